@@ -1,0 +1,51 @@
+# Every target sets up .venv once, and again only when pyproject.toml or constraints.txt changes.
+PYTHON ?= python3
+ARGS ?=
+PYTEST_ARGS ?= -n auto --maxprocesses 8 --dist worksteal
+
+BIN := .venv/bin
+STAMP := .venv/.installed
+BENCHMARKS := $(wildcard benchmarks/[a-z]*.py)
+
+# One thread per process: more of them slow networks this small down, and tests run side by side.
+export OMP_NUM_THREADS ?= 1
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help train test lint format bench clean
+
+help: ## List the targets
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
+	  awk -F'|' '{ printf "%-12s %s\n", $$1, $$2 }'
+
+train: $(STAMP) ## Train PPO on the warehouse, or what ARGS="--env ... --algo ..." says
+	$(BIN)/python train.py $(if $(strip $(ARGS)),$(ARGS),--env Warehouse-v0 --algo ppo)
+
+test: $(STAMP) ## Run the whole test suite; PYTEST_ARGS replaces its options
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+lint: $(STAMP) ## Check style, formatting, types and import contracts
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m mypy
+	$(BIN)/lint-imports
+
+format: $(STAMP) ## Format the code and mend what ruff can mend
+	$(BIN)/ruff check --fix-only .
+	$(BIN)/ruff format .
+
+bench: $(STAMP) ## Run every benchmark
+	@set -e; for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python "$$file"; done
+
+clean: ## Remove caches and builds; .venv and logs/ stay
+	rm -rf build dist *.egg-info .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The stamp is written last, so a set-up that failed half-way is taken up again.
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	  { echo "Yardstick needs Python 3.11 or newer; $(PYTHON) is not. Name one: make PYTHON=python3.12" >&2; exit 1; }
+	@echo "Setting up .venv (once, some minutes: PyTorch is large)"
+	@test -x $(BIN)/pip || $(PYTHON) -m venv .venv
+	@$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,contrib,tensorboard,video]'
+	@touch $@

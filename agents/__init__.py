@@ -1,0 +1,9 @@
+"""The learners, each a Stable-Baselines3 algorithm, and the one table of their names.
+
+Importing this package loads neither torch nor Stable-Baselines3: names can be listed, and spaces
+compared, before anything heavy is paid for.
+"""
+
+from agents.registry import ALGORITHMS, AlgorithmEntry, fitting_algorithms, load_algorithm
+
+__all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm"]

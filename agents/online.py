@@ -1,0 +1,286 @@
+"""The base of every hand-written agent: one environment step at a time, and a zip without pickles.
+
+`OnlineAlgorithm` is a Stable-Baselines3 algorithm whose callbacks, logger, Monitor statistics and
+model files behave as those of the library's own off-policy algorithms do. What an agent adds is how
+it chooses actions and what it learns from them.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import pathlib
+import warnings
+import zipfile
+from collections.abc import Iterable
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self, cast
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file, open_path, save_to_zip_file
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import check_for_correct_spaces
+
+from agents.serialization import UnknownTypeError, decode, encode
+
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """One step of every environment.
+
+    Attributes:
+        obs: observations before the step, shape (n_envs, ...).
+        actions: what was done, shape (n_envs, ...).
+        rewards: float64 of shape (n_envs,).
+        terminated: the episode ended for good, bool of shape (n_envs,).
+        dones: it ended for good or was truncated, bool of shape (n_envs,).
+        next_obs: observations after the step, before any reset, shape (n_envs, ...).
+    """
+
+    obs: Any
+    actions: Any
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    dones: NDArray[np.bool_]
+    next_obs: Any
+
+
+class OnlineAlgorithm(BaseAlgorithm):
+    """Acts and learns one step at a time, with generators of its own.
+
+    Subclasses define `_setup_model`, which ends in a call of ``set_random_seed``, and
+    `_choose_actions`, and override `_learn_from` where they learn.
+    """
+
+    rng: np.random.Generator
+    predict_rng: np.random.Generator
+
+    # Rebuilt by `_setup_model`, or belonging to one process alone.
+    _rebuilt: ClassVar[tuple[str, ...]] = ("lr_schedule", "policy_class", "start_time")
+
+    def _choose_actions(self) -> NDArray[Any]:
+        """Actions for `_last_obs`, shape (n_envs, ...)."""
+        raise NotImplementedError
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        """Learn from one step of every environment; an agent that does not learn leaves it."""
+
+    def _record_training(self) -> None:
+        """Hand the agent's own figures to the logger, just before it writes."""
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 100,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for at least ``total_timesteps`` environment steps.
+
+        Args:
+            total_timesteps: number of steps, counted over all environments.
+            callback: one or several callbacks, called at every step.
+            log_interval: episodes between two log records, or None for none.
+            tb_log_name: name of the TensorBoard run; by default the class's name.
+            reset_num_timesteps: start counting anew rather than go on.
+            progress_bar: show one.
+
+        Returns:
+            The agent itself.
+        """
+        tb_log_name = tb_log_name or type(self).__name__
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < total_timesteps and self._step(callback, log_interval):
+            pass
+        callback.on_training_end()
+        return self
+
+    def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
+        """Act, tell the callbacks, learn; False once a callback asks to stop.
+
+        The order is that of the library's off-policy algorithms. Unlike there, the last transition
+        is learnt from even when a callback stops the training on it.
+        """
+        assert self.env is not None
+        callback.on_rollout_start()
+        obs, actions = self._last_obs, self._choose_actions()
+        new_obs, rewards, dones, infos = self.env.step(actions)
+        self.num_timesteps += self.env.num_envs
+
+        callback.update_locals(locals())
+        keep_going = callback.on_step()
+
+        self._update_info_buffer(infos, dones)
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        next_obs, terminated = true_outcome(new_obs, dones, infos)
+        self._learn_from(
+            Transitions(obs, actions, rewards.astype(np.float64), terminated, dones, next_obs)
+        )
+        self._last_obs = cast(Any, new_obs)
+        if dones.any():
+            self._count_episodes(int(dones.sum()), log_interval)
+        callback.on_rollout_end()
+        return keep_going
+
+    def _count_episodes(self, finished: int, log_interval: int | None) -> None:
+        before = self._episode_num
+        self._episode_num += finished
+        if log_interval is not None and self._episode_num // log_interval > before // log_interval:
+            self.dump_logs()
+
+    def dump_logs(self) -> None:
+        """Write the log: episode statistics, speed, and what the agent records."""
+        self._record_training()
+        OffPolicyAlgorithm.dump_logs(cast(OffPolicyAlgorithm, self))
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed the agent's generators, its action space and its environments.
+
+        The global generators of NumPy, Python and torch are left alone: no hand-written agent draws
+        from them.
+        """
+        self.rng, self.predict_rng = np.random.default_rng(seed).spawn(2)
+        if seed is None:
+            return
+        self.action_space.seed(seed)
+        if self.env is not None:
+            self.env.seed(seed)
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """Write the agent as a zip: JSON for its attributes, ``policy.pth`` for its tables.
+
+        Args:
+            path: where to; ``.zip`` is appended where a path has no suffix.
+            exclude: attributes to leave out.
+            include: attributes to write although they are left out by default.
+        """
+        left_out = {*self._excluded_save_params(), *self._rebuilt, *(exclude or ())}
+        left_out -= set(include or ())
+        data: dict[str, Any] = {"format": FORMAT_VERSION, "algorithm": type(self).__name__}
+        for name, value in self.__dict__.items():
+            if name not in left_out:
+                data[name] = self._encode_attribute(name, value)
+        save_to_zip_file(path, data=data, params=self.get_parameters(), pytorch_variables={})
+
+    def _encode_attribute(self, name: str, value: Any) -> Any:
+        try:
+            return encode(value)
+        except UnknownTypeError:
+            if not callable(value):
+                raise
+            # Losing what was learnt would be worse than losing the shape of a schedule.
+            present = float(value(self._current_progress_remaining))
+            warnings.warn(
+                f"{name} is a Python function, which a model file cannot hold: "
+                f"its present value {present} is saved instead",
+                stacklevel=3,
+            )
+            return present
+
+    @classmethod
+    def load(
+        cls,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "cpu",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        **kwargs: Any,
+    ) -> Self:
+        """Build the agent anew from a zip that `save` wrote.
+
+        Args:
+            path: where the zip lies.
+            env: environment to go on with, or None to predict only.
+            device: ignored, as tables live on the CPU.
+            custom_objects: values that replace those in the file.
+            print_system_info: print this system's and the file's library versions.
+            force_reset: begin a new episode at the next `learn`.
+            kwargs: attributes to change.
+
+        Raises:
+            ValueError: if the zip is of another agent, or damaged, or does not fit ``env``.
+        """
+        _, parameters, _ = load_from_zip_file(
+            path, load_data=False, device="cpu", print_system_info=print_system_info
+        )
+        data = {**cls._read_data(path), **(custom_objects or {}), **kwargs}
+        if env is not None:
+            env = cls._wrap_env(env, data["verbose"])
+            check_for_correct_spaces(env, data["observation_space"], data["action_space"])
+            data["n_envs"] = env.num_envs
+            if force_reset:
+                data["_last_obs"] = None
+        policy = next(iter(cls.policy_aliases))
+        model = cls(policy=policy, env=env, _init_setup_model=False)  # type: ignore[call-arg]
+        # Without a seed, setting up leaves alone what was saved with its state.
+        model.__dict__.update({**data, "seed": None})
+        model._setup_model()
+        model.__dict__.update(data)
+        if "seed" in kwargs:
+            model.set_random_seed(kwargs["seed"])
+        model.set_parameters(cast(dict[str, Any], parameters), exact_match=True, device="cpu")
+        return model
+
+    @classmethod
+    def _read_data(cls, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
+        """The decoded attributes of a zip of this very class."""
+        with (
+            open_path(path, "r", suffix="zip") as file,
+            zipfile.ZipFile(file) as archive,
+        ):
+            raw = json.loads(archive.read("data"))
+        if raw.pop("algorithm", None) != cls.__name__:
+            raise ValueError(f"{path} does not hold a {cls.__name__} agent")
+        if raw.pop("format", None) != FORMAT_VERSION:
+            raise ValueError(f"{path} is written in another version of the file format")
+        return {name: decode(value) for name, value in raw.items()}
+
+
+def true_outcome(
+    new_obs: Any, dones: NDArray[np.bool_], infos: list[dict[str, Any]]
+) -> tuple[Any, NDArray[np.bool_]]:
+    """What the environments showed before they were reset, and whether they had terminated.
+
+    A VecEnv resets a finished environment within the same step.
+
+    Args:
+        new_obs: observations as ``VecEnv.step`` returns them, shape (n_envs, ...).
+        dones: bool of shape (n_envs,).
+        infos: one dictionary for each environment.
+
+    Returns:
+        The observations reached, shape (n_envs, ...), and ``terminated``, shape (n_envs,).
+    """
+    if not dones.any():
+        return new_obs, dones
+    terminated = dones.copy()
+    next_obs = deepcopy(new_obs)
+    for i in np.flatnonzero(dones):
+        terminated[i] = not infos[i].get("TimeLimit.truncated", False)
+        last_obs = infos[i]["terminal_observation"]
+        if isinstance(next_obs, dict):
+            for key in next_obs:
+                next_obs[key][i] = last_obs[key]
+        else:
+            next_obs[i] = last_obs
+    return next_obs, terminated

@@ -1,0 +1,107 @@
+"""Agents that do not learn: what the others must beat."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from agents.online import OnlineAlgorithm
+
+POLE_ANGLE = 2
+LEFT, RIGHT = 0, 1
+
+
+class FixedPolicy(BasePolicy):
+    """A policy without parameters."""
+
+    def __init__(
+        self,
+        observation_space: Any,
+        action_space: Any,
+        lr_schedule: Schedule | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
+
+
+class RandomPolicy(FixedPolicy):
+    """Uniformly random actions from the action space's own generator."""
+
+    def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
+        first = next(iter(observation.values())) if isinstance(observation, dict) else observation
+        return th.from_numpy(np.stack([self.action_space.sample() for _ in range(len(first))]))
+
+
+class AnglePolicy(FixedPolicy):
+    """Push the cart towards the side that the pole leans to."""
+
+    def _predict(
+        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
+    ) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        return th.where(observation[:, POLE_ANGLE] > 0, RIGHT, LEFT)
+
+
+class ReferenceAgent(OnlineAlgorithm):
+    """Acts by a fixed policy; training it changes nothing but its counters.
+
+    Args:
+        policy: name of the policy.
+        env: environment, or its id.
+        stats_window_size: episodes over which logged statistics are averaged.
+        tensorboard_log: folder for TensorBoard, or None.
+        verbose: 0 silent, 1 information.
+        seed: seeds the agent's generators, its action space and its environments.
+        device: not used.
+    """
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=0.0,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device="cpu",
+            support_multi_env=True,
+            seed=seed,
+        )
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.policy_class(self.observation_space, self.action_space)
+
+    def _choose_actions(self) -> NDArray[Any]:
+        assert self._last_obs is not None
+        return self.predict(self._last_obs)[0]
+
+
+class RandomAgent(ReferenceAgent):
+    """Uniformly random actions, whatever is observed."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"RandomPolicy": RandomPolicy}
+
+
+class AngleAgent(ReferenceAgent):
+    """CartPole: push the cart towards the side that the pole leans to."""
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"AnglePolicy": AnglePolicy}

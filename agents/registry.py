@@ -1,0 +1,133 @@
+"""The table of agents: a name, where the class lives, and the spaces it can work with."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from gymnasium import spaces
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+DISCRETE = ("Discrete",)
+NETWORK_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict")
+POLICY_GRADIENT_OUTPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
+
+
+@dataclass(frozen=True)
+class AlgorithmEntry:
+    """One agent that can be trained.
+
+    Attributes:
+        entry_point: where the class lives, as ``"module:Class"``; imported only when needed.
+        summary: what the agent is, in a few words.
+        observations: names of the Gymnasium spaces that it can observe.
+        actions: names of the Gymnasium spaces that it can act in.
+        observation_shape: the one observation shape that it understands, or None for any.
+        package: the import name of an optional package that it needs, or None.
+        extra: the extra of this distribution that installs that package.
+    """
+
+    entry_point: str
+    summary: str
+    observations: tuple[str, ...]
+    actions: tuple[str, ...]
+    observation_shape: tuple[int, ...] | None = None
+    package: str | None = None
+    extra: str | None = None
+
+    @property
+    def is_installed(self) -> bool:
+        """Whether the package that the agent needs is there."""
+        return self.package is None or importlib.util.find_spec(self.package) is not None
+
+    def misfit(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> str:
+        """Say why the agent cannot work with these spaces; empty where it can."""
+        for space, known, role in (
+            (observation_space, self.observations, "observes"),
+            (action_space, self.actions, "acts in"),
+        ):
+            if type(space).__name__ not in known:
+                return f"it {role} {' or '.join(known)} spaces, not {space}"
+            # The one-hot encoding of Stable-Baselines3 and every table count from zero.
+            if isinstance(space, spaces.Discrete) and space.start != 0:
+                return f"it needs Discrete spaces that start at 0, not {space}"
+        shape = self.observation_shape
+        if shape is not None and observation_space.shape != shape:
+            return f"it needs observations of shape {shape}, not {observation_space.shape}"
+        return ""
+
+
+def _tabular(name: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(f"agents.tabular.algorithms:{name}", summary, DISCRETE, DISCRETE)
+
+
+def _deep(entry_point: str, summary: str, actions: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
+    return AlgorithmEntry(entry_point, summary, NETWORK_INPUTS, actions)
+
+
+ALGORITHMS: dict[str, AlgorithmEntry] = {
+    "qlearning": _tabular("QLearning", "Q-learning on a table"),
+    "sarsa": _tabular("SARSA", "SARSA on a table"),
+    "expected_sarsa": _tabular("ExpectedSARSA", "Expected SARSA on a table"),
+    "double_qlearning": _tabular("DoubleQLearning", "double Q-learning on two tables"),
+    "dqn": _deep("stable_baselines3:DQN", "deep Q-network (Stable-Baselines3)"),
+    "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
+    "ppo": _deep(
+        "stable_baselines3:PPO",
+        "proximal policy optimisation (Stable-Baselines3)",
+        POLICY_GRADIENT_OUTPUTS,
+    ),
+    "a2c": _deep(
+        "stable_baselines3:A2C",
+        "advantage actor-critic (Stable-Baselines3)",
+        POLICY_GRADIENT_OUTPUTS,
+    ),
+    "qrdqn": AlgorithmEntry(
+        "sb3_contrib:QRDQN",
+        "quantile-regression DQN (sb3-contrib)",
+        NETWORK_INPUTS,
+        DISCRETE,
+        package="sb3_contrib",
+        extra="contrib",
+    ),
+    "random": AlgorithmEntry(
+        "agents.reference:RandomAgent",
+        "uniformly random actions",
+        NETWORK_INPUTS,
+        POLICY_GRADIENT_OUTPUTS,
+    ),
+    "angle": AlgorithmEntry(
+        "agents.reference:AngleAgent",
+        "CartPole: push to where the pole leans",
+        ("Box",),
+        DISCRETE,
+        observation_shape=(4,),
+    ),
+}
+
+
+def load_algorithm(name: str) -> type[BaseAlgorithm]:
+    """Import the class of the agent ``name``.
+
+    Raises:
+        KeyError: if there is no agent of that name.
+        ModuleNotFoundError: if the optional package that it needs is missing.
+    """
+    module_name, class_name = ALGORITHMS[name].entry_point.split(":")
+    algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module_name), class_name)
+    return algorithm
+
+
+def fitting_algorithms(
+    observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+) -> list[str]:
+    """Names of the agents that can work with these spaces, in the order of the table."""
+    return [
+        name
+        for name, entry in ALGORITHMS.items()
+        if not entry.misfit(observation_space, action_space)
+    ]

@@ -1,0 +1,1 @@
+"""Tabular temporal-difference agents as Stable-Baselines3 algorithms."""

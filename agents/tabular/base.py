@@ -1,0 +1,305 @@
+"""What all tabular agents share: their arguments, their tables, and how they act and learn."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal, cast, get_args
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+
+from agents.exploration import (
+    GAUSSIAN_NOISE,
+    STRATEGIES,
+    draws_per_choice,
+)
+from agents.online import OnlineAlgorithm, Transitions
+from agents.schedules import ExponentialSchedule
+from agents.step_sizes import SAMPLE_AVERAGE
+from agents.tabular.policy import QTablePolicy
+from agents.tabular.steps import UNDECIDED, choose_actions, update_tables
+
+ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
+ExplorationDecay = Literal["constant", "linear", "exponential"]
+TieBreaking = Literal["random", "first"]
+
+
+class TabularAlgorithm(OnlineAlgorithm):
+    """Temporal-difference control on a table of action values.
+
+    Args:
+        policy: ``"QTablePolicy"``.
+        env: environment with `Discrete` observations and actions, or its id.
+        learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N(s, a).
+        gamma: discount factor.
+        exploration: ``"epsilon_greedy"``; ``"boltzmann"`` (softmax of value / temperature); or
+            ``"gaussian_noise"`` (greedy in value + noise_std / (episode + 1) * normal noise, the
+            episodes counted over all environments).
+        exploration_fraction: share of training over which epsilon falls.
+        exploration_initial_eps: epsilon at the start.
+        exploration_final_eps: epsilon at the end of that share.
+        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
+        temperature: of ``"boltzmann"``, above 0, constant or scheduled.
+        noise_std: of ``"gaussian_noise"``, constant or scheduled.
+        tie_breaking: which of several best actions to take while learning: a random one, or the
+            first, as NumPy's argmax does. `predict` takes the first.
+        initial_q: value of every entry of the table at the start; high values are optimistic.
+        initial_q_std: standard deviation of normal noise on the entries at the start.
+        skip_terminal_update: learn nothing from the step that terminates an episode, a common
+            omission in hand-written programs, here to reproduce their results.
+        stats_window_size: episodes over which logged statistics are averaged.
+        tensorboard_log: folder for TensorBoard, or None.
+        policy_kwargs: further arguments of the policy.
+        verbose: 0 silent, 1 information.
+        seed: seeds the agent's generators, its action space and its environments.
+        device: tables live on the CPU; any other device is refused.
+
+    Raises:
+        ValueError: if an argument lies outside its range or a space does not fit.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
+    policy: QTablePolicy
+    rule: ClassVar[int]
+    n_tables: ClassVar[int] = 1
+
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule")
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "QTablePolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: float | Schedule | Literal["sample_average"] = 0.1,
+        gamma: float = 0.99,
+        exploration: ExplorationStrategy = "epsilon_greedy",
+        exploration_fraction: float = 0.5,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        exploration_decay: ExplorationDecay = "linear",
+        temperature: float | Schedule = 1.0,
+        noise_std: float | Schedule = 1.0,
+        tie_breaking: TieBreaking = "random",
+        initial_q: float = 0.0,
+        initial_q_std: float = 0.0,
+        skip_terminal_update: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,  # type: ignore[arg-type]  # the word is taken care of in _setup_model
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device="cpu",
+            support_multi_env=True,
+            seed=seed,
+        )
+        self.gamma = gamma
+        self.exploration = exploration
+        self.exploration_fraction = exploration_fraction
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_decay = exploration_decay
+        self.temperature = temperature
+        self.noise_std = noise_std
+        self.tie_breaking = tie_breaking
+        self.initial_q = initial_q
+        self.initial_q_std = initial_q_std
+        self.skip_terminal_update = skip_terminal_update
+        self.mean_td_error = 0.0
+        self._next_actions: NDArray[np.int64] | None = None
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        self.lr_schedule = FloatSchedule(1.0 if self.averages_samples else self.learning_rate)
+        self.exploration_schedule = self._make_exploration_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            n_tables=self.n_tables,
+            **self.policy_kwargs,
+        )
+        noise = self.rng.standard_normal(self.policy.q_tables.shape)
+        self.policy.q_tables.copy_(th.from_numpy(self.initial_q + self.initial_q_std * noise))
+
+    def _check_arguments(self) -> None:
+        for name, space in (
+            ("observations", self.observation_space),
+            ("actions", self.action_space),
+        ):
+            if not isinstance(space, spaces.Discrete) or space.start != 0:
+                raise ValueError(
+                    f"{type(self).__name__} needs {name} in a Discrete space that starts at 0, "
+                    f"not {space}"
+                )
+        for name, options in (
+            ("exploration", ExplorationStrategy),
+            ("exploration_decay", ExplorationDecay),
+            ("tie_breaking", TieBreaking),
+        ):
+            if getattr(self, name) not in get_args(options):
+                raise ValueError(
+                    f"{name} must be one of {', '.join(get_args(options))}, "
+                    f"not {getattr(self, name)!r}"
+                )
+        for name in (
+            "gamma",
+            "exploration_fraction",
+            "exploration_initial_eps",
+            "exploration_final_eps",
+        ):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name} must lie between 0 and 1, not {getattr(self, name)}")
+        if isinstance(self.temperature, int | float) and self.temperature <= 0:
+            raise ValueError(f"temperature must be above 0, not {self.temperature}")
+        if isinstance(cast(Any, self.learning_rate), str) and not self.averages_samples:
+            raise ValueError(
+                f"learning_rate must be a number, a schedule or {SAMPLE_AVERAGE!r}, "
+                f"not {self.learning_rate!r}"
+            )
+
+    def _make_exploration_schedule(self) -> Schedule:
+        """How much to explore, by the progress remaining."""
+        if self.exploration == "boltzmann":
+            return FloatSchedule(self.temperature)
+        if self.exploration == "gaussian_noise":
+            return FloatSchedule(self.noise_std)
+        start, end = self.exploration_initial_eps, self.exploration_final_eps
+        if self.exploration_decay == "constant" or self.exploration_fraction == 0:
+            constant = start if self.exploration_decay == "constant" else end
+            return FloatSchedule(constant)
+        if self.exploration_decay == "exponential":
+            return ExponentialSchedule(start, end, self.exploration_fraction)
+        return LinearSchedule(start, end, self.exploration_fraction)
+
+    @property
+    def averages_samples(self) -> bool:
+        """Whether the step size is 1/N(s, a)."""
+        return bool(cast(Any, self.learning_rate) == SAMPLE_AVERAGE)
+
+    @property
+    def exploration_rate(self) -> float:
+        """How much the agent explores now: epsilon, temperature or standard deviation."""
+        rate = self.exploration_schedule(self._current_progress_remaining)
+        if self.exploration == "gaussian_noise":
+            return rate / (self._episode_num + 1)
+        return rate
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, Any]:
+        if reset_num_timesteps or self._last_obs is None:
+            self._next_actions = np.full(self.n_envs, UNDECIDED)
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def _decide(
+        self, obs: NDArray[np.int64], actions: NDArray[np.int64], rng: np.random.Generator
+    ) -> None:
+        """Fill in the undecided of ``actions``, both of shape (n,), in place."""
+        strategy = STRATEGIES[self.exploration]
+        shape = (
+            np.count_nonzero(actions == UNDECIDED),
+            draws_per_choice(strategy, self.policy.q_tables.shape[2]),
+        )
+        normal = strategy == GAUSSIAN_NOISE
+        draws = rng.standard_normal(shape) if normal else rng.random(shape)
+        choose_actions(
+            strategy,
+            self.policy.q_tables.numpy(),
+            obs,
+            self.exploration_rate,
+            float(self.tie_breaking == "random"),
+            draws,
+            actions,
+        )
+
+    def _choose_actions(self) -> NDArray[np.int64]:
+        assert self._next_actions is not None
+        actions = self._next_actions
+        self._next_actions = np.full(self.n_envs, UNDECIDED)
+        self._decide(cast(Any, self._last_obs), actions, self.rng)
+        return actions
+
+    def _commit_to_next_actions(self, transitions: Transitions) -> NDArray[np.int64]:
+        """Actions that the target uses, shape (n_envs,); only SARSA decides on them here."""
+        return np.zeros(self.n_envs, dtype=np.int64)
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        next_actions = self._commit_to_next_actions(transitions)
+        uniforms = self.rng.random(self.n_envs) if self.n_tables > 1 else np.zeros(self.n_envs)
+        self.mean_td_error = update_tables(
+            self.rule,
+            self.policy.q_tables.numpy(),
+            self.policy.visit_counts.numpy(),
+            transitions.obs,
+            transitions.actions,
+            transitions.rewards,
+            transitions.terminated,
+            transitions.next_obs,
+            next_actions,
+            self.gamma,
+            self.lr_schedule(self._current_progress_remaining),
+            self.averages_samples,
+            self.skip_terminal_update,
+            STRATEGIES[self.exploration],
+            self.exploration_rate,
+            float(self.tie_breaking == "random"),
+            uniforms,
+        )
+        self._n_updates += self.n_envs
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The greedy action, or an exploring one unless ``deterministic``, as DQN has it.
+
+        Args:
+            observation: one state index, or an array of shape (n,).
+            state: passed through.
+            episode_start: not used.
+            deterministic: take the first of the best actions.
+
+        Returns:
+            Actions, of the observation's shape, and ``state``.
+        """
+        if deterministic:
+            return super().predict(observation, state, episode_start, deterministic)
+        obs = np.asarray(observation, dtype=np.int64)
+        actions = np.full(obs.size, UNDECIDED)
+        self._decide(obs.reshape(-1), actions, self.predict_rng)
+        return actions.reshape(obs.shape), state
+
+    def _record_training(self) -> None:
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+        self.logger.record("train/mean_absolute_td_error", self.mean_td_error)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if not self.averages_samples:
+            rate = self.lr_schedule(self._current_progress_remaining)
+            self.logger.record("train/learning_rate", rate)

@@ -1,0 +1,33 @@
+"""Gymnasium environments whose optimum is known exactly; importing the package registers them."""
+
+import gymnasium as gym
+from gymnasium.envs.registration import WrapperSpec
+
+from envs.grid_map import MAX_STATES
+
+PATH_MULTIPLE = 10
+
+gym.register(
+    id="Warehouse-v0",
+    entry_point="envs.warehouse:WarehouseEnv",
+    max_episode_steps=1000,
+)
+gym.register(
+    id="MineMaze-v0",
+    entry_point="envs.mine_maze:MineMazeEnv",
+    max_episode_steps=100,
+)
+gym.register(
+    id="RandomWarehouse-v0",
+    entry_point="envs.warehouse:RandomWarehouseEnv",
+    # The limit of the largest map there may be. It stands in until the map is made: then the
+    # wrapper puts the map's own in its place, unless the caller of `gym.make` gave another.
+    max_episode_steps=PATH_MULTIPLE * MAX_STATES,
+    additional_wrappers=(
+        WrapperSpec(
+            name="PathTimeLimit",
+            entry_point="envs.wrappers:limit_by_shortest_path",
+            kwargs={"multiple": PATH_MULTIPLE, "instead_of": PATH_MULTIPLE * MAX_STATES},
+        ),
+    ),
+)

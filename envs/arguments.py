@@ -1,0 +1,58 @@
+"""Checks of arguments: each failure is one line that names the argument and what it may be."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+
+def check_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
+    """The value as a float, if it is a finite number between two others, both included.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if isinstance(value, int | float | np.number) and not isinstance(value, bool):
+        number = float(value)
+        if math.isfinite(number) and low <= number <= high:
+            return number
+    between = f" from {low} to {high}" if math.isfinite(high) else ""
+    raise ValueError(f"{name} must be a finite number{between}, not {value!r}")
+
+
+def check_whole_number(name: str, value: object, low: int, high: int) -> int:
+    """The value as an int, if it is a whole number between two others, both included.
+
+    Raises:
+        ValueError: if it is not.
+    """
+    if isinstance(value, int | np.integer) and not isinstance(value, bool) and low <= value <= high:
+        return int(value)
+    raise ValueError(f"{name} must be a whole number from {low} to {high}, not {value!r}")
+
+
+def check_choice(name: str, value: object, choices: Sequence[str]) -> str:
+    """The value, if it is one of the choices.
+
+    Raises:
+        ValueError: if it is not; the message names the nearest one.
+    """
+    if isinstance(value, str) and value in choices:
+        return value
+    near = difflib.get_close_matches(str(value), choices, n=1)
+    hint = f"did you mean {near[0]!r}? It" if near else "it"
+    raise ValueError(f"unknown {name} {value!r}: {hint} must be one of {', '.join(choices)}")
+
+
+def check_flag(name: str, value: object) -> bool:
+    """The value, if it is true or false.
+
+    Raises:
+        ValueError: if it is anything else, a number included.
+    """
+    if isinstance(value, bool):
+        return value
+    raise ValueError(f"{name} must be true or false, not {value!r}")

@@ -1,0 +1,232 @@
+"""What every grid world shares: its arguments, stepping, the exact model, and rendering."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from envs.arguments import check_choice, check_flag, check_number
+from envs.grid_dynamics import MOVES, POSSIBLE_MOVES, GridDynamics, Tile
+from envs.grid_map import GOAL, MAX_STATES, Description, GridMap
+from envs.rendering import GridRenderer, Scene
+
+if TYPE_CHECKING:
+    from mdp.model import TransitionModel
+
+Observation = int | NDArray[np.float32]
+RENDER_MODES = ("ansi", "rgb_array", "human")
+
+Outcome = tuple[float, int, float, bool]
+
+
+class GridWorld(gym.Env[Any, Any]):
+    """A robot on a map of letters, moving up, down, left or right; the base of all grid worlds.
+
+    A subclass says in `tiles` what its letters mean; cells that neither block nor terminate can
+    be walked on. What it must hold to, so that the arrays of `transition_model` replay an episode
+    exactly: `reset` and `step` draw one uniform number each, even where nothing is random, and
+    choose by cumulative sum in the order of `initial_state_distrib` and `P`.
+
+    Args:
+        desc: the map: its rows, or the path to a text file. Exactly one ``S``, at least one ``G``.
+        tiles: what each letter means.
+        edge: what meets a robot that tries to leave the map.
+        slip: probability that a move goes sideways, half of it to each side.
+        random_start: start each episode on any cell that can be walked on, holds nothing to
+            collect, and has a way to the goal, with equal probability, instead of on ``S``.
+        render_mode: ``"ansi"``, ``"rgb_array"``, ``"human"`` or None.
+
+    Attributes:
+        s: the state, an index; may be set to continue from another one.
+
+    Raises:
+        ValueError: if an argument is out of range or the map malformed; see `GridMap.read`.
+    """
+
+    # Not annotated as ClassVar, since Gymnasium declares it as an attribute of the instance.
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
+
+    def __init__(
+        self,
+        desc: Description,
+        tiles: Mapping[str, Tile],
+        edge: Tile,
+        *,
+        slip: float,
+        random_start: bool,
+        render_mode: str | None,
+    ) -> None:
+        slip = check_number("slip", slip, 0, 1)
+        self.random_start = check_flag("random_start", random_start)
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, RENDER_MODES)
+        passable = [
+            letter for letter, tile in tiles.items() if not (tile.blocked or tile.terminated)
+        ]
+        self.map = GridMap.read(desc, tiles, passable)
+        self.dynamics = GridDynamics(self.map, tiles, edge, slip)
+        self._check_size()
+        self.observation_space = spaces.Discrete(self.dynamics.n_states)
+        self.action_space = spaces.Discrete(len(MOVES))
+        self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
+        self.s = self.map.start
+        self.render_mode = render_mode
+        self._renderer: GridRenderer | None = None
+        self._path: list[int] = []
+        self._last_action: int | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode; ``options`` are not used."""
+        super().reset(seed=seed)
+        starts, thresholds = self._starts
+        drawn = np.searchsorted(thresholds, self.np_random.random(), side="right")
+        self.s = int(starts[drawn])
+        self._path = [self.s]
+        self._last_action = None
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), self._info(bumped=False)
+
+    def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Try to move one cell; see the class for the meaning of what is returned.
+
+        Raises:
+            ValueError: if the action is not one of 0, 1, 2, 3.
+        """
+        action = int(action)
+        if not 0 <= action < len(MOVES):
+            raise ValueError(f"action {action} does not exist: 0 up, 1 down, 2 left, 3 right")
+        uniform = self.np_random.random()
+        # As categorical_sample of toy_text: the first, where rounding leaves none.
+        outcome = next((k for k, upto in enumerate(self._slip_thresholds) if upto > uniform), 0)
+        move = self.dynamics.move(self.s, POSSIBLE_MOVES[action][outcome])
+        self.s = move.next_state
+        if self.render_mode is not None:
+            self._path.append(self.s % self.map.n_cells)
+            self._last_action = action
+            if self.render_mode == "human":
+                self.render()
+        info = self._info(move.bumped)
+        return self._observe(), move.reward, move.terminated, False, info
+
+    def render(self) -> str | NDArray[np.uint8] | None:
+        """The map as text (``ansi``), as a picture of shape (height, width, 3), or in a window."""
+        if self.render_mode is None:
+            gym.logger.warn("render() does nothing: the environment was made without render_mode")
+            return None
+        if self._renderer is None:
+            self._renderer = GridRenderer(self.map.rows, self.metadata["render_fps"])
+        cell = self.s % self.map.n_cells
+        collected = self.s // self.map.n_cells
+        scene = Scene(
+            robot=cell,
+            path=self._path,
+            collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
+            last_action=self._last_action,
+        )
+        return self._renderer.render(scene, self.render_mode)
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def observation_of(self, states: NDArray[np.integer[Any]]) -> NDArray[Any]:
+        """What is observed in each of many states: here the states themselves.
+
+        Args:
+            states: indices of states, shape (n,).
+
+        Returns:
+            The observations, the first axis counting the states.
+        """
+        return states
+
+    def transition_model(self) -> TransitionModel:
+        """The exact dynamics as arrays; its states are numbered as `s`, whatever is observed."""
+        return self.dynamics.transition_model(self.initial_state_distrib)
+
+    @cached_property
+    def initial_state_distrib(self) -> NDArray[np.float64]:
+        """Probabilities of the starting states, shape (S,)."""
+        starts, thresholds = self._starts
+        distribution = np.zeros(self.dynamics.n_states)
+        distribution[starts] = _uniform(len(thresholds))
+        return distribution
+
+    @cached_property
+    def P(self) -> dict[int, dict[int, list[Outcome]]]:  # noqa: N802 (the name toy_text gave it)
+        """The dynamics as Gymnasium's toy_text environments hold them.
+
+        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built when
+        first asked for, from `transition_model`, whose arrays take a tenth of the memory.
+        """
+        model = self.transition_model()
+        columns = (model.prob, model.next_state, model.reward, model.terminated)
+        states = zip(*(column.tolist() for column in columns), strict=True)
+        return {
+            state: {
+                action: list(zip(*outcomes, strict=True))
+                for action, outcomes in enumerate(zip(*actions, strict=True))
+            }
+            for state, actions in enumerate(states)
+        }
+
+    @property
+    def desc(self) -> NDArray[np.bytes_]:
+        """The map as FrozenLake holds it, single letters of shape (rows, columns)."""
+        return np.frombuffer(self.map.codes, "S1").reshape(self.map.n_rows, self.map.n_columns)
+
+    @property
+    def shortest_path_length(self) -> int:
+        """Moves from ``S`` to the nearest goal if none slips."""
+        return int(self.map.distances[self.map.start])
+
+    @cached_property
+    def _starts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """The cells where an episode may begin, in order, and their cumulative probabilities."""
+        if self.random_start:
+            starts = np.flatnonzero(self.map.distances > 0)
+            starts = starts[~np.isin(starts, list(self.dynamics.collectable_bits))]
+        else:
+            starts = np.array([self.map.start])
+        return starts, np.cumsum(_uniform(len(starts)))
+
+    def _observe(self) -> Observation:
+        return self.s
+
+    def _info(self, bumped: bool) -> dict[str, Any]:
+        cell = self.s % self.map.n_cells
+        return {
+            "position": divmod(cell, self.map.n_columns),
+            "bumped": bumped,
+            # On every step, so that an episode cut off by a time limit counts as a failure.
+            "is_success": self.map.codes[cell] == ord(GOAL),
+        }
+
+    def _check_size(self) -> None:
+        n_states, n_items = self.dynamics.n_states, len(self.dynamics.collectable_bits)
+        if n_states > MAX_STATES:
+            raise ValueError(
+                f"the map has {self.map.n_cells} cells and {n_items} to collect, which makes "
+                f"{n_states:,} states: more than {MAX_STATES:,}; use fewer to collect"
+            )
+
+
+def _uniform(n: int) -> NDArray[np.float64]:
+    """Equal probabilities whose running sum ends at exactly one.
+
+    Otherwise a uniform number above the sum would choose state 0, as `categorical_sample` does.
+    """
+    probabilities = np.full(n, 1 / n)
+    probabilities[-1] = 1 - probabilities[:-1].cumsum()[-1] if n > 1 else 1
+    return probabilities

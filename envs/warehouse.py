@@ -1,0 +1,215 @@
+"""A robot that has to find its way between the shelves of a warehouse."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from envs.arguments import check_choice, check_number
+from envs.grid import GridWorld, Observation
+from envs.grid_dynamics import Tile
+from envs.grid_map import Description
+
+DEFAULT_MAP = (
+    "...#.....G",
+    ".###.####.",
+    ".....#....",
+    "###.#..###",
+    "..#.#.##..",
+    "....#.....",
+    "###.###.##",
+    "..#......#",
+    ".####.###.",
+    "S.........",
+)
+OBSERVATIONS = ("discrete", "position", "one_hot")
+
+
+class WarehouseEnv(GridWorld):
+    """A robot finds the shortest way through a warehouse without running into its shelves.
+
+    ## Description
+    The robot starts in one corner of a warehouse and is to reach the loading point in the other.
+    In between stand shelves, among which there are dead ends. The default map, with shelves
+    ``#``, aisles ``.``, the start ``S`` and the goal ``G``::
+
+        ...#.....G
+        .###.####.
+        .....#....
+        ###.#..###
+        ..#.#.##..
+        ....#.....
+        ###.###.##
+        ..#......#
+        .####.###.
+        S.........
+
+    The shortest way takes 22 moves; there are two of that length.
+
+    ## Action Space
+    `Discrete(4)`: 0 up, 1 down, 2 left, 3 right.
+
+    ## Observation Space
+    With `observation="discrete"`, `Discrete(rows * columns)`: row times the number of columns plus
+    column, row 0 being at the top. With `"position"`, `Box(0, 1, (2,), float32)`: row and column,
+    each divided by its largest value. With `"one_hot"`, `Box(0, 1, (rows * columns,), float32)`: 1
+    at the robot's cell and 0 elsewhere.
+
+    ## Rewards
+    - a move, also one against the outer wall, where the robot stays: -1
+    - a move against a shelf, where it stays too: -100
+    - the move onto the goal: +100
+
+    The best return on the default map is 21 * (-1) + 100 = 79.
+
+    ## Starting State
+    The cell marked `S`; with `random_start=True` any cell but the goal from which the goal can be
+    reached, all with equal probability.
+
+    ## Episode End
+    The episode terminates on the goal. It is truncated after 1000 steps when made by
+    `gymnasium.make`.
+
+    ## Information
+    `reset` and `step` give `position` (row, column), `bumped` (whether the robot ran into a shelf
+    or the outer wall) and `is_success` (whether it stands on the goal).
+    The exact dynamics are available as arrays from `transition_model()`, and as `P` and
+    `initial_state_distrib` as in Gymnasium's FrozenLake. States are numbered as the discrete
+    observation is, whatever is observed.
+
+    ## Arguments
+    - `desc`: the map, as a list of rows or the path to a text file with one row per line
+    - `shelf_reward=-100`, `step_reward=-1`, `goal_reward=100`: the rewards
+    - `slip=0`: probability that the robot moves sideways instead, half of it to each side
+    - `random_start=False`: see Starting State
+    - `observation="discrete"`: see Observation Space
+    - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
+
+    ## Version History
+    - v0: the first version
+    """
+
+    def __init__(
+        self,
+        desc: Description = DEFAULT_MAP,
+        shelf_reward: float = -100,
+        step_reward: float = -1,
+        goal_reward: float = 100,
+        slip: float = 0,
+        random_start: bool = False,
+        observation: str = "discrete",
+        render_mode: str | None = None,
+    ) -> None:
+        self.observation = check_choice("observation", observation, OBSERVATIONS)
+        aisle = Tile(check_number("step_reward", step_reward))
+        tiles = {
+            "#": Tile(check_number("shelf_reward", shelf_reward), blocked=True),
+            ".": aisle,
+            "S": aisle,
+            "G": Tile(check_number("goal_reward", goal_reward), terminated=True),
+        }
+        super().__init__(
+            desc,
+            tiles,
+            edge=replace(aisle, blocked=True),
+            slip=slip,
+            random_start=random_start,
+            render_mode=render_mode,
+        )
+        if observation == "position":
+            self.observation_space = spaces.Box(0, 1, (2,), np.float32)
+        elif observation == "one_hot":
+            self.observation_space = spaces.Box(0, 1, (self.map.n_cells,), np.float32)
+
+    def observation_of(self, states: NDArray[np.integer[Any]]) -> NDArray[Any]:
+        """What is observed in each of many states.
+
+        Args:
+            states: indices of states, shape (n,).
+
+        Returns:
+            For "discrete" the states themselves; for "position" float32 of shape (n, 2); for
+            "one_hot" float32 of shape (n, cells).
+        """
+        if self.observation == "position":
+            largest = np.maximum((self.map.n_rows - 1, self.map.n_columns - 1), 1)
+            position = np.stack(np.divmod(states, self.map.n_columns), axis=-1)
+            return (position / largest).astype(np.float32)
+        if self.observation == "one_hot":
+            hot = np.zeros((len(states), self.map.n_cells), np.float32)
+            hot[np.arange(len(states)), states] = 1
+            return hot
+        return states
+
+    def _observe(self) -> Observation:
+        if self.observation == "discrete":
+            return self.s
+        observed: NDArray[np.float32] = self.observation_of(np.array([self.s]))[0]
+        return observed
+
+
+class RandomWarehouseEnv(WarehouseEnv):
+    """A warehouse with shelves at random, of any size up to 4096 x 4096.
+
+    ## Description
+    As Warehouse-v0, on a square map from `envs.map_generation.random_warehouse`: the start in the
+    lower left corner, the goal in the upper right one, and always a way between them.
+
+    ## Action Space
+    As Warehouse-v0.
+
+    ## Observation Space
+    As Warehouse-v0.
+
+    ## Rewards
+    As Warehouse-v0.
+
+    ## Starting State
+    As Warehouse-v0.
+
+    ## Episode End
+    The episode terminates on the goal. When made by `gymnasium.make`, it is truncated after ten
+    times as many steps as the shortest way has, or after `max_episode_steps` where that is given.
+
+    ## Information
+    As Warehouse-v0.
+
+    ## Arguments
+    - `size=10`: number of rows and of columns
+    - `shelf_density=0.3`: the part of the cells that hold a shelf, about
+    - `map_seed=0`: the same seed gives the same map
+    - all of Warehouse-v0's but `desc`
+
+    ## Version History
+    - v0: the first version
+    """
+
+    def __init__(
+        self,
+        size: int = 10,
+        shelf_density: float = 0.3,
+        map_seed: int = 0,
+        shelf_reward: float = -100,
+        step_reward: float = -1,
+        goal_reward: float = 100,
+        slip: float = 0,
+        random_start: bool = False,
+        observation: str = "discrete",
+        render_mode: str | None = None,
+    ) -> None:
+        from envs.map_generation import random_warehouse
+
+        super().__init__(
+            random_warehouse(size, shelf_density, map_seed),
+            shelf_reward=shelf_reward,
+            step_reward=step_reward,
+            goal_reward=goal_reward,
+            slip=slip,
+            random_start=random_start,
+            observation=observation,
+            render_mode=render_mode,
+        )

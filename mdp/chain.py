@@ -1,0 +1,119 @@
+"""The Markov chain that a policy makes of a decision process, and linear systems on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mdp.graph import reachable_states, steps_to_end
+from mdp.model import TransitionModel
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+LARGEST_DENSE = 300
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyChain:
+    """The outcomes that happen under a stationary policy, one entry each.
+
+    Attributes:
+        model: the decision process.
+        used: the actions that the policy takes, bool of shape (S, A).
+        states: the states of the chain, shape (n,); rows and following states below are places
+            in this array.
+        row: where each outcome happens, shape (m,).
+        weight: its probability under the policy, shape (m,).
+        following: where it leads, shape (m,); of no meaning where it ends the episode.
+        outcome: its flat index into the arrays of the model, shape (m,).
+    """
+
+    model: TransitionModel
+    used: NDArray[np.bool_]
+    states: Indices
+    row: Indices
+    weight: Floats
+    following: Indices
+    outcome: Indices
+
+    @classmethod
+    def build(
+        cls, model: TransitionModel, policy: Floats, states: NDArray[np.bool_] | None = None
+    ) -> PolicyChain:
+        """The chain of a policy matrix (S, A), on the states it visits or on those given.
+
+        ``states``, bool of shape (S,), must be closed under the policy.
+        """
+        if states is None:
+            states = reachable_states(model, policy > 0)
+        listed = np.flatnonzero(states)
+        place = np.cumsum(states) - 1
+        weight = (policy[listed][:, :, None] * model.prob[listed]).ravel()
+        entry = np.flatnonzero(weight)
+        size = model.n_actions * model.n_outcomes
+        row = entry // size
+        outcome = listed[row] * size + entry % size
+        following = place[model.next_state.ravel()[outcome]]
+        return cls(model, policy > 0, listed, row, weight[entry], following, outcome)
+
+    @cached_property
+    def reward(self) -> Floats:
+        """The reward of each outcome, shape (m,)."""
+        return self.model.reward.ravel()[self.outcome]
+
+    @cached_property
+    def terminated(self) -> NDArray[np.bool_]:
+        """Whether each outcome ends the episode, bool of shape (m,)."""
+        return self.model.terminated.ravel()[self.outcome]
+
+    @cached_property
+    def endless(self) -> NDArray[np.bool_]:
+        """The states from which the episode never ends, bool of shape (n,)."""
+        nowhere = np.zeros(self.model.n_states, np.bool_)
+        steps, _ = steps_to_end(self.model, self.used, nowhere)
+        return steps[self.states] < 0
+
+    @property
+    def size(self) -> int:
+        """The number of states, n."""
+        return len(self.states)
+
+    def mean(self, per_outcome: ArrayLike) -> Floats:
+        """The expectation of a quantity (m,) of one step's outcome, for each state (n,)."""
+        return np.bincount(self.row, self.weight * per_outcome, self.size)
+
+    def after(self, values: Floats) -> Floats:
+        """The value (n,) of the state that each outcome leads to (m,): zero where none follows."""
+        return np.where(self.terminated, 0.0, values[self.following])
+
+    def solve(self, per_step: Floats, discount: float) -> Floats:
+        """The expected discounted sum of ``per_step`` (n,) until the episode ends, per state.
+
+        Without discount, states from which it never ends get zero: their ``per_step`` must be
+        zero, or the caller must refuse them.
+        """
+        kept = np.ones(self.size, np.bool_) if discount < 1 else ~self.endless
+        result = np.zeros(self.size)
+        result[kept] = self._solve_kept(per_step[kept], discount, kept)
+        return result
+
+    def _solve_kept(self, right: Floats, discount: float, kept: NDArray[np.bool_]) -> Floats:
+        leads = ~self.terminated & kept[self.row] & kept[self.following]
+        place = np.cumsum(kept) - 1
+        row, following = place[self.row[leads]], place[self.following[leads]]
+        weight = -discount * self.weight[leads]
+        n = len(right)
+        if n <= LARGEST_DENSE:
+            matrix = np.eye(n)
+            np.add.at(matrix, (row, following), weight)
+            return np.linalg.solve(matrix, right)
+        from scipy.sparse import csc_array, eye_array
+        from scipy.sparse.linalg import splu
+
+        system = eye_array(n, format="csc") + csc_array((weight, (row, following)), shape=(n, n))
+        solution: Floats = splu(system).solve(right)
+        return solution

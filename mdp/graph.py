@@ -1,0 +1,175 @@
+"""Which states lead where: reachability, distance to the end of an episode, end components.
+
+Every function takes ``allowed``, bool of shape (S, A): the actions that count. Outcomes of
+probability zero lead nowhere.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdp.compiled import compiled
+from mdp.model import TransitionModel
+
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.int64]
+
+
+def reachable_states(model: TransitionModel, allowed: Mask | None = None) -> Mask:
+    """The states that are visited, with positive probability, by allowed actions.
+
+    Returns:
+        bool of shape (S,): starting states, and whatever non-terminating transitions reach.
+    """
+    if allowed is None:
+        allowed = np.ones((model.n_states, model.n_actions), np.bool_)
+    found = model.initial > 0
+    _flood(model.prob, model.next_state, model.terminated, allowed, found)
+    return found
+
+
+def steps_to_end(model: TransitionModel, allowed: Mask, target: Mask) -> tuple[Indices, Indices]:
+    """The fewest transitions of positive probability to a termination or to a target state.
+
+    Returns:
+        The number of steps, shape (S,): 0 for target states, -1 where there is no way. And the
+        states that have a way, in the order of that number.
+    """
+    ends = (model.terminated & (model.prob > 0) & allowed[:, :, None]).any(axis=(1, 2))
+    steps = np.where(target, 0, np.where(ends, 1, -1))
+    order = np.empty(model.n_states, np.int64)
+    nearest = np.concatenate([np.flatnonzero(steps == 0), np.flatnonzero(steps == 1)])
+    order[: len(nearest)] = nearest
+    edges = (model.prob, model.next_state, model.terminated, allowed)
+    first = _count_predecessors(*edges)
+    predecessors = np.empty(first[-1], np.int32 if model.n_states < 2**31 else np.int64)
+    _list_predecessors(*edges, first.copy(), predecessors)
+    found = _search_backwards(first, predecessors, steps, order, len(nearest))
+    return steps, order[:found]
+
+
+def end_components(model: TransitionModel, allowed: Mask) -> tuple[Indices, Mask]:
+    """The maximal sets of states in which an agent can stay for ever, surely.
+
+    An end component is a set of states and actions such that no outcome ends the episode or
+    leaves the set, and each state can be reached from each other (de Alfaro, Formal Verification
+    of Probabilistic Systems, 1997, section 3.3).
+
+    Returns:
+        The number of each state's component, shape (S,), -1 for states in none; and the actions
+        that stay within the component, bool of shape (S, A).
+    """
+    from scipy.sparse.csgraph import connected_components
+
+    possible = model.prob > 0
+    inside = allowed & ~(possible & model.terminated).any(axis=2)
+    while True:
+        _, label = connected_components(_graph(model, inside), connection="strong")
+        same = label[model.next_state] == label[:, None, None]
+        kept = inside & (same | ~possible).all(axis=2)
+        if np.array_equal(kept, inside):
+            return np.where(kept.any(axis=1), label, -1).astype(np.int64), kept
+        inside = kept
+
+
+def _graph(model: TransitionModel, allowed: Mask) -> Any:
+    from scipy.sparse import csr_array
+
+    edges = (model.prob > 0) & allowed[:, :, None]
+    states = np.nonzero(edges)[0]
+    ones = np.ones(len(states), np.int8)
+    shape = (model.n_states, model.n_states)
+    return csr_array((ones, (states, model.next_state[edges])), shape=shape)
+
+
+@compiled
+def _flood(
+    prob: NDArray[np.float64],
+    next_state: NDArray[np.integer],
+    terminated: Mask,
+    allowed: Mask,
+    found: Mask,
+) -> None:
+    """Extend ``found`` by all that it leads to, in place."""
+    n_states, n_actions, n_outcomes = prob.shape
+    stack = np.empty(n_states, np.int64)
+    height = 0
+    for state in range(n_states):
+        if found[state]:
+            stack[height] = state
+            height += 1
+    while height > 0:
+        height -= 1
+        state = stack[height]
+        for action in range(n_actions):
+            if not allowed[state, action]:
+                continue
+            for k in range(n_outcomes):
+                reached = next_state[state, action, k]
+                leads = prob[state, action, k] > 0 and not terminated[state, action, k]
+                if leads and not found[reached]:
+                    found[reached] = True
+                    stack[height] = reached
+                    height += 1
+
+
+@compiled
+def _count_predecessors(
+    prob: NDArray[np.float64],
+    next_state: NDArray[np.integer],
+    terminated: Mask,
+    allowed: Mask,
+) -> Indices:
+    """Where each state's list of predecessors begins; the last entry is the length of all."""
+    n_states, n_actions, n_outcomes = prob.shape
+    first = np.zeros(n_states + 1, np.int64)
+    for state in range(n_states):
+        for action in range(n_actions):
+            if allowed[state, action]:
+                for k in range(n_outcomes):
+                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                        first[next_state[state, action, k] + 1] += 1
+    for state in range(n_states):
+        first[state + 1] += first[state]
+    return first
+
+
+@compiled
+def _list_predecessors(
+    prob: NDArray[np.float64],
+    next_state: NDArray[np.integer],
+    terminated: Mask,
+    allowed: Mask,
+    place: Indices,
+    predecessors: NDArray[np.integer],
+) -> None:
+    n_states, n_actions, n_outcomes = prob.shape
+    for state in range(n_states):
+        for action in range(n_actions):
+            if allowed[state, action]:
+                for k in range(n_outcomes):
+                    if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                        reached = next_state[state, action, k]
+                        predecessors[place[reached]] = state
+                        place[reached] += 1
+
+
+@compiled
+def _search_backwards(
+    first: Indices, predecessors: NDArray[np.integer], steps: Indices, order: Indices, found: int
+) -> int:
+    """Breadth-first search from the first ``found`` states in order; returns how many there are."""
+    done = 0
+    while done < found:
+        reached = order[done]
+        done += 1
+        for place in range(first[reached], first[reached + 1]):
+            state = predecessors[place]
+            if steps[state] < 0:
+                steps[state] = steps[reached] + 1
+                order[found] = state
+                found += 1
+    return found

@@ -1,0 +1,204 @@
+"""A finite Markov decision process as arrays.
+
+The arrays have shape (S, A, K): S states, A actions, and K, the largest number of outcomes that
+any state and action has. Outcome k of taking action a in state s happens with probability
+``prob[s, a, k]``, leads to ``next_state[s, a, k]``, earns ``reward[s, a, k]`` and ends the episode
+if ``terminated[s, a, k]``. Rows with fewer outcomes are padded with outcomes of probability zero.
+
+Termination belongs to the transition, not to the state: what the row of a state says that is
+entered by terminating transitions alone is never used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+PROBABILITY_TOLERANCE = 1e-9
+
+Outcomes = Sequence[tuple[float, int, float, bool]]
+
+
+@dataclass(frozen=True, eq=False)
+class TransitionModel:
+    """The dynamics, rewards and starting states of a finite Markov decision process.
+
+    The arrays are converted to the types below, copied only where that needs it, and read-only.
+    Outcomes keep the order they are given in, and equal ones stay apart: a simulator that picks
+    an outcome by cumulative sum then picks what the source would have picked.
+
+    Args:
+        prob: probabilities, float64 of shape (S, A, K), summing to one over K.
+        next_state: indices of the states reached, int64 (or int32) of shape (S, A, K).
+        reward: rewards, float64 of shape (S, A, K).
+        terminated: whether the episode ends with the outcome, bool of shape (S, A, K).
+        initial: probabilities of the starting states, float64 of shape (S,), summing to one.
+
+    Raises:
+        ValueError: where the shapes disagree, a probability lies outside [0, 1], a row of
+            probabilities does not sum to one within 1e-9, an index is out of range, or a
+            reward is not finite. The message names state and action.
+    """
+
+    prob: NDArray[np.float64]
+    next_state: NDArray[np.integer]
+    reward: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    initial: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        index_type = np.int32 if np.asarray(self.next_state).dtype == np.int32 else np.int64
+        self._freeze("prob", np.float64)
+        self._freeze("next_state", index_type)
+        self._freeze("reward", np.float64)
+        self._freeze("terminated", np.bool_)
+        self._freeze("initial", np.float64)
+        self._check_shapes()
+        self._check_outcomes()
+        self._check_initial()
+
+    @classmethod
+    def from_gymnasium(
+        cls,
+        P: Mapping[int, Mapping[int, Outcomes]],  # noqa: N803 (Gymnasium's own name)
+        initial_state_distrib: ArrayLike,
+    ) -> TransitionModel:
+        """The model held in the attributes of the same names of Gymnasium's toy_text environments.
+
+        Args:
+            P: ``P[state][action]`` is a list of (probability, next state, reward, terminated);
+                states and actions are numbered from zero.
+            initial_state_distrib: probabilities of the starting states, shape (S,).
+
+        Raises:
+            ValueError: as the constructor, and where states have different numbers of actions
+                or a state and action has no outcome.
+        """
+        n_states = len(P)
+        n_actions = len(P[0])
+        rows = [_row(P, state, action) for state in range(n_states) for action in range(n_actions)]
+        lengths = np.array([len(row) for row in rows])
+        n_outcomes = int(lengths.max())
+        filled = np.arange(n_outcomes) < lengths[:, None]
+        flat = [outcome for row in rows for outcome in row]
+
+        def column(position: int, dtype: type[Any]) -> NDArray[Any]:
+            padded = np.zeros(filled.shape, dtype)
+            padded[filled] = [outcome[position] for outcome in flat]
+            return padded.reshape(n_states, n_actions, n_outcomes)
+
+        return cls(
+            prob=column(0, np.float64),
+            next_state=column(1, np.int64),
+            reward=column(2, np.float64),
+            terminated=column(3, np.bool_),
+            initial=np.asarray(initial_state_distrib, np.float64),
+        )
+
+    @property
+    def n_states(self) -> int:
+        """S, the number of states, unreachable ones included."""
+        return self.prob.shape[0]
+
+    @property
+    def n_actions(self) -> int:
+        """A, the number of actions."""
+        return self.prob.shape[1]
+
+    @property
+    def n_outcomes(self) -> int:
+        """K, the largest number of outcomes of any state and action, padding included."""
+        return self.prob.shape[2]
+
+    @cached_property
+    def expected_reward(self) -> NDArray[np.float64]:
+        """The mean reward of one step, shape (S, A)."""
+        return _read_only(np.einsum("sak,sak->sa", self.prob, self.reward))
+
+    @cached_property
+    def reachable(self) -> NDArray[np.bool_]:
+        """The states in which the agent may have to act, bool of shape (S,).
+
+        These are the possible starting states and whatever transitions lead to, from one to the
+        next, without ending the episode. The rows of all other states mean nothing.
+        """
+        from mdp.graph import reachable_states
+
+        return _read_only(reachable_states(self))
+
+    def continuing(self, action: int) -> csr_array:
+        """Probabilities of going from state to state by ``action`` without the episode ending.
+
+        Returns:
+            A sparse matrix of shape (S, S); its rows sum to one minus the probability of ending.
+        """
+        from scipy.sparse import csr_array
+
+        kept = (self.prob[:, action] > 0) & ~self.terminated[:, action]
+        states, _ = np.nonzero(kept)
+        return csr_array(
+            (self.prob[:, action][kept], (states, self.next_state[:, action][kept])),
+            shape=(self.n_states, self.n_states),
+        )
+
+    def _freeze(self, name: str, dtype: type[Any]) -> None:
+        """Replace an array by a read-only view, so that the caller's own stays writable."""
+        view = np.ascontiguousarray(getattr(self, name), dtype).view()
+        object.__setattr__(self, name, _read_only(view))
+
+    def _check_shapes(self) -> None:
+        shape = self.prob.shape
+        if len(shape) != 3 or 0 in shape:
+            raise ValueError(f"prob has shape {shape}, it must be (states, actions, outcomes)")
+        for name in ("next_state", "reward", "terminated"):
+            if getattr(self, name).shape != shape:
+                raise ValueError(f"{name} has shape {getattr(self, name).shape}, prob has {shape}")
+        if self.initial.shape != shape[:1]:
+            raise ValueError(f"initial has shape {self.initial.shape}, it must be {shape[:1]}")
+
+    def _check_outcomes(self) -> None:
+        # Written so that a NaN fails each check.
+        self._require((self.prob >= 0) & (self.prob <= 1), "a probability outside [0, 1]")
+        total = self.prob.sum(axis=2)
+        self._require(
+            np.abs(total - 1) <= PROBABILITY_TOLERANCE, "probabilities that do not sum to one"
+        )
+        in_range = (self.next_state >= 0) & (self.next_state < self.n_states)
+        self._require(in_range, f"a next state outside 0..{self.n_states - 1}")
+        self._require(np.isfinite(self.reward), "a reward that is not finite")
+
+    def _check_initial(self) -> None:
+        bad = np.flatnonzero(~((self.initial >= 0) & (self.initial <= 1)))
+        if bad.size:
+            raise ValueError(f"initial has a probability outside [0, 1] at state {bad[0]}")
+        if not abs(self.initial.sum() - 1) <= PROBABILITY_TOLERANCE:
+            raise ValueError(f"initial sums to {self.initial.sum()}, it must sum to one")
+
+    @staticmethod
+    def _require(valid: NDArray[np.bool_], problem: str) -> None:
+        if not valid.all():
+            state, action = np.argwhere(~valid)[0][:2]
+            raise ValueError(f"state {state}, action {action} has {problem}")
+
+
+def _row(P: Mapping[int, Mapping[int, Outcomes]], state: int, action: int) -> Outcomes:  # noqa: N803
+    if state not in P:
+        raise ValueError(f"P has no state {state}: states must be numbered from 0 to {len(P) - 1}")
+    if len(P[state]) != len(P[0]) or action not in P[state]:
+        raise ValueError(f"state {state} must have the actions 0 to {len(P[0]) - 1} in P")
+    if not P[state][action]:
+        raise ValueError(f"state {state}, action {action} has no outcome in P")
+    return P[state][action]
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    array.setflags(write=False)
+    return array

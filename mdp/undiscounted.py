@@ -1,0 +1,132 @@
+"""Planning without discount: which part of a decision process has a finite optimum.
+
+The sum of rewards until the episode ends is a stochastic shortest path problem (Bertsekas and
+Tsitsiklis, An Analysis of Stochastic Shortest Path Problems, 1991). It has a finite optimum where
+an agent can surely bring the episode to its end, or stay for ever at no cost, and cannot earn for
+ever.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdp.graph import end_components, steps_to_end
+from mdp.model import TransitionModel
+
+Mask = NDArray[np.bool_]
+
+# Expected rewards are sums of products; closer to zero than this they are zero up to rounding.
+ROUNDING = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class FinitePart:
+    """Where the undiscounted optimum is finite.
+
+    Attributes:
+        states: the reachable states whose optimum is finite, bool of shape (S,); from all other
+            reachable states it is minus infinity.
+        allowed: the actions of those states that lead to no others, bool of shape (S, A).
+        resting: the states in which an agent can stay for ever at no cost, bool of shape (S,).
+        rest_actions: the actions that do so, bool of shape (S, A).
+        step_cost: no step that cannot end the episode earns more than minus this; zero where
+            some such step costs nothing.
+    """
+
+    states: Mask
+    allowed: Mask
+    resting: Mask
+    rest_actions: Mask
+    step_cost: float
+
+
+def finite_part(model: TransitionModel) -> FinitePart:
+    """Find where the undiscounted optimum is finite.
+
+    Raises:
+        ValueError: if it is infinite, because an agent can earn for ever, or minus infinity from
+            a starting state, because from there no policy surely ends the episode.
+    """
+    allowed = np.repeat(model.reachable[:, None], model.n_actions, axis=1)
+    ends = (model.terminated & (model.prob > 0)).any(axis=2)
+    endless = allowed & ~ends
+    step_cost = float(-model.expected_reward[endless].max(initial=-np.inf)) if endless.any() else 1.0
+    if step_cost > ROUNDING:
+        rest_actions = np.zeros_like(allowed)
+    else:
+        step_cost = 0.0
+        rest_actions = _rest_actions(model, endless)
+    resting = rest_actions.any(axis=1)
+    states, allowed = _surely_ending(model, allowed, resting)
+    lost = np.flatnonzero((model.initial > 0) & ~states)
+    if lost.size:
+        raise ValueError(
+            f"the undiscounted optimum is not finite: from starting state {lost[0]} no policy "
+            "surely ends the episode; use a discount below 1 or a time limit"
+        )
+    return FinitePart(states, allowed, resting, rest_actions, step_cost)
+
+
+def _surely_ending(model: TransitionModel, allowed: Mask, resting: Mask) -> tuple[Mask, Mask]:
+    """The states from which some policy ends the episode, or comes to rest, with probability one.
+
+    What has no way there is left out, and then what might lead to it, until nothing changes.
+    """
+    leads = (model.prob > 0) & ~model.terminated
+    while True:
+        steps, _ = steps_to_end(model, allowed, resting)
+        good = steps >= 0
+        risky = allowed & (leads & ~good[model.next_state]).any(axis=2)
+        dead = allowed & ~good[:, None]
+        if not (risky | dead).any():
+            return good, allowed
+        allowed = allowed & ~(risky | dead)
+
+
+def _rest_actions(model: TransitionModel, endless: Mask) -> Mask:
+    """The actions by which an agent can stay for ever at no cost, bool of shape (S, A).
+
+    Raises:
+        ValueError: if an agent can earn for ever.
+    """
+    component, staying = end_components(model, endless)
+    reward = model.expected_reward
+    scale = ROUNDING * max(1.0, float(np.abs(reward[endless]).max()))
+    for label in np.unique(component[(staying & (reward > scale)).any(axis=1)]):
+        inside = staying & (component == label)[:, None]
+        if _largest_gain(model, inside) > -scale:
+            state, action = np.argwhere(inside & (reward > scale))[0]
+            raise ValueError(
+                f"the undiscounted optimum is not finite: action {action} in state {state} earns "
+                f"{reward[state, action]:g} and can be repeated for ever at no net cost; "
+                "use a discount below 1 or a time limit"
+            )
+    _, resting = end_components(model, staying & (np.abs(reward) <= scale))
+    return resting
+
+
+def _largest_gain(model: TransitionModel, inside: Mask) -> float:
+    """The largest mean reward per step of staying in an end component, by linear programming.
+
+    Puterman, Markov Decision Processes, 1994, section 8.8: the best stationary flow.
+    """
+    from scipy.optimize import linprog
+    from scipy.sparse import csr_array, vstack
+
+    states, actions = np.nonzero(inside)
+    columns = np.arange(len(states))
+    prob, following = model.prob[states, actions], model.next_state[states, actions]
+    repeated = np.repeat(columns, model.n_outcomes)
+    shape = (model.n_states, len(states))
+    inflow = csr_array((prob.ravel(), (following.ravel(), repeated)), shape=shape)
+    outflow = csr_array((np.ones(len(states)), (states, columns)), shape=shape)
+    balance = (inflow - outflow)[np.unique(states)]
+    flow = linprog(
+        -model.expected_reward[states, actions],
+        A_eq=vstack([balance, np.ones((1, len(states)))]),
+        b_eq=np.append(np.zeros(balance.shape[0]), 1.0),
+    )
+    return float(-flow.fun)

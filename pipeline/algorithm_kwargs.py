@@ -1,0 +1,93 @@
+"""The arguments of an agent's constructor, checked down to its policy's, and built."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, get_args, get_origin
+
+from pipeline.arguments import check_arguments, constructor_parameters
+from pipeline.class_names import find_class
+from pipeline.components import build_value
+from pipeline.errors import UserError, unknown
+from pipeline.hyperparams import check_algorithm_kwargs
+from pipeline.literals import DottedName
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.policies import BasePolicy
+
+
+def build_algorithm_kwargs(
+    algorithm: type[BaseAlgorithm],
+    kwargs: Mapping[str, Any],
+    where: str,
+    extra_packages: Sequence[str] = (),
+) -> dict[str, Any]:
+    """An agent's constructor arguments, checked to the last one and built.
+
+    Beyond `check_algorithm_kwargs` and `build_value`, the policy must exist and know what
+    ``policy_kwargs`` says.
+
+    Args:
+        algorithm: the agent's class.
+        kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
+        where: begins every error message.
+        extra_packages: packages that the user admits beside the usual ones.
+
+    Raises:
+        UserError: naming the argument, and what it must be.
+    """
+    parameters = constructor_parameters(algorithm)
+    checked = check_algorithm_kwargs(kwargs, parameters, where)
+    policy = _policy_class(algorithm, checked, parameters, where, extra_packages)
+    if checked.get("policy_kwargs") is not None:
+        accepted = constructor_parameters(policy)
+        policy_kwargs = check_arguments(
+            checked["policy_kwargs"], accepted, f"{where}: policy_kwargs"
+        )
+        checked["policy_kwargs"] = _build(policy_kwargs, accepted, where, extra_packages)
+    if isinstance(checked.get("policy"), DottedName):
+        checked["policy"] = policy
+    return _build(checked, parameters, where, extra_packages)
+
+
+def _policy_class(
+    algorithm: type[BaseAlgorithm],
+    kwargs: Mapping[str, Any],
+    parameters: Mapping[str, inspect.Parameter],
+    where: str,
+    extra_packages: Sequence[str],
+) -> type[BasePolicy]:
+    from stable_baselines3.common.policies import BasePolicy
+
+    policy = kwargs.get("policy", parameters["policy"].default)
+    if isinstance(policy, DottedName):
+        return find_class(policy.name, (BasePolicy,), f"{where}: policy", extra_packages)
+    if policy is inspect.Parameter.empty:
+        raise UserError(f"{where}: policy is missing: {', '.join(algorithm.policy_aliases)}")
+    if policy not in algorithm.policy_aliases:
+        raise unknown(f"{where}: unknown policy", str(policy), algorithm.policy_aliases)
+    return algorithm.policy_aliases[policy]
+
+
+def _build(
+    kwargs: Mapping[str, Any],
+    parameters: Mapping[str, inspect.Parameter],
+    where: str,
+    extra_packages: Sequence[str],
+) -> dict[str, Any]:
+    """Build each argument, and hold classes against ``type[...]`` in the annotations."""
+    built = {}
+    for name, value in kwargs.items():
+        built[name] = build_value(value, extra_packages, f"{where}: {name}")
+        annotation = parameters[name].annotation if name in parameters else None
+        bases = tuple(
+            get_args(option)[0]
+            for option in (annotation, *get_args(annotation))
+            if get_origin(option) is type
+        )
+        if isinstance(value, DottedName) and bases and not issubclass(built[name], bases):
+            wanted = " or ".join(base.__name__ for base in bases)
+            raise UserError(f"{where}: {name}: {value} is no {wanted}")
+    return built

@@ -1,0 +1,108 @@
+"""Arguments of a constructor: checked by name, by type, and against bounds."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import sys
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from pipeline.coercion import ScheduleSpec, coerce
+from pipeline.errors import UserError, shown, unknown
+
+_FINITE = sys.float_info.max
+
+# Bounds, both included, of hyperparameters that mean the same in every algorithm.
+RANGES: Mapping[str, tuple[float, float]] = {
+    "n_timesteps": (1, _FINITE),
+    "n_episodes": (1, _FINITE),
+    "n_envs": (1, _FINITE),
+    "frame_stack": (1, _FINITE),
+    "noise_std": (0, _FINITE),
+    "learning_rate": (0, _FINITE),
+    "gamma": (0, 1),
+    "gae_lambda": (0, 1),
+    "tau": (0, 1),
+    "clip_range": (0, _FINITE),
+    "clip_range_vf": (0, _FINITE),
+    "exploration_fraction": (0, 1),
+    "exploration_initial_eps": (0, 1),
+    "exploration_final_eps": (0, 1),
+    "temperature": (0, _FINITE),
+    "batch_size": (1, _FINITE),
+    "buffer_size": (1, _FINITE),
+    "n_steps": (1, _FINITE),
+    "n_epochs": (1, _FINITE),
+    "learning_starts": (0, _FINITE),
+    "train_freq": (1, _FINITE),
+    # -1 stands for one for every step of the environment, or for never.
+    "gradient_steps": (-1, _FINITE),
+    "sde_sample_freq": (-1, _FINITE),
+    "target_update_interval": (1, _FINITE),
+    "max_grad_norm": (0, math.inf),
+    "vf_coef": (0, _FINITE),
+    "rms_prop_eps": (0, _FINITE),
+    "target_kl": (0, _FINITE),
+    "stats_window_size": (1, _FINITE),
+}
+
+
+def constructor_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
+    """The arguments of a class's constructor, annotations as objects wherever they resolve."""
+    try:
+        return inspect.signature(cls, eval_str=True).parameters
+    except (NameError, AttributeError, TypeError, SyntaxError):
+        # A name that only type checkers import; annotations that stay texts go unchecked.
+        return inspect.signature(cls).parameters
+
+
+def check_arguments(
+    kwargs: Mapping[str, Any],
+    parameters: Mapping[str, inspect.Parameter],
+    where: str,
+    what: str = "argument",
+    also_known: Iterable[str] = (),
+) -> dict[str, Any]:
+    """Check arguments by name and type.
+
+    Args:
+        kwargs: the arguments as they stand in a file or on the command line.
+        parameters: those that exist; ``**kwargs`` among them admits any name.
+        where: begins every error message.
+        what: what an argument is called there.
+        also_known: further names that a message may suggest.
+
+    Returns:
+        The arguments, each as its annotation asks for, see `pipeline.coercion.coerce`.
+
+    Raises:
+        UserError: if a name is not known, naming the nearest, or a type does not fit.
+    """
+    admits_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    result = {}
+    for name, value in kwargs.items():
+        if name not in parameters and not admits_any:
+            raise unknown(f"{where}: unknown {what}", name, [*parameters, *also_known])
+        annotation = parameters[name].annotation if name in parameters else Any
+        result[name] = coerce(value, annotation, f"{where}: {name}")
+    return result
+
+
+def check_range(name: str, value: object, where: str) -> None:
+    """Refuse a number, or an end of a schedule, outside of `RANGES`.
+
+    Raises:
+        UserError: saying what the bounds are.
+    """
+    if isinstance(value, ScheduleSpec):
+        check_range(name, value.start, where)
+        check_range(name, value.end, where)
+    if isinstance(value, tuple) and value:
+        check_range(name, value[0], where)
+    if name in RANGES and isinstance(value, int | float):
+        low, high = RANGES[name]
+        if not low <= value <= high:
+            bounds = f"at least {low}" if high >= _FINITE else f"between {low} and {high}"
+            finite = " and finite" if value > high >= _FINITE else ""
+            raise UserError(f"{where}: {name} must be {bounds}{finite}, not {shown(value)}")

@@ -1,0 +1,53 @@
+"""What the commands share: one-line errors, exit codes, and lists of ``key:value``."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+from collections.abc import Callable
+from typing import NoReturn
+
+from pipeline.errors import UserError, did_you_mean, one_line
+
+MISTAKE = 2
+INTERRUPT = 130
+
+
+class OneLineParser(argparse.ArgumentParser):
+    """An argument parser whose complaints are one line and name the nearest flag."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print the mistake and exit with code 2."""
+        unknown = message.removeprefix("unrecognized arguments: ")
+        if unknown != message:
+            flags = [flag for action in self._actions for flag in action.option_strings]
+            message = f"unknown argument {unknown}: {did_you_mean(unknown.split()[0], flags)}"
+        self.exit(MISTAKE, f"{self.prog}: error: {message} (see --help)\n")
+
+
+def run_command(main: Callable[[], int]) -> NoReturn:
+    """Run a command's ``main`` and exit with its code.
+
+    A mistake of the user's, or a file system that refuses, ends in one line on stderr and exit
+    code 2.
+    """
+    program = os.path.basename(sys.argv[0])  # noqa: PTH119  # a name, not a path
+    try:
+        sys.exit(main())
+    except UserError as error:
+        message = str(error)
+    except OSError as error:
+        place = f": {error.filename}" if error.filename else ""
+        message = f"{error.strerror or one_line(error)}{place}"
+    except KeyboardInterrupt:
+        print(f"{program}: interrupted", file=sys.stderr)
+        sys.exit(INTERRUPT)
+    print(f"{program}: error: {message}", file=sys.stderr)
+    sys.exit(MISTAKE)
+
+
+def command_line() -> str:
+    """The command as it was typed, ready to be typed again."""
+    return shlex.join(["python", *sys.argv])

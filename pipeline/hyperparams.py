@@ -1,0 +1,289 @@
+"""Hyperparameters in rl_zoo3's format: read strictly, and never run.
+
+One YAML file per algorithm maps environment ids to entries. An entry holds arguments of the
+algorithm's constructor, and the special keys that `Hyperparams` lists.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, get_type_hints
+
+from pipeline.arguments import check_arguments, check_range
+from pipeline.coercion import coerce
+from pipeline.errors import UserError, did_you_mean, shown
+from pipeline.literals import contains_name
+from pipeline.strict_yaml import read_yaml
+
+_FOLDER = Path(__file__).resolve().parent.parent / "hyperparams"
+_ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
+_TOP_LEVEL_KEY = re.compile(r"^([\w./-]+):", re.MULTILINE)
+_STAND_INS = ("default", "atari")
+
+# Constructor arguments that the command line sets, and how.
+_COMMAND_LINE = {
+    "env": "--env",
+    "seed": "--seed",
+    "device": "--device",
+    "verbose": "--verbose",
+    "tensorboard_log": "--tensorboard-log",
+}
+_INTERNAL = ("self", "_init_setup_model")
+
+_WRAPPERS = ("env_wrapper", "train_env_wrapper", "vec_env_wrapper", "callback")
+_KEYWORDS: Mapping[str, Mapping[str, Any]] = {
+    "normalize": {
+        "training": bool,
+        "norm_obs": bool,
+        "norm_reward": bool,
+        "clip_obs": float,
+        "clip_reward": float,
+        "gamma": float,
+        "epsilon": float,
+        "norm_obs_keys": list[str] | None,
+    },
+    "monitor_kwargs": {
+        "allow_early_resets": bool,
+        "reset_keywords": tuple[str, ...],
+        "info_keywords": tuple[str, ...],
+        "override_existing": bool,
+    },
+}
+
+
+class NoEntryError(UserError):
+    """A file of hyperparameters says nothing about the environment."""
+
+
+@dataclass(frozen=True)
+class ComponentSpec:
+    """A wrapper or callback that an entry asks for.
+
+    Attributes:
+        name: the dotted name of its class.
+        kwargs: arguments of its constructor.
+    """
+
+    name: str
+    kwargs: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Hyperparams:
+    """One entry, the special keys apart from the algorithm's arguments.
+
+    Attributes:
+        n_timesteps: environment steps to train for; None if counted in episodes or not said.
+        n_episodes: episodes to train for; never set together with ``n_timesteps``.
+        n_envs: environments to train on at once.
+        normalize: arguments of VecNormalize, the algorithm's ``gamma`` included; None for without.
+        env_wrapper: wrappers of every environment, the innermost first.
+        train_env_wrapper: wrappers of the training environments alone, around those.
+        vec_env_wrapper: wrappers of the vectorised environment.
+        callback: callbacks of the training.
+        env_kwargs: arguments of every environment.
+        train_env_kwargs: further arguments of the training environments alone.
+        eval_env_kwargs: further arguments of the evaluation environments alone.
+        frame_stack: how many observations to stack, or None.
+        monitor_kwargs: arguments of Monitor.
+        noise_type: action noise, for algorithms that take an ``action_noise``.
+        noise_std: its standard deviation.
+        algorithm: everything else: arguments of the algorithm's constructor, not checked yet.
+    """
+
+    n_timesteps: int | None = None
+    n_episodes: int | None = None
+    n_envs: int = 1
+    normalize: dict[str, Any] | None = None
+    env_wrapper: tuple[ComponentSpec, ...] = ()
+    train_env_wrapper: tuple[ComponentSpec, ...] = ()
+    vec_env_wrapper: tuple[ComponentSpec, ...] = ()
+    callback: tuple[ComponentSpec, ...] = ()
+    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    train_env_kwargs: dict[str, Any] = field(default_factory=dict)
+    eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
+    frame_stack: int | None = None
+    monitor_kwargs: dict[str, Any] = field(default_factory=dict)
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
+    noise_std: float | None = None
+    algorithm: dict[str, Any] = field(default_factory=dict)
+
+
+SPECIAL_KEYS = tuple(key.name for key in fields(Hyperparams) if key.name != "algorithm")
+
+
+def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> dict[str, Any]:
+    """Read the entry of an environment.
+
+    Args:
+        algo: the algorithm, whose file is ``hyperparams/<algo>.yml``.
+        env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts. The entry
+            ``atari`` stands in for Atari games without their own, ``default`` for all others.
+        path: another file to read.
+
+    Returns:
+        The entry as it stands there, see `split`.
+
+    Raises:
+        UserError: if the file cannot be read or is not of this format.
+        NoEntryError: if it has no entry that fits.
+    """
+    path = _path(algo, path)
+    if path.suffix == ".py":
+        raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
+    entries = read_yaml(path)
+    if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
+        raise UserError(f"{path}: must map environment ids to hyperparameters")
+    key = _find_entry(entries, env_id.partition(":")[2] or env_id)
+    if key is None:
+        hint = did_you_mean(env_id, [name for name in entries if name not in _STAND_INS], n=3)
+        raise NoEntryError(
+            f"{path}: no entry for {shown(env_id)}{' (' + hint + ')' if hint else ''}; "
+            "give hyperparameters with -params, or another file with --conf-file"
+        )
+    entry = entries[key]
+    if not (isinstance(entry, dict) and all(isinstance(name, str) for name in entry)):
+        raise UserError(f"{path}: the entry {key} must map names to values")
+    return entry
+
+
+def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:
+    if env_id in entries:
+        return env_id
+    if _ATARI_ID.fullmatch(env_id) and "atari" in entries:
+        return "atari"
+    return "default" if "default" in entries else None
+
+
+def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
+    """Ids of the environments that an algorithm's file has an entry for, in its order.
+
+    Empty where there is no such file. The stand-ins ``default`` and ``atari`` are left out.
+    """
+    path = _path(algo, path)
+    # The keys alone, by their place in the line: parsing all files would slow listing them down.
+    names = _TOP_LEVEL_KEY.findall(path.read_text("utf-8")) if path.is_file() else []
+    return [name for name in names if name not in _STAND_INS]
+
+
+def _path(algo: str, path: Path | str | None) -> Path:
+    return _FOLDER / f"{algo}.yml" if path is None else Path(path)
+
+
+def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry with ``changes`` put over it; one budget of training replaces the other."""
+    kept = dict(entry)
+    if not {"n_timesteps", "n_episodes"}.isdisjoint(changes):
+        kept.pop("n_timesteps", None)
+        kept.pop("n_episodes", None)
+    return {**kept, **changes}
+
+
+def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperparams:
+    """Tell the special keys of an entry from the algorithm's arguments, and check them.
+
+    Args:
+        entry: what `read_hyperparams` returned. A special key that is null counts as left out.
+        where: begins every error message.
+
+    Raises:
+        UserError: if a special key has a wrong type or range, or contradicts another.
+    """
+    algorithm = {key: value for key, value in entry.items() if key not in SPECIAL_KEYS}
+    special = {key: value for key in SPECIAL_KEYS if (value := entry.get(key)) is not None}
+    if isinstance(special.get("normalize"), bool):
+        special["normalize"] = {} if special["normalize"] else None
+    hints = get_type_hints(Hyperparams)
+    for key, value in special.items():
+        if key in _WRAPPERS:
+            special[key] = component_specs(value, f"{where}: {key}")
+        else:
+            special[key] = coerce(value, hints[key], f"{where}: {key}")
+        check_range(key, special[key], where)
+        if isinstance(special[key], dict):
+            special[key] = _checked_keywords(key, special[key], where)
+    if "n_timesteps" in special and "n_episodes" in special:
+        raise UserError(f"{where}: give n_timesteps or n_episodes, not both")
+    if special.get("normalize") is not None and "gamma" in algorithm:
+        # As rl_zoo3 has it: rewards are normalised under the discount that the agent uses.
+        gamma = coerce(algorithm["gamma"], float, f"{where}: gamma")
+        special["normalize"].setdefault("gamma", gamma)
+    return Hyperparams(**special, algorithm=algorithm)
+
+
+def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
+    """Read wrappers or callbacks in rl_zoo3's forms.
+
+    Args:
+        spec: the dotted name of a class, a mapping from it to its arguments, a list of either, or
+            what this function returned before.
+        where: begins every error message.
+
+    Raises:
+        UserError: if the form is another.
+    """
+    items = spec if isinstance(spec, list | tuple) else [] if spec is None else [spec]
+    return tuple(_component_spec(item, where) for item in items)
+
+
+def _component_spec(item: Any, where: str) -> ComponentSpec:
+    if isinstance(item, ComponentSpec):
+        return item
+    if isinstance(item, dict) and len(item) == 1:
+        ((name, kwargs),) = item.items()
+    else:
+        name, kwargs = item, None
+    kwargs = {} if kwargs is None else kwargs
+    if not (isinstance(name, str) and isinstance(kwargs, dict) and set(map(type, kwargs)) <= {str}):
+        raise UserError(
+            f"{where} must be the dotted name of a class, or that name with its arguments indented "
+            f"below it, or a list of such; not {shown(item)}"
+        )
+    return ComponentSpec(name, kwargs)
+
+
+def _checked_keywords(key: str, keywords: dict[str, Any], where: str) -> dict[str, Any]:
+    if contains_name(keywords):
+        raise UserError(f"{where}: {key} takes plain values, not names: put quotes around texts")
+    if key not in _KEYWORDS:
+        return keywords
+    parameters = {
+        name: inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
+        for name, annotation in _KEYWORDS[key].items()
+    }
+    return check_arguments(keywords, parameters, f"{where}: {key}")
+
+
+def check_algorithm_kwargs(
+    kwargs: Mapping[str, Any], parameters: Mapping[str, inspect.Parameter], where: str
+) -> dict[str, Any]:
+    """Check constructor arguments by name, type and range.
+
+    Args:
+        kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
+        parameters: those of the constructor, from `pipeline.arguments.constructor_parameters`.
+        where: begins every error message.
+
+    Returns:
+        The arguments as their annotations ask for; classes as `DottedName` and schedules as
+        `ScheduleSpec`, which `pipeline.components.build_value` turns into objects.
+
+    Raises:
+        UserError: naming the argument, and what it must be.
+    """
+    for name in kwargs:
+        if name in _COMMAND_LINE and name in parameters:
+            raise UserError(f"{where}: {name} is set by {_COMMAND_LINE[name]}, not here")
+    known = {
+        name: parameter
+        for name, parameter in parameters.items()
+        if name not in _COMMAND_LINE and name not in _INTERNAL
+    }
+    result = check_arguments(kwargs, known, where, "hyperparameter", SPECIAL_KEYS)
+    for name, value in result.items():
+        check_range(name, value, where)
+    return result

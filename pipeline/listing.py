@@ -1,0 +1,50 @@
+"""The agents, the environments, and which fit which."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+from rich.console import Console
+from rich.table import Table
+
+from agents import ALGORITHMS, fitting_algorithms
+from pipeline.environments import make_env
+from pipeline.hyperparams import entry_names
+
+
+def print_lists() -> None:
+    """Print the table of agents and that of environments."""
+    console = Console(highlight=False)
+    _print_agents(console)
+    console.print()
+    _print_environments(console)
+
+
+def _print_agents(console: Console) -> None:
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    table.add_column("agent (--algo)", style="bold", no_wrap=True)
+    table.add_column("what it is")
+    for name, entry in ALGORITHMS.items():
+        missing = f"  needs: pip install 'rl-yardstick\\[{entry.extra}]'"
+        table.add_row(name, entry.summary + ("" if entry.is_installed else missing))
+    console.print(table)
+
+
+def _print_environments(console: Console) -> None:
+    """A row for each environment that some agent has hyperparameters of its own for."""
+    tuned = {name: set(entry_names(name)) for name in ALGORITHMS}
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    table.add_column("environment (--env)", style="bold", no_wrap=True)
+    table.add_column("agents with hyperparameters for it")
+    table.add_column("also fit, with default ones")
+    for env_id in sorted(set().union(*tuned.values()) & set(gym.registry)):
+        env = make_env(env_id, {})
+        with_entry = [name for name in ALGORITHMS if env_id in tuned[name]]
+        fitting = fitting_algorithms(env.observation_space, env.action_space)
+        others = [name for name in fitting if name not in with_entry]
+        env.close()
+        table.add_row(env_id, " ".join(with_entry), " ".join(others))
+    console.print(table)
+    console.print(
+        "\nAny other environment registered with Gymnasium works where the spaces fit; "
+        "--gym-packages imports modules that register more."
+    )

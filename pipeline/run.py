@@ -1,0 +1,170 @@
+"""One run folder: its number, the names of its files, and its state.
+
+The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, so that its tools read our runs;
+``run.json`` is ours and says what was asked for, how far it came, and what came out.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import UserError
+from pipeline.files import write_json
+
+RUNNING = "running"
+FINISHED = "finished"
+INTERRUPTED = "interrupted"
+FAILED = "failed"
+
+
+def environment_name(env_id: str) -> str:
+    """The environment's id as a file name: no module before it, and no slash in it."""
+    return env_id.rpartition(":")[2].replace("/", "-")
+
+
+def _run_number(name: str, env_name: str) -> int:
+    """The number in a run folder's name, with or without a unique suffix; 0 if it is none."""
+    match = re.fullmatch(re.escape(env_name) + r"_(\d+)(?:_[0-9a-f-]{36})?", name)
+    return int(match[1]) if match else 0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder.
+
+    Attributes:
+        path: the folder.
+        env_name: the environment's name in file names.
+    """
+
+    path: Path
+    env_name: str
+
+    @classmethod
+    def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
+        """Make the folder of a new run, with the first number that is free.
+
+        Raises:
+            UserError: if the folder cannot be made.
+        """
+        name = environment_name(env_id)
+        parent = log_folder / algo
+        try:
+            parent.mkdir(parents=True, exist_ok=True)
+            number = max((n for n, _ in numbered_runs(parent, name)), default=0) + 1
+            while True:
+                path = parent / f"{name}_{number}{suffix}"
+                try:
+                    # Making the folder is what claims the number: two runs never share one.
+                    path.mkdir()
+                    break
+                except FileExistsError:
+                    number += 1
+            run = cls(path, name)
+            run.params_path.mkdir()
+        except OSError as error:
+            raise UserError(f"cannot make a run folder in {parent}: {error.strerror}") from error
+        return run
+
+    @classmethod
+    def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
+        """The run of that number, or the newest where the number is 0.
+
+        Raises:
+            UserError: if there is none; it names those that there are.
+        """
+        name = environment_name(env_id)
+        runs = numbered_runs(log_folder / algo, name)
+        if not runs:
+            raise UserError(
+                f"no run of {algo} on {name} in {log_folder}: "
+                f"train one with: python train.py --algo {algo} --env {env_id} -f {log_folder}"
+            )
+        if number == 0:
+            return cls(runs[-1][1], name)
+        for known, path in runs:
+            if known == number:
+                return cls(path, name)
+        numbers = ", ".join(str(known) for known, _ in runs)
+        raise UserError(f"no run {number} of {algo} on {name} in {log_folder}: there is {numbers}")
+
+    @property
+    def params_path(self) -> Path:
+        """The folder of the run's settings and normalisation statistics."""
+        return self.path / self.env_name
+
+    @property
+    def model_path(self) -> Path:
+        """The agent at the end of training."""
+        return self.path / f"{self.env_name}.zip"
+
+    @property
+    def best_model_path(self) -> Path:
+        """The agent that evaluated best."""
+        return self.path / "best_model.zip"
+
+    def checkpoint_path(self, n_steps: int) -> Path:
+        """The agent after ``n_steps`` steps."""
+        return self.path / f"rl_model_{n_steps}_steps.zip"
+
+    def checkpoints(self) -> list[Path]:
+        """The checkpoints that there are, by rising number of steps."""
+        steps = (
+            re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name) for path in self.path.iterdir()
+        )
+        return [self.checkpoint_path(n) for n in sorted(int(match[1]) for match in steps if match)]
+
+    @property
+    def evaluations_path(self) -> Path:
+        """The evaluations during training."""
+        return self.path / "evaluations.npz"
+
+    @property
+    def vecnormalize_path(self) -> Path:
+        """The running statistics of VecNormalize."""
+        return self.params_path / "vecnormalize.pkl"
+
+    @property
+    def info_path(self) -> Path:
+        """What the run was asked for and what came out."""
+        return self.path / "run.json"
+
+    @property
+    def curve_path(self) -> Path:
+        """The picture of the learning curve."""
+        return self.path / "learning_curve.png"
+
+    def read_info(self) -> dict[str, Any]:
+        """The contents of ``run.json``; empty where there is none.
+
+        Raises:
+            UserError: if the file is damaged.
+        """
+        try:
+            info: dict[str, Any] = json.loads(self.info_path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return {}
+        except ValueError as error:
+            raise UserError(f"{self.info_path} is damaged: {error}") from error
+        return info
+
+    def update_info(self, **fields: Any) -> None:
+        """Set fields of ``run.json``."""
+        write_json(self.info_path, {**self.read_info(), **fields})
+
+    def discard(self) -> None:
+        """Remove the folder, where nothing has come of the run."""
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:
+    """The run folders of one environment, by rising number."""
+    if not parent.is_dir():
+        return []
+    numbered = [(_run_number(path.name, env_name), path) for path in parent.iterdir()]
+    return sorted((number, path) for number, path in numbered if number > 0)

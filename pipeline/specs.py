@@ -1,0 +1,68 @@
+"""What a training run is asked to do, as one immutable value."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from pipeline.hyperparams import Hyperparams
+
+
+@dataclass(frozen=True)
+class TrainSpec:
+    """One training run.
+
+    Attributes:
+        algo: name of the agent.
+        env_id: id of the environment.
+        hyperparams: the merged hyperparameters, read but not yet made into objects.
+        saved_hyperparams: the same as plain data, for the run folder.
+        seed: of everything random in the run.
+        eval_freq: environment steps between two evaluations; below 0 for none, None for twenty
+            evaluations over the run.
+        eval_episodes: episodes of each evaluation during training.
+        n_eval_envs: environments that an evaluation plays on at once.
+        save_freq: environment steps between two checkpoints; below 1 for none.
+        log_folder: the folder above all runs.
+        tensorboard_log: folder for TensorBoard, or None.
+        trained_agent: a zip to go on training, or None.
+        vec_env: ``"dummy"`` or ``"subproc"``.
+        device: torch device of the networks.
+        num_threads: torch threads; results may differ between numbers of threads.
+        log_interval: episodes (or rollouts) between two log records; below 0 for the default.
+        verbose: 0 silent, 1 progress and summary, 2 the library's own log as well.
+        progress: draw a live bar wherever the output goes.
+        gym_packages: modules to import for the environments that they register.
+        unique_id: give the folder a name that no other machine's run can have.
+    """
+
+    algo: str
+    env_id: str
+    hyperparams: Hyperparams
+    saved_hyperparams: dict[str, Any]
+    seed: int
+    eval_freq: int | None = None
+    eval_episodes: int = 20
+    n_eval_envs: int = 10
+    save_freq: int = -1
+    log_folder: Path = Path("logs")
+    tensorboard_log: Path | None = None
+    trained_agent: Path | None = None
+    vec_env: str = "dummy"
+    device: str = "auto"
+    num_threads: int = 1
+    log_interval: int = -1
+    verbose: int = 1
+    progress: bool = False
+    gym_packages: tuple[str, ...] = field(default=())
+    unique_id: bool = False
+
+    def as_data(self) -> dict[str, Any]:
+        """The spec as JSON."""
+        data = asdict(self)
+        del data["hyperparams"]
+        data["hyperparams"] = data.pop("saved_hyperparams")
+        for name in ("log_folder", "tensorboard_log", "trained_agent"):
+            data[name] = None if data[name] is None else str(data[name])
+        return data

@@ -1,0 +1,124 @@
+"""YAML without surprises: plain data only, no key twice, and errors that say where.
+
+Beside `yaml.safe_load`, three things differ: a repeated key is refused instead of winning silently,
+dates and other tags stay what they look like or are refused, and ``1e-4`` is a number, as YAML 1.2
+has it, not a text.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import yaml
+from yaml.constructor import ConstructorError
+from yaml.nodes import MappingNode, Node, ScalarNode
+
+from pipeline.errors import UserError, shown
+
+_TAG = "tag:yaml.org,2002:"
+_PLAIN_TAGS = frozenset(
+    _TAG + name for name in ("null", "bool", "int", "float", "str", "seq", "map")
+)
+_MAX_DEPTH = 50
+_MAX_VALUES = 100_000
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """Refuses repeated keys and every tag but those of plain data."""
+
+    yaml_implicit_resolvers = {  # noqa: RUF012 # PyYAML copies it itself before it adds to it
+        first: [(tag, regexp) for tag, regexp in resolvers if tag != _TAG + "timestamp"]
+        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
+
+    def compose_mapping_node(self, anchor: dict[Any, Node]) -> MappingNode:
+        # Here, and not where the mapping is built: by then merged keys stand among its own.
+        node = super().compose_mapping_node(anchor)
+        first_lines: dict[str, int] = {}
+        for key in (key for key, _ in node.value if isinstance(key, ScalarNode)):
+            if key.value in first_lines:
+                first = first_lines[key.value]
+                problem = f"key {shown(key.value)} appears twice, first on line {first}"
+                raise ConstructorError(None, None, problem, key.start_mark)
+            first_lines[key.value] = key.start_mark.line + 1
+        return node
+
+    def construct_object(self, node: Node, deep: bool = False) -> Any:
+        if node.tag not in _PLAIN_TAGS:
+            problem = f"{node.tag.replace(_TAG, '!!')} is not allowed here"
+            raise ConstructorError(None, None, problem, node.start_mark)
+        try:
+            return super().construct_object(node, deep)
+        except (ValueError, LookupError) as error:
+            problem = f"{shown(node.value)} is no {node.tag.removeprefix(_TAG)}"
+            raise ConstructorError(None, None, problem, node.start_mark) from error
+
+
+_StrictLoader.add_implicit_resolver(
+    _TAG + "float", re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), "-+0123456789"
+)
+
+
+def parse_yaml(content: str | bytes, where: str) -> Any:
+    """Read one YAML document.
+
+    Args:
+        content: the document; bytes may be UTF-8 or UTF-16.
+        where: the file it comes from, for error messages.
+
+    Returns:
+        Nested lists, dictionaries, texts, numbers, booleans and None.
+
+    Raises:
+        UserError: if it is not YAML, holds anything but plain data, or a key twice.
+    """
+    try:
+        value = _load(content)
+        _check_size(value)
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
+        raise UserError(f"{where}{place}: {error.problem or error.context}") from error
+    except yaml.YAMLError as error:
+        raise UserError(f"{where}: is not a text file, or holds control characters") from error
+    except (RecursionError, ValueError) as error:
+        raise UserError(f"{where}: is nested too deeply, or too large") from error
+    return value
+
+
+def read_yaml(path: Path) -> Any:
+    """Read the one YAML document in a file; see `parse_yaml`.
+
+    Raises:
+        UserError: if the file cannot be read, or is not such a document.
+    """
+    try:
+        content = path.read_bytes()
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"{path}: cannot be read: {reason}") from error
+    return parse_yaml(content, str(path))
+
+
+def _load(content: str | bytes) -> Any:
+    loader = _StrictLoader(content)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
+
+
+def _check_size(value: Any) -> None:
+    """Refuse what a few anchors can unfold to: structures without end, or of billions of values."""
+    pending = [(value, 0)]
+    count = 0
+    while pending:
+        item, depth = pending.pop()
+        count += 1
+        if depth > _MAX_DEPTH or count > _MAX_VALUES:
+            raise ValueError
+        children = item.values() if isinstance(item, dict) else item
+        if isinstance(item, dict | list):
+            pending.extend((child, depth + 1) for child in children)

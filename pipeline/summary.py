@@ -1,0 +1,57 @@
+"""The few lines before and after a training run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.run import FINISHED
+from pipeline.specs import TrainSpec
+
+if TYPE_CHECKING:
+    from pipeline.evaluation import Evaluation
+    from pipeline.training import Outcome
+
+
+def describe(evaluation: Evaluation) -> str:
+    """An evaluation in a few words."""
+    text = (
+        f"return {evaluation.mean_return:.2f} ± {evaluation.std_return:.2f} "
+        f"over {len(evaluation.returns)} episodes"
+    )
+    if evaluation.success_rate is not None:
+        text += f", success {evaluation.success_rate:.0%}"
+    return text
+
+
+def print_header(console: Console, spec: TrainSpec) -> None:
+    """Say what is about to be trained, and with which hyperparameters."""
+    budget = spec.hyperparams.n_timesteps or spec.hyperparams.n_episodes or 0
+    unit = "steps" if spec.hyperparams.n_timesteps else "episodes"
+    console.print(
+        f"[bold]{spec.algo}[/] on [bold]{spec.env_id}[/], seed {spec.seed}, {budget:,} {unit}"
+    )
+    settings = "  ".join(f"{key}={value}" for key, value in spec.saved_hyperparams.items())
+    console.print(f"[dim]{settings}[/]", highlight=False)
+
+
+def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
+    """Say what came out and where the files lie."""
+    speed = outcome.n_steps / max(outcome.seconds, 1e-9)
+    table = Table.grid(padding=(0, 2))
+    done = "trained" if outcome.state == FINISHED else "interrupted"
+    table.add_row(
+        done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)"
+    )
+    if outcome.final is not None:
+        table.add_row("final", describe(outcome.final))
+    if outcome.best_return is not None:
+        table.add_row(
+            "best", f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
+        )
+    table.add_row("files", str(outcome.run.path))
+    folder = "" if str(spec.log_folder) == "logs" else f" -f {spec.log_folder}"
+    table.add_row("watch", f"python enjoy.py --algo {spec.algo} --env {spec.env_id}{folder}")
+    console.print(table, highlight=False)

@@ -1,0 +1,274 @@
+"""From a spec to a finished run folder."""
+
+from __future__ import annotations
+
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib.metadata import version
+from typing import Any
+from uuid import uuid4
+
+import torch as th
+import yaml
+from rich.console import Console
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents import load_algorithm
+from pipeline import components
+from pipeline.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.callbacks import (
+    EpisodeBudget,
+    EvaluationCallback,
+    StepCheckpoint,
+    save_model,
+    save_normalization,
+)
+from pipeline.environments import make_evaluation_env, make_training_env
+from pipeline.errors import UserError, one_line
+from pipeline.evaluation import Evaluation, evaluate, evaluation_seed
+from pipeline.files import write_text
+from pipeline.loading import load_model
+from pipeline.plots import draw_learning_curve
+from pipeline.progress import ProgressDisplay
+from pipeline.run import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
+from pipeline.specs import TrainSpec
+
+FINAL_EVALUATION_EPISODES = 100
+EVALUATIONS_PER_RUN = 20
+# A budget in episodes has no number of steps; this one is never reached.
+UNBOUNDED_TIMESTEPS = 10**12
+
+RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
+
+
+@dataclass(frozen=True)
+class Training:
+    """A run that is set up and can be started.
+
+    Attributes:
+        spec: what was asked for.
+        run: its folder.
+        model: the agent, with its environments.
+        eval_env: environments to evaluate on.
+        evaluation: the evaluation callback, also part of ``callback``.
+        callback: all callbacks.
+    """
+
+    spec: TrainSpec
+    run: Run
+    model: BaseAlgorithm
+    eval_env: VecEnv
+    evaluation: EvaluationCallback
+    display: ProgressDisplay
+    callback: BaseCallback
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a run has come to.
+
+    Attributes:
+        run: its folder.
+        state: ``"finished"`` or ``"interrupted"``.
+        n_steps: environment steps that were run.
+        seconds: time that they took, evaluations included.
+        final: evaluation of the agent at the end, by episodes that served nothing else; None where
+            evaluation was turned off.
+        best_return: mean return of the best evaluation during training, if there was one.
+        best_timesteps: when that was.
+    """
+
+    run: Run
+    state: str
+    n_steps: int
+    seconds: float
+    final: Evaluation | None
+    best_return: float | None
+    best_timesteps: int
+
+
+def train(spec: TrainSpec, console: Console, args: dict[str, Any], command: str) -> Outcome:
+    """Train the agent and leave a run folder.
+
+    Ctrl-C ends the training early; what has been learnt is saved all the same.
+
+    Args:
+        spec: what to do.
+        console: where to report to.
+        args: the command's arguments, for the run folder.
+        command: the command itself, likewise.
+
+    Raises:
+        UserError: if the spec does not work out; no folder is left behind then.
+    """
+    th.set_num_threads(spec.num_threads)
+    kwargs = algorithm_kwargs(spec)
+    suffix = f"_{uuid4()}" if spec.unique_id else ""
+    run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
+    with _discarding_on_failure(run):
+        training = _set_up(spec, run, kwargs, console)
+        _write_settings(training, args, command)
+    return _execute(training)
+
+
+def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
+    """The arguments of the agent's constructor, checked and made into objects.
+
+    Raises:
+        UserError: if one is unknown or has a wrong type or range.
+    """
+    return build_algorithm_kwargs(
+        load_algorithm(spec.algo), spec.hyperparams.algorithm, spec.algo, spec.gym_packages
+    )
+
+
+@contextmanager
+def _discarding_on_failure(run: Run) -> Iterator[None]:
+    try:
+        yield
+    except (ValueError, TypeError, AssertionError, RuntimeError) as error:
+        run.discard()
+        raise UserError(one_line(error)) from error
+    except BaseException:
+        run.discard()
+        raise
+
+
+def _set_up(spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console) -> Training:
+    env = make_training_env(spec, run.path)
+    model = _make_model(spec, env, kwargs)
+    eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
+    evaluation = EvaluationCallback(
+        run,
+        eval_env,
+        partial(
+            evaluate,
+            env=eval_env,
+            n_episodes=spec.eval_episodes,
+            seed=evaluation_seed(spec.seed, 1),
+        ),
+        _evaluation_interval(spec, env.num_envs),
+    )
+    display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
+    callbacks: list[BaseCallback] = components.callbacks(
+        spec.hyperparams.callback, spec.gym_packages, run.path
+    )
+    if spec.save_freq > 0:
+        callbacks.append(StepCheckpoint(spec.save_freq, run.path))
+    callbacks.append(evaluation)
+    if spec.hyperparams.n_episodes is not None:
+        callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
+    if spec.verbose > 0:
+        callbacks.append(display)
+    return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks))
+
+
+def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlgorithm:
+    common: dict[str, Any] = {
+        "seed": spec.seed,
+        "verbose": max(spec.verbose - 1, 0),
+        "tensorboard_log": None
+        if spec.tensorboard_log is None
+        else str(spec.tensorboard_log / spec.env_id),
+    }
+    if spec.trained_agent is None:
+        return load_algorithm(spec.algo)(env=env, device=spec.device, **common, **kwargs)
+    # The networks are those of the file: their shape cannot change.
+    kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
+    return load_model(spec.algo, spec.trained_agent, env, device=spec.device, **common, **kwargs)
+
+
+def _evaluation_interval(spec: TrainSpec, n_envs: int) -> int:
+    """Calls of `VecEnv.step` between two evaluations; 0 for none."""
+    if spec.eval_freq is not None:
+        return max(spec.eval_freq // n_envs, 1) if spec.eval_freq > 0 else 0
+    n_timesteps = spec.hyperparams.n_timesteps
+    if n_timesteps is None:
+        return 10_000 // n_envs
+    return max(n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1)
+
+
+def _write_settings(training: Training, args: dict[str, Any], command: str) -> None:
+    """Write what the run was asked to do, as rl_zoo3 does and as our own ``run.json``."""
+    run, spec = training.run, training.spec
+    write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
+    write_text(run.params_path / "args.yml", yaml.safe_dump(args))
+    write_text(run.params_path / "command.txt", command + "\n")
+    run.update_info(
+        state=RUNNING,
+        env_name=run.env_name,
+        spec=spec.as_data(),
+        versions={"python": platform.python_version()}
+        | {package: version(package) for package in RECORDED_PACKAGES},
+    )
+
+
+def _execute(training: Training) -> Outcome:
+    run, model = training.run, training.model
+    started = time.monotonic()
+    state = FINISHED
+    try:
+        try:
+            _learn(training)
+        except KeyboardInterrupt:
+            state = INTERRUPTED
+        finally:
+            training.display.close()
+        return _finish(training, state, time.monotonic() - started)
+    except BaseException as error:
+        run.update_info(state=FAILED, reason=one_line(error))
+        raise
+    finally:
+        training.eval_env.close()
+        if model.env is not None:
+            model.env.close()
+
+
+def _learn(training: Training) -> None:
+    spec = training.spec
+    kwargs: dict[str, Any] = {}
+    if spec.log_interval != -1:
+        kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
+    training.model.learn(
+        spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
+        callback=training.callback,
+        reset_num_timesteps=spec.trained_agent is None,
+        **kwargs,
+    )
+
+
+def _finish(training: Training, state: str, seconds: float) -> Outcome:
+    """Save what was learnt, judge it, draw it; ``run.json`` says so when all else is there."""
+    run, model, evaluation = training.run, training.model, training.evaluation
+    save_model(model, run.model_path)
+    save_normalization(model, run)
+    final = _final_evaluation(training) if state == FINISHED else None
+    draw_learning_curve(run, f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}")
+    best = evaluation.best_mean_reward if evaluation.best_timesteps else None
+    run.update_info(
+        state=state,
+        n_timesteps=model.num_timesteps,
+        seconds=round(seconds, 3),
+        final=None if final is None else final.summary(),
+        best_mean_return=best,
+        best_timesteps=evaluation.best_timesteps,
+    )
+    return Outcome(run, state, model.num_timesteps, seconds, final, best, evaluation.best_timesteps)
+
+
+def _final_evaluation(training: Training) -> Evaluation | None:
+    """Episodes that have served nothing else; none where evaluation is turned off."""
+    if training.evaluation.eval_freq == 0:
+        return None
+    return evaluate(
+        training.model,
+        training.eval_env,
+        FINAL_EVALUATION_EPISODES,
+        evaluation_seed(training.spec.seed, 2),
+    )
