@@ -92,11 +92,10 @@ def main() -> int:
     from rich.console import Console
 
     from pipeline.run import INTERRUPTED
-    from pipeline.summary import print_header, print_outcome
+    from pipeline.summary import print_outcome
     from pipeline.training import train
 
     console = Console(quiet=spec.verbose < 1)
-    print_header(console, spec)
     outcome = train(spec, console, vars(args), command_line())
     print_outcome(console, spec, outcome)
     return INTERRUPT if outcome.state == INTERRUPTED else 0

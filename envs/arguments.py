@@ -15,7 +15,7 @@ def check_number(name: str, value: object, low: float = -math.inf, high: float =
     Raises:
         ValueError: if it is not.
     """
-    if isinstance(value, int | float | np.number) and not isinstance(value, bool):
+    if isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool):
         number = float(value)
         if math.isfinite(number) and low <= number <= high:
             return number

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from envs.arguments import check_choice, check_flag, check_number
 from envs.grid_dynamics import MOVES, POSSIBLE_MOVES, GridDynamics, Tile
 from envs.grid_map import GOAL, MAX_STATES, Description, GridMap
-from envs.rendering import GridRenderer, Scene
+from envs.rendering import GridRenderer
+from envs.scene import Scene
+from envs.text_rendering import render_text
 
 if TYPE_CHECKING:
     from mdp.model import TransitionModel
@@ -78,7 +80,7 @@ class GridWorld(gym.Env[Any, Any]):
         self.s = self.map.start
         self.render_mode = render_mode
         self._renderer: GridRenderer | None = None
-        self._path: list[int] = []
+        self._steps: set[tuple[int, int]] = set()
         self._last_action: int | None = None
 
     def reset(
@@ -89,7 +91,7 @@ class GridWorld(gym.Env[Any, Any]):
         starts, thresholds = self._starts
         drawn = np.searchsorted(thresholds, self.np_random.random(), side="right")
         self.s = int(starts[drawn])
-        self._path = [self.s]
+        self._steps = set()
         self._last_action = None
         if self.render_mode == "human":
             self.render()
@@ -108,31 +110,28 @@ class GridWorld(gym.Env[Any, Any]):
         # As categorical_sample of toy_text: the first, where rounding leaves none.
         outcome = next((k for k, upto in enumerate(self._slip_thresholds) if upto > uniform), 0)
         move = self.dynamics.move(self.s, POSSIBLE_MOVES[action][outcome])
-        self.s = move.next_state
         if self.render_mode is not None:
-            self._path.append(self.s % self.map.n_cells)
-            self._last_action = action
-            if self.render_mode == "human":
-                self.render()
-        info = self._info(move.bumped)
-        return self._observe(), move.reward, move.terminated, False, info
+            self._note_step(action, move.next_state)
+        self.s = move.next_state
+        if self.render_mode == "human":
+            self.render()
+        return self._observe(), move.reward, move.terminated, False, self._info(move.bumped)
 
     def render(self) -> str | NDArray[np.uint8] | None:
         """The map as text (``ansi``), as a picture of shape (height, width, 3), or in a window."""
         if self.render_mode is None:
             gym.logger.warn("render() does nothing: the environment was made without render_mode")
             return None
+        scene = self._scene()
+        if self.render_mode == "ansi":
+            return render_text(scene)
         if self._renderer is None:
-            self._renderer = GridRenderer(self.map.rows, self.metadata["render_fps"])
-        cell = self.s % self.map.n_cells
-        collected = self.s // self.map.n_cells
-        scene = Scene(
-            robot=cell,
-            path=self._path,
-            collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
-            last_action=self._last_action,
-        )
-        return self._renderer.render(scene, self.render_mode)
+            title = type(self).__name__ if self.spec is None else self.spec.id
+            self._renderer = GridRenderer(self.map.rows, self.metadata["render_fps"], title)
+        if self.render_mode == "rgb_array":
+            return self._renderer.pixels(scene)
+        self._renderer.show(scene)
+        return None
 
     def close(self) -> None:
         """Close the window, if there is one."""
@@ -212,6 +211,23 @@ class GridWorld(gym.Env[Any, Any]):
             # On every step, so that an episode cut off by a time limit counts as a failure.
             "is_success": self.map.codes[cell] == ord(GOAL),
         }
+
+    def _note_step(self, action: int, next_state: int) -> None:
+        """Remember for the next picture what was done."""
+        origin, target = self.s % self.map.n_cells, next_state % self.map.n_cells
+        if origin != target:
+            self._steps.add((origin, target))
+        self._last_action = action
+
+    def _scene(self) -> Scene:
+        collected, cell = divmod(self.s, self.map.n_cells)
+        return Scene(
+            rows=self.map.rows,
+            robot=cell,
+            steps=self._steps,
+            collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
+            last_action=self._last_action,
+        )
 
     def _check_size(self) -> None:
         n_states, n_items = self.dynamics.n_states, len(self.dynamics.collectable_bits)

@@ -1,0 +1,56 @@
+"""Finite Markov decision processes: the transition model, planning, exact evaluation.
+
+The package knows arrays alone, neither environments nor agents. The functions are loaded on first
+use, because the libraries behind them take longer to import than a command may take to answer.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
+from mdp.model import TransitionModel
+
+if TYPE_CHECKING:
+    from mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
+    from mdp.planning import Plan, policy_iteration, value_iteration
+    from mdp.policy_evaluation import (
+        PolicyReturn,
+        best_blind_return,
+        blind_policies,
+        policy_return,
+        state_visitation,
+    )
+
+__all__ = [
+    "FiniteHorizonPlan",
+    "Plan",
+    "PolicyReturn",
+    "TransitionModel",
+    "best_blind_return",
+    "blind_policies",
+    "finite_horizon_optimum",
+    "policy_iteration",
+    "policy_return",
+    "state_visitation",
+    "value_iteration",
+]
+
+_HOMES = {
+    "FiniteHorizonPlan": "mdp.finite_horizon",
+    "finite_horizon_optimum": "mdp.finite_horizon",
+    "Plan": "mdp.planning",
+    "policy_iteration": "mdp.planning",
+    "value_iteration": "mdp.planning",
+    "PolicyReturn": "mdp.policy_evaluation",
+    "best_blind_return": "mdp.policy_evaluation",
+    "blind_policies": "mdp.policy_evaluation",
+    "policy_return": "mdp.policy_evaluation",
+    "state_visitation": "mdp.policy_evaluation",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mdp' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from mdp.graph import reachable_states, steps_to_end
 from mdp.model import TransitionModel
@@ -82,38 +82,48 @@ class PolicyChain:
         """The number of states, n."""
         return len(self.states)
 
-    def mean(self, per_outcome: ArrayLike) -> Floats:
+    def mean(self, per_outcome: NDArray[np.floating] | NDArray[np.bool_]) -> Floats:
         """The expectation of a quantity (m,) of one step's outcome, for each state (n,)."""
-        return np.bincount(self.row, self.weight * per_outcome, self.size)
+        total = np.bincount(self.row, weights=self.weight * per_outcome, minlength=self.size)
+        return total.astype(np.float64)
 
     def after(self, values: Floats) -> Floats:
         """The value (n,) of the state that each outcome leads to (m,): zero where none follows."""
         return np.where(self.terminated, 0.0, values[self.following])
 
-    def solve(self, per_step: Floats, discount: float) -> Floats:
-        """The expected discounted sum of ``per_step`` (n,) until the episode ends, per state.
+    def spread(self, result: Floats, mean: Floats) -> Floats:
+        """The mean square (n,) by which a result per outcome (m,) differs from its mean (n,)."""
+        return self.mean((result - mean[self.row]) ** 2)
 
-        Without discount, states from which it never ends get zero: their ``per_step`` must be
-        zero, or the caller must refuse them.
+    def solve(self, right: Floats, discount: float, *, transposed: bool = False) -> Floats:
+        """Solve (I - discount P) x = right, where P are the probabilities of going on.
+
+        With a reward per step on the right, x is the expected sum until the episode ends; the
+        transposed system, with the starting distribution, gives the expected visits. Without
+        discount, states from which the episode never ends get zero: the caller must see to it
+        that nothing is earned there, or refuse them.
         """
         kept = np.ones(self.size, np.bool_) if discount < 1 else ~self.endless
-        result = np.zeros(self.size)
-        result[kept] = self._solve_kept(per_step[kept], discount, kept)
-        return result
-
-    def _solve_kept(self, right: Floats, discount: float, kept: NDArray[np.bool_]) -> Floats:
         leads = ~self.terminated & kept[self.row] & kept[self.following]
         place = np.cumsum(kept) - 1
         row, following = place[self.row[leads]], place[self.following[leads]]
-        weight = -discount * self.weight[leads]
-        n = len(right)
-        if n <= LARGEST_DENSE:
-            matrix = np.eye(n)
-            np.add.at(matrix, (row, following), weight)
-            return np.linalg.solve(matrix, right)
-        from scipy.sparse import csc_array, eye_array
-        from scipy.sparse.linalg import splu
+        if transposed:
+            row, following = following, row
+        result = np.zeros(self.size)
+        result[kept] = _solve(row, following, -discount * self.weight[leads], right[kept])
+        return result
 
-        system = eye_array(n, format="csc") + csc_array((weight, (row, following)), shape=(n, n))
-        solution: Floats = splu(system).solve(right)
-        return solution
+
+def _solve(row: Indices, column: Indices, weight: Floats, right: Floats) -> Floats:
+    """Solve (I + W) x = right, with the entries of W given one by one."""
+    n = len(right)
+    if n <= LARGEST_DENSE:
+        matrix = np.eye(n)
+        np.add.at(matrix, (row, column), weight)
+        return np.linalg.solve(matrix, right).astype(np.float64)
+    from scipy.sparse import csc_array, eye_array
+    from scipy.sparse.linalg import splu
+
+    system = eye_array(n, format="csc") + csc_array((weight, (row, column)), shape=(n, n))
+    solution: Floats = splu(system).solve(right)
+    return solution

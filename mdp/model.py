@@ -106,17 +106,17 @@ class TransitionModel:
     @property
     def n_states(self) -> int:
         """S, the number of states, unreachable ones included."""
-        return self.prob.shape[0]
+        return int(self.prob.shape[0])
 
     @property
     def n_actions(self) -> int:
         """A, the number of actions."""
-        return self.prob.shape[1]
+        return int(self.prob.shape[1])
 
     @property
     def n_outcomes(self) -> int:
         """K, the largest number of outcomes of any state and action, padding included."""
-        return self.prob.shape[2]
+        return int(self.prob.shape[2])
 
     @cached_property
     def expected_reward(self) -> NDArray[np.float64]:

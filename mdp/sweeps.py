@@ -77,16 +77,17 @@ def first_guess(
     mean_reward: Floats,
     allowed: Mask,
     discount: float,
+    known: Mask,
     order: Indices,
     values: Floats,
     policy: Indices,
 ) -> None:
-    """Values and actions in one pass, as if what leads further from the end left the agent in place.
+    """Values and actions in one pass, as if what leads away from the end left the agent in place.
 
     Without chance these are the shortest paths. With it, each action still leads nearer to the
-    end with positive probability wherever it can, so that the policy ends every episode.
+    end, or to the states ``known`` before, with positive probability wherever it can, so that the
+    policy ends every episode. ``known``, bool of shape (S,), is extended on the way.
     """
-    known = np.zeros(len(values), np.bool_)
     for state in order:
         best = -np.inf
         for action in range(prob.shape[1]):
@@ -124,12 +125,14 @@ def policy_rows(
 ) -> tuple[Floats, NDArray[np.int32], Floats, Floats]:
     """The rows that a policy uses, in the order of the sweep and with places in it for states.
 
+    States that are not in the order count as ends.
+
     Returns:
         Discounted weights and places of the following states, both (n, K); rewards (n,); and the
         weight of all that does not lie further on in the order, (n,).
     """
     n_outcomes = prob.shape[2]
-    place_of = np.zeros(prob.shape[0], np.int32)
+    place_of = np.full(prob.shape[0], -1, np.int32)
     for place in range(len(order)):
         place_of[order[place]] = place
     weight = np.zeros((len(order), n_outcomes))
@@ -141,10 +144,12 @@ def policy_rows(
         action = policy[state]
         reward[place] = mean_reward[state, action]
         for k in range(n_outcomes):
-            if prob[state, action, k] > 0 and not terminated[state, action, k]:
+            leads = prob[state, action, k] > 0 and not terminated[state, action, k]
+            target = place_of[next_state[state, action, k]]
+            if leads and target >= 0:
                 weight[place, k] = discount * prob[state, action, k]
-                following[place, k] = place_of[next_state[state, action, k]]
-                if following[place, k] >= place:
+                following[place, k] = target
+                if target >= place:
                     settled[place] -= weight[place, k]
     return weight, following, reward, settled
 

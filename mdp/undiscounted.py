@@ -42,6 +42,13 @@ class FinitePart:
     rest_actions: Mask
     step_cost: float
 
+    @classmethod
+    def everything(cls, model: TransitionModel) -> FinitePart:
+        """All reachable states and their actions, as with a discount below one."""
+        allowed = np.repeat(model.reachable[:, None], model.n_actions, axis=1)
+        none = np.zeros_like(allowed)
+        return cls(model.reachable, allowed, np.zeros_like(model.reachable), none, 0.0)
+
 
 def finite_part(model: TransitionModel) -> FinitePart:
     """Find where the undiscounted optimum is finite.
@@ -53,13 +60,13 @@ def finite_part(model: TransitionModel) -> FinitePart:
     allowed = np.repeat(model.reachable[:, None], model.n_actions, axis=1)
     ends = (model.terminated & (model.prob > 0)).any(axis=2)
     endless = allowed & ~ends
-    step_cost = float(-model.expected_reward[endless].max(initial=-np.inf)) if endless.any() else 1.0
-    if step_cost > ROUNDING:
-        rest_actions = np.zeros_like(allowed)
-    else:
+    # Where every step may end the episode, any cost will do.
+    step_cost = -float(model.expected_reward[endless].max()) if endless.any() else 1.0
+    rest_actions = np.zeros_like(allowed)
+    if step_cost <= ROUNDING:
         step_cost = 0.0
         rest_actions = _rest_actions(model, endless)
-    resting = rest_actions.any(axis=1)
+    resting = np.any(rest_actions, axis=1)
     states, allowed = _surely_ending(model, allowed, resting)
     lost = np.flatnonzero((model.initial > 0) & ~states)
     if lost.size:

@@ -29,11 +29,11 @@ def check_model_file(path: Path) -> None:
     except FileNotFoundError:
         raise UserError(f"no such model file: {path}") from None
     except (OSError, zipfile.BadZipFile) as error:
-        raise UserError(f"{path} is not a whole zip file: {one_line(error)}") from error
+        raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
     if damaged is not None:
         raise UserError(f"{path} is damaged: its part {damaged} does not match its checksum")
     if "data" not in names or not any(name.endswith(".pth") for name in names):
-        raise UserError(f"{path} is a zip file, but not of an agent")
+        raise UserError(f"{path} is no whole zip of an agent: it lacks parts that one has")
 
 
 def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) -> BaseAlgorithm:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import platform
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
@@ -38,6 +38,7 @@ from pipeline.plots import draw_learning_curve
 from pipeline.progress import ProgressDisplay
 from pipeline.run import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.specs import TrainSpec
+from pipeline.summary import print_header
 
 FINAL_EVALUATION_EPISODES = 100
 EVALUATIONS_PER_RUN = 20
@@ -111,9 +112,12 @@ def train(spec: TrainSpec, console: Console, args: dict[str, Any], command: str)
     kwargs = algorithm_kwargs(spec)
     suffix = f"_{uuid4()}" if spec.unique_id else ""
     run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
-    with _discarding_on_failure(run):
-        training = _set_up(spec, run, kwargs, console)
+    with ExitStack() as undo, _library_errors_in_one_line():
+        undo.callback(run.discard)
+        training = _set_up(spec, run, kwargs, console, undo)
         _write_settings(training, args, command)
+        undo.pop_all()
+    print_header(console, spec)
     return _execute(training)
 
 
@@ -129,21 +133,23 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
 
 
 @contextmanager
-def _discarding_on_failure(run: Run) -> Iterator[None]:
+def _library_errors_in_one_line() -> Iterator[None]:
+    """Settings that only the library finds fault with, when it is handed them."""
     try:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError) as error:
-        run.discard()
         raise UserError(one_line(error)) from error
-    except BaseException:
-        run.discard()
-        raise
 
 
-def _set_up(spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console) -> Training:
+def _set_up(
+    spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
+) -> Training:
+    """Make all parts of the training; ``undo`` is told how to take them back."""
     env = make_training_env(spec, run.path)
+    undo.callback(env.close)
     model = _make_model(spec, env, kwargs)
     eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
+    undo.callback(eval_env.close)
     evaluation = EvaluationCallback(
         run,
         eval_env,

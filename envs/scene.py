@@ -1,0 +1,29 @@
+"""What a picture of a grid world shows."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A moment of an episode; cells are numbered row by row.
+
+    Attributes:
+        rows: the map.
+        robot: where the robot is.
+        steps: pairs of neighbouring cells that it has gone from and to, in no order.
+        collected: cells that it has emptied.
+        last_action: its latest action, None before the first.
+    """
+
+    rows: tuple[str, ...]
+    robot: int
+    steps: Collection[tuple[int, int]]
+    collected: Collection[int]
+    last_action: int | None
+
+    def place(self, cell: int) -> tuple[int, int]:
+        """Row and column of a cell."""
+        return divmod(cell, len(self.rows[0]))

@@ -1,0 +1,19 @@
+"""Wrappers that fit an environment to an agent: discrete or one-hot observations, other rewards.
+
+The observation wrappers also map whole batches of observations (`map_observations`), which exact
+evaluation needs: it asks a policy for every state at once.
+"""
+
+from envs.wrappers.discretize import DiscretizeObservation
+from envs.wrappers.encodings import FlattenToDiscrete, OneHotObservation
+from envs.wrappers.rewards import ScaleReward, TerminationReward
+from envs.wrappers.time_limit import limit_by_shortest_path
+
+__all__ = [
+    "DiscretizeObservation",
+    "FlattenToDiscrete",
+    "OneHotObservation",
+    "ScaleReward",
+    "TerminationReward",
+    "limit_by_shortest_path",
+]

@@ -1,0 +1,115 @@
+"""The best policy under a time limit: what is best depends on the steps that are left."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdp.compiled import compiled
+from mdp.model import TransitionModel
+from mdp.sweeps import TIE_TOLERANCE, Floats, Indices, Mask, States
+
+
+@dataclass(frozen=True, eq=False)
+class FiniteHorizonPlan:
+    """An optimal policy under a time limit.
+
+    Attributes:
+        values: the optimal expected (discounted) sum of rewards from each state at step 0, shape
+            (S,); zero for states that cannot be reached.
+        actions_left: the greedy action, the first among ties within 1e-12 of the best value, with
+            1, 2, ... steps left: shape (m, S) of a small unsigned integer type. With more than m
+            steps left nothing changes any more, and the last row stands for all.
+        horizon: the number of steps after which the episode is cut off.
+        start_value: the mean of ``values`` over the starting states.
+    """
+
+    values: Floats
+    actions_left: NDArray[np.unsignedinteger]
+    horizon: int
+    start_value: float
+
+    def actions(self, step: int) -> NDArray[np.unsignedinteger]:
+        """The actions (S,) to take after ``step`` steps of the episode, 0 to horizon - 1."""
+        if not 0 <= step < self.horizon:
+            raise ValueError(f"step is {step}, it must lie between 0 and {self.horizon - 1}")
+        row: NDArray[np.unsignedinteger] = self.actions_left[
+            min(self.horizon - step, len(self.actions_left)) - 1
+        ]
+        return row
+
+    @property
+    def policy(self) -> NDArray[np.unsignedinteger]:
+        """The actions at each step, shape (horizon, S), in order of time."""
+        left = np.minimum(np.arange(self.horizon, 0, -1), len(self.actions_left))
+        rows: NDArray[np.unsignedinteger] = self.actions_left[left - 1]
+        return rows
+
+
+def finite_horizon_optimum(
+    model: TransitionModel, horizon: int, discount: float = 1.0
+) -> FiniteHorizonPlan:
+    """Plan backwards from the time limit.
+
+    Stops early where one more step changes no value in its last bit: neither would any further
+    one. Sutton and Barto, Reinforcement Learning, 2nd edition, chapter 4; Puterman, Markov
+    Decision Processes, 1994, section 4.5.
+
+    Args:
+        model: the decision process; rows of unreachable states are ignored.
+        horizon: the time limit in steps, at least 1.
+        discount: from 0 to 1.
+
+    Raises:
+        ValueError: for a horizon or discount out of range.
+    """
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, it must be at least 1")
+    if not 0 <= discount <= 1:
+        raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
+    states = np.flatnonzero(model.reachable)
+    arrays = (model.prob, model.next_state, model.terminated, model.expected_reward)
+    values = np.zeros(model.n_states)
+    rows: list[NDArray[np.unsignedinteger]] = []
+    for _ in range(horizon):
+        earlier = np.zeros(model.n_states)
+        actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
+        back_up(*arrays, float(discount), states, values, earlier, actions)
+        rows.append(actions)
+        if np.array_equal(earlier, values):
+            break
+        values = earlier
+    return FiniteHorizonPlan(values, np.array(rows), horizon, float(model.initial @ values))
+
+
+@compiled
+def back_up(
+    prob: Floats,
+    next_state: States,
+    terminated: Mask,
+    mean_reward: Floats,
+    discount: float,
+    states: Indices,
+    values: Floats,
+    earlier: Floats,
+    actions: NDArray[np.unsignedinteger],
+) -> None:
+    """Values one step earlier, and the actions to take there, into ``earlier`` and ``actions``."""
+    action_values = np.empty(prob.shape[1])
+    for state in states:
+        for action in range(prob.shape[1]):
+            value = mean_reward[state, action]
+            for k in range(prob.shape[2]):
+                if prob[state, action, k] > 0 and not terminated[state, action, k]:
+                    following = values[next_state[state, action, k]]
+                    value += discount * prob[state, action, k] * following
+            action_values[action] = value
+        best = action_values.max()
+        tied = best - TIE_TOLERANCE * max(1.0, abs(best))
+        action = 0
+        while action_values[action] < tied:
+            action += 1
+        earlier[state] = best
+        actions[state] = action
