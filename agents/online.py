@@ -103,10 +103,14 @@ class OnlineAlgorithm(BaseAlgorithm):
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
         callback.on_training_start(locals(), globals())
-        while self.num_timesteps < total_timesteps and self._step(callback, log_interval):
-            pass
+        self._run(total_timesteps, callback, log_interval)
         callback.on_training_end()
         return self
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        """Step until ``num_timesteps`` is reached or a callback asks to stop."""
+        while self.num_timesteps < total_timesteps and self._step(callback, log_interval):
+            pass
 
     def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
         """Act, tell the callbacks, learn; False once a callback asks to stop.

@@ -9,21 +9,21 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
 from mdp.compiled import compiled
 
-LINEAR = 0
-EXPONENTIAL = 1
+LINEAR = 0.0
+EXPONENTIAL = 1.0
+
+ScheduleRow = tuple[float, float, float, float]
 
 
 @compiled
-def schedule_value(row: NDArray[np.float64], progress_remaining: float) -> float:
-    """Value of the schedule ``row`` = (kind, start, end, end_fraction), shape (4,)."""
-    kind, start, end, end_fraction = float(row[0]), float(row[1]), float(row[2]), float(row[3])
+def schedule_value(row: ScheduleRow, progress_remaining: float) -> float:
+    """Value of the schedule ``row`` = (kind, start, end, end_fraction)."""
+    kind, start, end, end_fraction = row
     elapsed = 1.0 - progress_remaining
     if elapsed > end_fraction:
         return end
@@ -65,12 +65,12 @@ class ExponentialSchedule:
         )
 
 
-def _row(kind: int, schedule: ExponentialSchedule | LinearSchedule) -> NDArray[np.float64]:
-    return np.array([kind, schedule.start, schedule.end, schedule.end_fraction], dtype=np.float64)
+def _row(kind: float, schedule: ExponentialSchedule | LinearSchedule) -> ScheduleRow:
+    return kind, float(schedule.start), float(schedule.end), float(schedule.end_fraction)
 
 
-def schedule_row(schedule: float | Schedule) -> NDArray[np.float64] | None:
-    """The schedule as (kind, start, end, end_fraction), shape (4,); None for a foreign function."""
+def schedule_row(schedule: float | Schedule) -> ScheduleRow | None:
+    """The schedule as (kind, start, end, end_fraction); None for a foreign function."""
     if isinstance(schedule, FloatSchedule):
         return schedule_row(schedule.value_schedule)
     if isinstance(schedule, ConstantSchedule):
@@ -80,5 +80,5 @@ def schedule_row(schedule: float | Schedule) -> NDArray[np.float64] | None:
     if isinstance(schedule, ExponentialSchedule):
         return _row(EXPONENTIAL, schedule)
     if isinstance(schedule, int | float):
-        return np.array([LINEAR, schedule, schedule, 1.0])
+        return LINEAR, float(schedule), float(schedule), 1.0
     return None

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from envs.arguments import check_choice, check_flag, check_number
 from envs.grid_dynamics import MOVES, POSSIBLE_MOVES, GridDynamics, Tile
-from envs.grid_map import GOAL, MAX_STATES, Description, GridMap
+from envs.grid_map import GOAL, Description, GridMap
 from envs.rendering import GridRenderer
 from envs.scene import Scene
 from envs.text_rendering import render_text
@@ -73,7 +73,6 @@ class GridWorld(gym.Env[Any, Any]):
         ]
         self.map = GridMap.read(desc, tiles, passable)
         self.dynamics = GridDynamics(self.map, tiles, edge, slip)
-        self._check_size()
         self.observation_space = spaces.Discrete(self.dynamics.n_states)
         self.action_space = spaces.Discrete(len(MOVES))
         self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
@@ -228,14 +227,6 @@ class GridWorld(gym.Env[Any, Any]):
             collected=[c for c, bit in self.dynamics.collectable_bits.items() if bit & collected],
             last_action=self._last_action,
         )
-
-    def _check_size(self) -> None:
-        n_states, n_items = self.dynamics.n_states, len(self.dynamics.collectable_bits)
-        if n_states > MAX_STATES:
-            raise ValueError(
-                f"the map has {self.map.n_cells} cells and {n_items} to collect, which makes "
-                f"{n_states:,} states: more than {MAX_STATES:,}; use fewer to collect"
-            )
 
 
 def _uniform(n: int) -> NDArray[np.float64]:

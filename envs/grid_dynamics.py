@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.grid_map import MAX_STATES, GridMap
+
 if TYPE_CHECKING:
-    from envs.grid_map import GridMap
     from mdp.model import TransitionModel
 
 MOVE_NAMES = ("up", "down", "left", "right")
@@ -58,6 +59,9 @@ class GridDynamics:
         tiles: what each letter of the map means.
         edge: what a robot meets that tries to leave the map.
         slip: probability that a move goes sideways, half of it to each side.
+
+    Raises:
+        ValueError: if there are more than 2**24 states.
     """
 
     def __init__(
@@ -70,6 +74,12 @@ class GridDynamics:
         self.edge = edge
         collectable = {code for code, tile in self.tiles.items() if tile.bonus is not None}
         cells = [cell for cell, code in enumerate(self.codes) if code in collectable]
+        # Shifted no further than needed: a map can hold a million such cells.
+        if self.n_cells << min(len(cells), 64) > MAX_STATES:
+            raise ValueError(
+                f"the map has {self.n_cells} cells, {len(cells)} of them to collect: these make "
+                f"{self.n_cells} * 2**{len(cells)} states, more than {MAX_STATES:,}"
+            )
         self.collectable_bits = {cell: 1 << i for i, cell in enumerate(cells)}
         self.n_states = self.n_cells << len(cells)
         self.outcome_prob = (1.0,) if slip == 0 else (1 - slip, slip / 2, slip / 2)

@@ -6,6 +6,7 @@ import os
 import sys
 
 from envs.grid_dynamics import MOVE_NAMES
+from envs.grid_map import START
 from envs.scene import Scene
 
 ROBOT = "R"
@@ -31,8 +32,8 @@ def render_text(scene: Scene) -> str:
     robot_row, robot_column = scene.place(scene.robot)
     rows = _window(robot_row, len(scene.rows), MAX_ROWS)
     columns = _window(robot_column, len(scene.rows[0]), MAX_COLUMNS)
-    marks = {scene.place(cell): TRAIL for step in scene.steps for cell in step}
-    marks = {place: TRAIL for place in marks if _letter(scene, place) not in "SG"}
+    trail = {scene.place(cell) for step in scene.steps for cell in step}
+    marks = {(row, column): TRAIL for row, column in trail if scene.rows[row][column] != START}
     marks[robot_row, robot_column] = ROBOT
     style = _coloured if terminal_has_colour() else str
     lines = [_title(scene, rows, columns)]
@@ -53,10 +54,6 @@ def _title(scene: Scene, rows: range, columns: range) -> str:
     if len(rows) < len(scene.rows) or len(columns) < len(scene.rows[0]):
         title += f" rows {rows[0]}-{rows[-1]}, columns {columns[0]}-{columns[-1]}"
     return title
-
-
-def _letter(scene: Scene, place: tuple[int, int]) -> str:
-    return scene.rows[place[0]][place[1]]
 
 
 def _window(centre: int, length: int, most: int) -> range:

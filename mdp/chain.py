@@ -95,15 +95,27 @@ class PolicyChain:
         """The mean square (n,) by which a result per outcome (m,) differs from its mean (n,)."""
         return self.mean((result - mean[self.row]) ** 2)
 
-    def solve(self, right: Floats, discount: float, *, transposed: bool = False) -> Floats:
+    def solve(
+        self,
+        right: Floats,
+        discount: float,
+        *,
+        zero: NDArray[np.bool_] | None = None,
+        transposed: bool = False,
+    ) -> Floats:
         """Solve (I - discount P) x = right, where P are the probabilities of going on.
 
         With a reward per step on the right, x is the expected sum until the episode ends; the
-        transposed system, with the starting distribution, gives the expected visits. Without
-        discount, states from which the episode never ends get zero: the caller must see to it
-        that nothing is earned there, or refuse them.
+        transposed system, with the starting distribution, gives the expected visits.
+
+        Args:
+            right: shape (n,).
+            discount: from 0 to 1; without discount the episode must end, or x be known to be
+                zero, wherever the chain may settle.
+            zero: states where x is zero, bool of shape (n,).
+            transposed: solve the transposed system.
         """
-        kept = np.ones(self.size, np.bool_) if discount < 1 else ~self.endless
+        kept = np.ones(self.size, np.bool_) if zero is None else ~zero
         leads = ~self.terminated & kept[self.row] & kept[self.following]
         place = np.cumsum(kept) - 1
         row, following = place[self.row[leads]], place[self.following[leads]]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.chain import PolicyChain
-from mdp.graph import steps_to_end
+from mdp.graph import end_components, steps_to_end
 from mdp.model import TransitionModel
 from mdp.problem import PlanningProblem
 from mdp.sweeps import TIE_TOLERANCE, improve
@@ -141,7 +141,12 @@ def _exact_values(problem: PlanningProblem, policy: Indices) -> Floats:
     taken[np.arange(model.n_states), policy] = 1.0
     chain = PolicyChain.build(model, taken, problem.part.states)
     values = np.zeros(model.n_states)
-    values[chain.states] = chain.solve(chain.mean(chain.reward), problem.discount)
+    rests = None
+    if problem.part.resting.any():
+        # Where a single action per state stays for ever, it does so at no cost.
+        component, _ = end_components(model, chain.used)
+        rests = component[chain.states] >= 0
+    values[chain.states] = chain.solve(chain.mean(chain.reward), problem.discount, zero=rests)
     return values
 
 
@@ -170,10 +175,16 @@ def _greedy(problem: PlanningProblem, action_values: Floats, tie: float, rests: 
     margin = np.maximum(TIE_TOLERANCE * np.maximum(1.0, np.abs(best)), tie)
     tied = part.allowed & (action_values >= (best - margin)[:, None])
     if not part.resting.any():
-        return np.argmax(tied, axis=1).astype(np.int64)
+        return _first(tied)
     # Going round at no cost ties with going on: only an action that may lead nearer counts.
     steps, _ = steps_to_end(model, tied, rests)
     nearer = model.terminated | (steps[model.next_state] < steps[:, None, None])
     goes_on = tied & ((model.prob > 0) & nearer).any(axis=2)
     chosen = np.where(rests[:, None], part.rest_actions, goes_on)
-    return np.argmax(chosen, axis=1).astype(np.int64)
+    return _first(chosen)
+
+
+def _first(mask: Mask) -> Indices:
+    """The first true column of each row."""
+    first: Indices = mask.argmax(axis=1)
+    return first

@@ -170,7 +170,8 @@ def _moments_without_limit(chain: PolicyChain, discount: float, ends_well: Mask)
         moments[:, 2] = chain.solve(np.ones(len(chain.states)), 1.0)
         length = 1 + chain.after(moments[:, 2])
         moments[:, 3] = chain.solve(chain.spread(length, moments[:, 2]), 1.0)
-    moments[:, 4] = chain.solve(chain.mean(ends_well.ravel()[chain.outcome]), 1.0)
+    succeeds = chain.mean(ends_well.ravel()[chain.outcome])
+    moments[:, 4] = chain.solve(succeeds, 1.0, zero=chain.endless)
     return moments
 
 

@@ -1,4 +1,4 @@
-"""Callbacks: evaluation, budgets, checkpoints, and exploration that decays by the update.
+"""Callbacks: evaluation, checkpoints, and exploration that decays by the update.
 
 Those that a hyperparameter file may name under ``callback`` are `EpisodeCheckpoint` and
 `ExponentialExploration`.
@@ -16,6 +16,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
+from agents.blocks import BlockCallback, Horizon, calls_until_multiple
 from pipeline.evaluation import Evaluation
 from pipeline.files import replacing
 from pipeline.run import Run
@@ -66,6 +67,14 @@ class EvaluationCallback(EvalCallback):
         self.last_evaluation: Evaluation | None = None
         self.best_timesteps = 0
 
+    def horizon(self) -> Horizon:
+        """When the next evaluation is due."""
+        return Horizon(calls=calls_until_multiple(self.n_calls, self.eval_freq))
+
+    def pass_over(self, n_calls: int, n_episodes: int) -> None:
+        """Take note of calls that were left out."""
+        self.n_calls += n_calls
+
     def _init_callback(self) -> None:
         """Training and evaluation environments may be of different kinds here."""
 
@@ -114,27 +123,7 @@ class EvaluationCallback(EvalCallback):
         self.logger.dump(self.num_timesteps)
 
 
-class EpisodeBudget(BaseCallback):
-    """End training after ``n_episodes``, counted over all environments.
-
-    Schedules then run by episodes as well: the share of training that remains is the share of
-    episodes that remain.
-    """
-
-    def __init__(self, n_episodes: int) -> None:
-        super().__init__()
-        self.n_episodes = n_episodes
-        self.episodes_seen = 0
-
-    def _on_step(self) -> bool:
-        self.episodes_seen += int(np.sum(self.locals["dones"]))
-        # Algorithms take their progress from the steps done over the steps to do.
-        share_done = max(self.episodes_seen, 1e-9) / self.n_episodes
-        self.model._total_timesteps = self.num_timesteps / share_done  # type: ignore[assignment]
-        return self.episodes_seen < self.n_episodes
-
-
-class Checkpoint(BaseCallback):
+class Checkpoint(BlockCallback):
     """Keeps the agent as it is at some moments, as ``rl_model_<steps>_steps.zip``.
 
     Args:
@@ -163,6 +152,10 @@ class StepCheckpoint(Checkpoint):
             raise ValueError(f"every_n_steps must be at least 1, not {every_n_steps}")
         self.every_n_steps = every_n_steps
 
+    def horizon(self) -> Horizon:
+        steps = self.every_n_steps - self.num_timesteps % self.every_n_steps
+        return Horizon(calls=-(-steps // self.training_env.num_envs))
+
     def _on_step(self) -> bool:
         if self.num_timesteps % self.every_n_steps < self.training_env.num_envs:
             self.save()
@@ -186,6 +179,13 @@ class EpisodeCheckpoint(Checkpoint):
             raise ValueError(f"every_n_episodes must be at least 1, not {every_n_episodes}")
         self.every_n_episodes = every_n_episodes
         self.episodes_seen = 0
+
+    def horizon(self) -> Horizon:
+        return Horizon(episodes=self.every_n_episodes - self.episodes_seen % self.every_n_episodes)
+
+    def pass_over(self, n_calls: int, n_episodes: int) -> None:
+        super().pass_over(n_calls, n_episodes)
+        self.episodes_seen += n_episodes
 
     def _on_step(self) -> bool:
         before = self.episodes_seen

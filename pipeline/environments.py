@@ -155,7 +155,7 @@ def _make_vec_env(
         env_kwargs={**kwargs, **(extra or {})},
         monitor_dir=None if monitor_folder is None else str(monitor_folder),
         monitor_kwargs=spec.hyperparams.monitor_kwargs,
-        wrapper_class=env_wrapper(spec, training),  # type: ignore[arg-type]
+        wrapper_class=env_wrapper(spec, training),
         vec_env_cls=getattr(vec_env, TRAINING_VEC_ENVS[spec.vec_env if training else "dummy"]),
     )
     wrap = vec_wrapper_factory(spec.hyperparams.vec_env_wrapper, spec.gym_packages)

@@ -30,19 +30,23 @@ def read_monitors(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
         folder: the run folder, with one ``*.monitor.csv`` for each environment.
 
     Returns:
-        Environment steps done by the end of each episode, and its return, both of shape
-        (n_episodes,).
+        Environment steps done by the end of each episode, counted over all environments, and its
+        return, both of shape (n_episodes,).
     """
+    paths = sorted(folder.glob("*.monitor.csv"))
     rows = [
-        np.loadtxt(path, delimiter=",", skiprows=2, usecols=(0, 1, 2), ndmin=2)
-        for path in sorted(folder.glob("*.monitor.csv"))
+        np.loadtxt(path, delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
+        for path in paths
         if path.read_bytes().count(b"\n") > 2
     ]
     if not rows:
         return np.empty(0), np.empty(0)
-    table = np.concatenate(rows)
-    table = table[np.argsort(table[:, 2], kind="stable")]
-    return np.cumsum(table[:, 1]), table[:, 0]
+    # The environments of a run are stepped together: by the time that one of them has done so many
+    # steps, all of them have.
+    steps = np.concatenate([len(paths) * np.cumsum(table[:, 1]) for table in rows])
+    returns = np.concatenate([table[:, 0] for table in rows])
+    order = np.argsort(steps, kind="stable")
+    return steps[order], returns[order]
 
 
 def moving_average(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:

@@ -13,13 +13,14 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
-from stable_baselines3.common.callbacks import BaseCallback
+
+from agents.blocks import BlockCallback
 
 SECONDS_BETWEEN_UPDATES = 0.1
 LINES_WITHOUT_TERMINAL = 10
 
 
-class ProgressDisplay(BaseCallback):
+class ProgressDisplay(BlockCallback):
     """A live bar in a terminal, a few plain lines elsewhere: steps/s, mean return, time left.
 
     Args:
@@ -52,11 +53,10 @@ class ProgressDisplay(BaseCallback):
             self.task = self.bar.add_task("training", total=1.0, figures="")
 
     def _on_step(self) -> bool:
-        if self.n_calls % 64 == 0:
-            now = time.monotonic()
-            if now - self.updated > SECONDS_BETWEEN_UPDATES:
-                self.updated = now
-                self._show()
+        now = time.monotonic()
+        if now - self.updated > SECONDS_BETWEEN_UPDATES:
+            self.updated = now
+            self._show()
         return True
 
     def _on_training_end(self) -> None:

@@ -146,11 +146,13 @@ class Run:
             UserError: if the file is damaged.
         """
         try:
-            info: dict[str, Any] = json.loads(self.info_path.read_text(encoding="utf-8"))
+            info = json.loads(self.info_path.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return {}
         except ValueError as error:
             raise UserError(f"{self.info_path} is damaged: {error}") from error
+        if not isinstance(info, dict):
+            raise UserError(f"{self.info_path} is damaged: it must map names to values")
         return info
 
     def update_info(self, **fields: Any) -> None:

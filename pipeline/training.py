@@ -20,10 +20,10 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents import load_algorithm
+from agents.blocks import EpisodeBudget
 from pipeline import components
 from pipeline.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.callbacks import (
-    EpisodeBudget,
     EvaluationCallback,
     StepCheckpoint,
     save_model,

@@ -45,9 +45,11 @@ def expected_sarsa_value(next_values: Floats, strategy: int, rate: float) -> flo
 
 
 @compiled
-def double_q_learning_value(next_values: Floats, judging_values: Floats, uniform: float) -> float:
+def double_q_learning_value(
+    next_values: Floats, tables: Floats, judge: int, next_obs: int, uniform: float
+) -> float:
     """The other table's value of the action that the updated table prefers."""
-    return float(judging_values[greedy_action(next_values, uniform)])
+    return float(tables[judge, next_obs, greedy_action(next_values, uniform)])
 
 
 @compiled
@@ -62,6 +64,7 @@ def td_target(
     strategy: int,
     rate: float,
     uniform: float,
+    next_values: Floats,
 ) -> float:
     """Reward plus the discounted value of what follows.
 
@@ -76,8 +79,10 @@ def td_target(
         strategy: exploration strategy (Expected SARSA).
         rate: its epsilon or temperature (Expected SARSA).
         uniform: breaks ties of the choosing table (double Q-learning).
+        next_values: room for the updated table's values of what follows, shape (A,).
     """
-    next_values = tables[table, next_obs]
+    for action in range(len(next_values)):
+        next_values[action] = tables[table, next_obs, action]
     if rule == Q_LEARNING:
         value = q_learning_value(next_values)
     elif rule == SARSA:
@@ -85,7 +90,7 @@ def td_target(
     elif rule == EXPECTED_SARSA:
         value = expected_sarsa_value(next_values, strategy, rate)
     else:
-        value = double_q_learning_value(next_values, tables[1 - table, next_obs], uniform)
+        value = double_q_learning_value(next_values, tables, 1 - table, next_obs, uniform)
     return reward + discount * value
 
 
@@ -106,17 +111,28 @@ def update(
     rate: float,
     tie_scale: float,
     uniform: float,
+    scratch: Floats,
 ) -> float:
     """Move one entry of ``tables`` towards its target, in place, and return the TD error.
 
     ``uniform`` decides which of two tables is updated, and what is left of it breaks the tie in the
     choosing table; the rules on one table do not look at it. Shapes as in `td_target`;
-    ``visit_counts`` is int64 of shape (T, S, A).
+    ``visit_counts`` is int64 of shape (T, S, A), and ``scratch`` room for A values.
     """
     table = int(uniform * tables.shape[0])
     tie_uniform = (uniform * tables.shape[0] - table) * tie_scale
     target = td_target(
-        rule, tables, table, reward, discount, next_obs, next_action, strategy, rate, tie_uniform
+        rule,
+        tables,
+        table,
+        reward,
+        discount,
+        next_obs,
+        next_action,
+        strategy,
+        rate,
+        tie_uniform,
+        scratch,
     )
     visit_counts[table, obs, action] += 1
     size = step_size(learning_rate, sample_average, visit_counts[table, obs, action])
@@ -127,10 +143,17 @@ def update(
 
 @compiled
 def behaviour_action(
-    tables: Floats, obs: int, strategy: int, rate: float, tie_scale: float, draws: Floats
+    tables: Floats,
+    obs: int,
+    strategy: int,
+    rate: float,
+    tie_scale: float,
+    draws: Floats,
+    scratch: Floats,
 ) -> int:
-    """Choose an action by the mean of the tables' values."""
-    if tables.shape[0] == 1:
-        return choose_action(strategy, tables[0, obs], rate, tie_scale, draws)
-    values = 0.5 * (tables[0, obs] + tables[1, obs])
-    return choose_action(strategy, values, rate, tie_scale, draws)
+    """Choose an action by the mean of the tables' values; ``scratch`` is room for A values."""
+    for action in range(len(scratch)):
+        scratch[action] = tables[0, obs, action]
+        if tables.shape[0] > 1:
+            scratch[action] = 0.5 * (scratch[action] + tables[1, obs, action])
+    return choose_action(strategy, scratch, rate, tie_scale, draws)

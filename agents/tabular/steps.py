@@ -36,10 +36,13 @@ def choose_actions(
         draws: one row of random numbers for each undecided action.
         actions: actions, shape (n_envs,).
     """
+    scratch = np.empty(tables.shape[2])
     row = 0
     for i in range(len(actions)):
         if actions[i] == UNDECIDED:
-            actions[i] = behaviour_action(tables, obs[i], strategy, rate, tie_scale, draws[row])
+            actions[i] = behaviour_action(
+                tables, obs[i], strategy, rate, tie_scale, draws[row], scratch
+            )
             row += 1
 
 
@@ -87,6 +90,7 @@ def update_tables(
     Returns:
         The mean absolute TD error.
     """
+    scratch = np.empty(tables.shape[2])
     total = 0.0
     for i in range(len(obs)):
         if terminated[i] and skip_terminal_update:
@@ -108,6 +112,7 @@ def update_tables(
             rate,
             tie_scale,
             uniforms[i],
+            scratch,
         )
         total += abs(td_error)
     return total / len(obs)

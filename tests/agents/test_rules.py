@@ -32,6 +32,7 @@ def updated(rule, tables, *, discount=0.5, sample_average=False, uniform=0.0, **
         rate=exploring.get("rate", 0.3),
         tie_scale=1.0,
         uniform=uniform,
+        scratch=np.empty(3),
     )
     changed = np.argwhere(counts)
     assert len(changed) == 1
@@ -96,6 +97,9 @@ def test_sample_average_is_the_mean_of_the_targets():
     counts = np.zeros((1, 1, 1), dtype=np.int64)
     rewards = [4.0, 1.0, 7.0, -2.0]
     for reward in rewards:
-        update(Q_LEARNING, tables, counts, 0, 0, reward, 0.0, 0, 0, 0.1, True, 0, 0.0, 0.0, 0.0)
+        update(
+            *(Q_LEARNING, tables, counts, 0, 0, reward, 0.0, 0, 0, 0.1, True, 0, 0.0, 0.0, 0.0),
+            np.empty(1),
+        )
     assert tables[0, 0, 0] == pytest.approx(np.mean(rewards))
     assert counts[0, 0, 0] == len(rewards)

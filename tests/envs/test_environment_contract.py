@@ -151,6 +151,36 @@ def test_simulating_the_model_with_the_same_generator_replays_every_step(
     assert env.np_random.random() == rng.random()
 
 
+class Fixed:
+    """A generator whose next uniform number is known."""
+
+    def __init__(self, uniform: float) -> None:
+        self.uniform = uniform
+
+    def random(self) -> float:
+        return self.uniform
+
+
+@every_variant
+def test_uniform_numbers_on_the_edge_choose_as_toy_text_does(
+    env_id: str, kwargs: dict[str, Any]
+) -> None:
+    env = grid_world(env_id, kwargs)
+    starts = np.cumsum(env.initial_state_distrib)
+    outcomes = np.cumsum(env.dynamics.outcome_prob)
+    edges = np.concatenate([[0.0], starts, outcomes])
+    uniforms = np.concatenate([edges, np.nextafter(edges, 0), np.nextafter(edges, 1)])
+    for uniform in np.unique(uniforms[uniforms < 1]).tolist():
+        env._np_random = Fixed(uniform)  # type: ignore[assignment]
+        env.reset()
+        start = categorical_sample(env.initial_state_distrib, env.np_random)
+        assert env.s == start
+        listed = env.P[int(start)][0]
+        chosen = categorical_sample([outcome[0] for outcome in listed], env.np_random)
+        env.step(0)
+        assert env.s == listed[chosen][1]
+
+
 @every_variant
 def test_p_and_the_arrays_say_the_same(env_id: str, kwargs: dict[str, Any]) -> None:
     env = grid_world(env_id, kwargs)

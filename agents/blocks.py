@@ -1,0 +1,150 @@
+"""How far training may run before a callback has to be asked.
+
+The compiled engine takes many steps at once. A block of steps ends where a callback can act, so
+that everything happens at the same time step as in a loop that asks after each step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    CallbackList,
+    CheckpointCallback,
+    ConvertCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    LogEveryNTimesteps,
+    ProgressBarCallback,
+    StopTrainingOnMaxEpisodes,
+)
+
+NEVER = 2**62
+
+
+@dataclass(frozen=True)
+class Horizon:
+    """When a callback may act next.
+
+    Attributes:
+        calls: number of the call of ``on_step``, counted from now, on which it may act.
+        episodes: number of ended episodes, counted from now, on which it may act.
+    """
+
+    calls: int = NEVER
+    episodes: int = NEVER
+
+
+class BlockCallback(BaseCallback):
+    """A callback that says when it will act, and bears to be left out before that."""
+
+    def horizon(self) -> Horizon:
+        """When it may act next; by default it does not mind when it is called."""
+        return Horizon()
+
+    def pass_over(self, n_calls: int, n_episodes: int) -> None:
+        """Take note of ``n_calls`` calls that were left out, in which ``n_episodes`` ended."""
+        self.n_calls += n_calls
+
+
+class EpisodeBudget(BlockCallback):
+    """End training after ``n_episodes``, counted over all environments.
+
+    Schedules then run by episodes as well: the share of training that remains is the share of
+    episodes that remain.
+    """
+
+    def __init__(self, n_episodes: int) -> None:
+        super().__init__()
+        self.n_episodes = n_episodes
+        self.episodes_seen = 0
+
+    def horizon(self) -> Horizon:
+        return Horizon(episodes=self.n_episodes - self.episodes_seen)
+
+    def pass_over(self, n_calls: int, n_episodes: int) -> None:
+        super().pass_over(n_calls, n_episodes)
+        self.episodes_seen += n_episodes
+
+    def _on_step(self) -> bool:
+        self.episodes_seen += int(np.sum(self.locals["dones"]))
+        # Algorithms take their progress from the steps done over the steps to do.
+        share_done = max(self.episodes_seen, 1e-9) / self.n_episodes
+        self.model._total_timesteps = self.num_timesteps / share_done  # type: ignore[assignment]
+        return self.episodes_seen < self.n_episodes
+
+
+def calls_until_multiple(n_calls: int, frequency: int) -> int:
+    """Calls until their number is a multiple of ``frequency``; never where that is below 1."""
+    return frequency - n_calls % frequency if frequency > 0 else NEVER
+
+
+def _every_n_timesteps(callback: Any) -> Horizon:
+    steps = callback.last_time_trigger + callback.n_steps - callback.num_timesteps
+    n_envs = callback.training_env.num_envs
+    return Horizon(calls=max(-(-steps // n_envs), 1))
+
+
+def _max_episodes(callback: Any) -> Horizon:
+    return Horizon(episodes=callback._total_max_episodes - callback.n_episodes)
+
+
+_LIBRARY_HORIZONS: dict[type[BaseCallback], Callable[[Any], Horizon]] = {
+    EvalCallback: lambda c: Horizon(calls_until_multiple(c.n_calls, c.eval_freq)),
+    CheckpointCallback: lambda c: Horizon(calls_until_multiple(c.n_calls, c.save_freq)),
+    EveryNTimesteps: _every_n_timesteps,
+    LogEveryNTimesteps: _every_n_timesteps,
+    StopTrainingOnMaxEpisodes: _max_episodes,
+    ProgressBarCallback: lambda _: Horizon(),
+}
+
+
+def members(callback: BaseCallback) -> list[BaseCallback]:
+    """The callback, or those in it where it is a list, down to the last."""
+    if type(callback) is CallbackList:
+        return [callback, *(m for child in callback.callbacks for m in members(child))]
+    return [callback]
+
+
+def unknown_callbacks(callback: BaseCallback) -> list[str]:
+    """Names of the callbacks that must be asked after each step."""
+    return [type(member).__name__ for member in members(callback) if not _is_known(member)]
+
+
+def _is_known(callback: BaseCallback) -> bool:
+    if type(callback) is ConvertCallback:
+        return callback.callback is None
+    known = type(callback) is CallbackList or type(callback) in _LIBRARY_HORIZONS
+    return known or hasattr(callback, "pass_over")
+
+
+def horizon(callback: BaseCallback) -> Horizon:
+    """When the first of the callbacks may act."""
+    horizons = []
+    for member in members(callback):
+        ask = getattr(member, "horizon", None)
+        if ask is not None:
+            horizons.append(ask())
+        elif type(member) in _LIBRARY_HORIZONS:
+            horizons.append(_LIBRARY_HORIZONS[type(member)](member))
+    return Horizon(
+        min((h.calls for h in horizons), default=NEVER),
+        min((h.episodes for h in horizons), default=NEVER),
+    )
+
+
+def pass_over(callback: BaseCallback, n_calls: int, n_episodes: int) -> None:
+    """Let each of the callbacks take note of calls that were left out."""
+    for member in members(callback):
+        if hasattr(member, "pass_over"):
+            member.pass_over(n_calls, n_episodes)
+            continue
+        member.n_calls += n_calls
+        if type(member) is StopTrainingOnMaxEpisodes:
+            member.n_episodes += n_episodes
+        elif type(member) is ProgressBarCallback:
+            member.pbar.update(n_calls * member.training_env.num_envs)

@@ -1,0 +1,92 @@
+"""What Monitor and the logger learn of many episodes at once."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+
+DECIMALS = 6
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Episodes that ended in a block, in the order in which they did.
+
+    Attributes:
+        envs: which environment each ran in, shape (n_episodes,).
+        steps: at which step of the block it ended, shape (n_episodes,).
+        returns: sum of its rewards, shape (n_episodes,).
+        lengths: number of its steps, shape (n_episodes,).
+        successes: whether it was a success, shape (n_episodes,).
+    """
+
+    envs: NDArray[np.int64]
+    steps: NDArray[np.int64]
+    returns: NDArray[np.float64]
+    lengths: NDArray[np.int64]
+    successes: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, log: NDArray[np.void]) -> Episodes:
+        """The episodes of records of type `EPISODE`, shape (n_episodes,)."""
+        return cls(log["env"], log["step"], log["episode_return"], log["length"], log["success"])
+
+    def infos(self, chosen: slice, times: list[float]) -> list[dict[str, Any]]:
+        """What Monitor would have put into ``info["episode"]`` for some of the episodes."""
+        return [
+            {"r": round(total, DECIMALS), "l": length, "t": times[env]}
+            for env, total, length in zip(
+                self.envs[chosen].tolist(),
+                self.returns[chosen].tolist(),
+                self.lengths[chosen].tolist(),
+                strict=True,
+            )
+        ]
+
+
+def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> list[float]:
+    """Do for a block of episodes what each Monitor does at the end of each.
+
+    All of them get the time of the end of the block.
+
+    Returns:
+        That time for each environment, in seconds since its Monitor was made.
+    """
+    times = []
+    for i, monitor in enumerate(monitors):
+        if monitor is None:
+            times.append(0.0)
+            continue
+        elapsed = time.time() - monitor.t_start
+        times.append(round(elapsed, DECIMALS))
+        chosen = slice(None) if len(monitors) == 1 else episodes.envs == i
+        returns, lengths = episodes.returns[chosen], episodes.lengths[chosen]
+        monitor.episode_returns += returns.tolist()
+        monitor.episode_lengths += lengths.tolist()
+        monitor.episode_times += [elapsed] * len(returns)
+        if monitor.results_writer is not None and len(returns):
+            _write_rows(monitor.results_writer.file_handler, returns, lengths, times[i])
+    return times
+
+
+def _write_rows(
+    file: Any, returns: NDArray[np.float64], lengths: NDArray[np.int64], seconds: float
+) -> None:
+    """Append rows as csv.DictWriter would, formatting each different one once."""
+    # Equal episodes are common where rewards are whole numbers.
+    pairs = np.stack((returns, lengths.astype(np.float64)), axis=1).view(np.complex128).ravel()
+    different, which = np.unique(pairs, return_inverse=True)
+    texts = np.array(
+        [
+            f"{round(pair.real, DECIMALS)},{int(pair.imag)},{seconds}\r\n"
+            for pair in different.tolist()
+        ],
+        dtype=object,
+    )
+    file.write("".join(texts[which].tolist()))
+    file.flush()

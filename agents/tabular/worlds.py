@@ -1,0 +1,153 @@
+"""From the environments of a training to the compiled `World` that stands for them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from agents.tabular.simulator import CART_POLE, MODEL, OUTCOME, CartPole, World
+from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
+from envs.wrappers import DiscretizeObservation
+from mdp.model import TransitionModel
+
+Env = gym.Env[Any, Any]
+
+NO_CART_POLE = CartPole(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, 0.0, 0.0)
+NO_INTS = np.empty(0, dtype=np.int64)
+CART_POLE_WRAPPERS = {DiscretizeObservation, Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
+
+
+class NotCompilable(Exception):  # noqa: N818  # no error: the interpreted loop takes over
+    """Why environments have no compiled counterpart."""
+
+
+def layers(env: Env) -> list[Env]:
+    """The environment and what it wraps, the outermost first."""
+    chain = [env]
+    while isinstance(env, gym.Wrapper):
+        env = env.env
+        chain.append(env)
+    return chain
+
+
+def monitor_of(env: Env) -> Monitor | None:
+    """The Monitor around the environment, if there is one."""
+    return next((layer for layer in layers(env) if isinstance(layer, Monitor)), None)
+
+
+def compile_world(vec_env: VecEnv) -> World:
+    """The compiled counterpart of environments that are all alike.
+
+    Raises:
+        NotCompilable: where there is none; the message says why.
+    """
+    if type(vec_env) is not DummyVecEnv:
+        raise NotCompilable(f"{type(vec_env).__name__} is not DummyVecEnv")
+    env = vec_env.envs[0]
+    if any(_description(other) != _description(env) for other in vec_env.envs[1:]):
+        raise NotCompilable("the environments are not known to be alike")
+    for other in vec_env.envs:
+        if other.render_mode == "human":
+            raise NotCompilable("the environment is shown on the screen")
+        _check_monitor(other)
+    if isinstance(env.unwrapped, CartPoleEnv):
+        return _cart_pole_world(env)
+    return _model_world(env)
+
+
+def _description(env: Env) -> list[Any]:
+    """What two environments must agree in to be alike."""
+    return [
+        *((type(layer), getattr(layer, "_saved_kwargs", None)) for layer in layers(env)),
+        env.unwrapped.spec or id(env),
+    ]
+
+
+def _check_monitor(env: Env) -> None:
+    monitor = monitor_of(env)
+    if monitor is None:
+        return
+    if monitor.info_keywords or monitor.reset_keywords:
+        raise NotCompilable("Monitor records further keys")
+    if time_limit(monitor.env) != time_limit(env):
+        raise NotCompilable("a time limit lies outside Monitor")
+
+
+def _model_world(env: Env) -> World:
+    model = transition_model(env)
+    observations = observations_of_states(env)
+    if model is None or observations is None:
+        raise NotCompilable("the environment's transition model is not known")
+    if not np.issubdtype(observations.dtype, np.integer) or observations.ndim != 1:
+        raise NotCompilable("the observations are not single numbers")
+    monitor = monitor_of(env)
+    seen_by_monitor = model if monitor is None else transition_model(monitor.env)
+    assert seen_by_monitor is not None
+    starts = np.flatnonzero(model.initial)
+    return World(
+        kind=MODEL,
+        time_limit=time_limit(env) or 0,
+        outcomes=_outcomes(env, model, seen_by_monitor),
+        starts=starts,
+        start_cumulative=np.cumsum(model.initial)[starts],
+        observation=observations.astype(np.int64),
+        cart_pole=NO_CART_POLE,
+        dims=NO_INTS,
+        bins=np.empty((0, 3)),
+    )
+
+
+def _outcomes(
+    env: Env, model: TransitionModel, seen_by_monitor: TransitionModel
+) -> np.ndarray[Any, np.dtype[np.void]]:
+    outcomes = np.zeros(model.prob.shape, dtype=OUTCOME)
+    outcomes["cumulative"] = np.cumsum(model.prob, axis=2)
+    outcomes["reward"] = seen_by_monitor.reward
+    # A VecEnv hands rewards on in single precision.
+    outcomes["agent_reward"] = model.reward.astype(np.float32)
+    outcomes["next_state"] = model.next_state
+    outcomes["terminated"] = model.terminated
+    success = success_outcomes(env)
+    if success is not None:
+        outcomes["success"] = success
+    return outcomes
+
+
+def _cart_pole_world(env: Env) -> World:
+    chain = layers(env)
+    wrappers = [layer for layer in chain if isinstance(layer, DiscretizeObservation)]
+    base = chain[-1]
+    assert isinstance(base, CartPoleEnv)
+    if len(wrappers) != 1 or {type(layer) for layer in chain[:-1]} - CART_POLE_WRAPPERS:
+        raise NotCompilable("CartPole compiles under DiscretizeObservation and Monitor alone")
+    if type(base) is not CartPoleEnv or base._sutton_barto_reward:
+        raise NotCompilable("CartPole compiles with its default reward alone")
+    wrapper = wrappers[0]
+    return World(
+        kind=CART_POLE,
+        time_limit=time_limit(env) or 0,
+        outcomes=np.empty((0, 0, 0), dtype=OUTCOME),
+        starts=NO_INTS,
+        start_cumulative=np.empty(0),
+        observation=NO_INTS,
+        cart_pole=CartPole(
+            gravity=float(base.gravity),
+            masspole=float(base.masspole),
+            total_mass=float(base.total_mass),
+            length=float(base.length),
+            polemass_length=float(base.polemass_length),
+            force_mag=float(base.force_mag),
+            tau=float(base.tau),
+            semi_implicit=base.kinematics_integrator != "euler",
+            x_threshold=float(base.x_threshold),
+            theta_threshold=float(base.theta_threshold_radians),
+        ),
+        dims=np.array(wrapper.dims, dtype=np.int64),
+        bins=np.stack((wrapper.bins, wrapper.low, wrapper.high), axis=1).astype(np.float64),
+    )

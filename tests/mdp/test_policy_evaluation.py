@@ -1,0 +1,217 @@
+"""Exact evaluation against closed forms and known figures."""
+
+import time
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from envs.model import success_outcomes, transition_model
+from mdp import (
+    TransitionModel,
+    best_blind_return,
+    blind_policies,
+    policy_return,
+    state_visitation,
+    value_iteration,
+)
+
+
+def model_of(env_id: str, **kwargs: Any) -> TransitionModel:
+    model = transition_model(gym.make(f"envs:{env_id}", **kwargs))
+    assert model is not None
+    return model
+
+
+def coin(end: float, reward: float = 1.0) -> TransitionModel:
+    """One state; each step earns ``reward`` and ends the episode with probability ``end``.
+
+    A second action does the same and never ends it.
+    """
+    return TransitionModel(
+        prob=np.array([[[end, 1 - end], [1.0, 0.0]]]),
+        next_state=np.zeros((1, 2, 2), int),
+        reward=np.full((1, 2, 2), reward),
+        terminated=np.array([[[True, False], [False, False]]]),
+        initial=np.ones(1),
+    )
+
+
+def test_the_geometric_distribution() -> None:
+    found = policy_return(coin(0.2, reward=3), np.array([0]), None)
+    assert found.expected_length == pytest.approx(5)
+    assert found.length_variance == pytest.approx(0.8 / 0.04)
+    assert found.expected_return == pytest.approx(15)
+    assert found.return_variance == pytest.approx(9 * 0.8 / 0.04)
+    assert found.success_rate is None
+    assert found.success_variance is None
+
+
+def test_the_geometric_distribution_cut_off() -> None:
+    model = coin(0.5)
+    found = policy_return(model, np.array([0]), 3, success=model.terminated)
+    assert found.expected_length == 0.5 * 1 + 0.25 * 2 + 0.25 * 3
+    assert found.success_rate == 0.875
+    assert found.success_variance == 0.875 * 0.125
+    assert state_visitation(model, np.array([0]), 3).tolist() == [1.75]
+
+
+def test_a_discounted_return_without_end() -> None:
+    found = policy_return(coin(0.5), np.array([1]), None, discount=0.9)
+    assert found.expected_return == pytest.approx(10)
+    assert found.return_variance == pytest.approx(0)
+    assert found.expected_length == np.inf
+    assert np.isnan(found.length_variance)
+    success = np.ones((1, 2, 2), bool)
+    assert policy_return(coin(0.5), np.array([1]), None, 0.9, success).success_rate == 0
+
+
+def test_different_starts_add_to_the_variance() -> None:
+    # From each of two states one step to the end, for 1 and for 5.
+    model = TransitionModel(
+        prob=np.ones((2, 1, 1)),
+        next_state=np.zeros((2, 1, 1), int),
+        reward=np.array([[[1.0]], [[5.0]]]),
+        terminated=np.ones((2, 1, 1), bool),
+        initial=np.array([0.5, 0.5]),
+    )
+    for horizon in (1, None):
+        found = policy_return(model, np.zeros(2, int), horizon)
+        assert (found.expected_return, found.return_variance) == (3.0, 4.0)
+
+
+@pytest.mark.parametrize(
+    ("shelf_reward", "expected"), [(-100, -27_427), (-1, -776)], ids=["shelf-100", "shelf-1"]
+)
+def test_random_moves_in_the_warehouse(shelf_reward: float, expected: float) -> None:
+    model = model_of("Warehouse-v0", shelf_reward=shelf_reward)
+    uniform, *constant = blind_policies(model)
+    assert policy_return(model, uniform, 1000).expected_return == pytest.approx(expected, abs=0.5)
+    returns = [policy_return(model, policy, 1000).expected_return for policy in constant]
+    assert returns[1:] == [-1000, -1000, -1000]
+    assert best_blind_return(model, 1000) == pytest.approx(max(-1000, expected), abs=0.5)
+
+
+def test_the_blind_policies_are_distributions_over_actions_alone() -> None:
+    model = coin(0.5)
+    assert [policy.tolist() for policy in blind_policies(model)] == [
+        [[0.5, 0.5]],
+        [[1.0, 0.0]],
+        [[0.0, 1.0]],
+    ]
+
+
+def test_the_best_route_of_the_warehouse() -> None:
+    env = gym.make("envs:Warehouse-v0")
+    model, success = transition_model(env), success_outcomes(env)
+    assert model is not None
+    found = policy_return(model, value_iteration(model, 1.0).policy, 1000, success=success)
+    assert vars(found) == {
+        "expected_return": 79.0,
+        "return_variance": 0.0,
+        "expected_length": 22.0,
+        "length_variance": 0.0,
+        "success_rate": 1.0,
+    }
+    visits = state_visitation(model, value_iteration(model, 1.0).policy, 1000)
+    assert sorted(visits)[-22:] == [1.0] * 22
+    assert visits.sum() == 22
+
+
+def test_the_frozen_lake_without_time_limit() -> None:
+    env = gym.make("FrozenLake-v1")
+    model, success = transition_model(env), success_outcomes(env)
+    assert model is not None
+    found = policy_return(model, value_iteration(model, 1.0).policy, None, success=success)
+    assert found.success_rate == pytest.approx(14 / 17)
+    assert found.expected_return == pytest.approx(14 / 17)
+    assert found.return_variance == pytest.approx(14 / 17 * 3 / 17)
+    assert found.success_variance == pytest.approx(14 / 17 * 3 / 17)
+
+
+def test_large_chains_are_solved_as_small_ones_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = model_of("FrozenLake-v1", map_name="8x8")
+    uniform = blind_policies(model)[0]
+    dense = policy_return(model, uniform, None, success=model.terminated)
+    dense_visits = state_visitation(model, uniform, None)
+    monkeypatch.setattr("mdp.chain.LARGEST_DENSE", 0)
+    sparse = policy_return(model, uniform, None, success=model.terminated)
+    for name, value in vars(dense).items():
+        assert getattr(sparse, name) == pytest.approx(value, rel=1e-10), name
+    np.testing.assert_allclose(state_visitation(model, uniform, None), dense_visits, rtol=1e-10)
+
+
+def test_forms_of_one_policy_agree() -> None:
+    model = model_of("FrozenLake-v1")
+    actions = value_iteration(model, 0.99).policy
+    matrix = np.eye(4)[actions]
+    expected = policy_return(model, actions, 100)
+    assert policy_return(model, matrix, 100) == expected
+    assert policy_return(model, matrix.astype(np.float32), 100) == expected
+    assert policy_return(model, np.tile(actions.astype(np.uint8), (100, 1)), 100) == expected
+
+
+def test_networks_round_their_probabilities() -> None:
+    model = coin(0.5)
+    rounded = np.array([[1 / 3, 2 / 3]], np.float32) * np.float32(1 + 1e-6)
+    found = policy_return(model, rounded, 50).expected_return
+    assert found == pytest.approx(
+        policy_return(model, np.array([[1 / 3, 2 / 3]]), 50).expected_return
+    )
+    assert state_visitation(model, rounded, 1).tolist() == [1.0]
+
+
+def test_marks_of_success_that_do_not_end_the_episode_are_ignored() -> None:
+    found = policy_return(coin(0.5), np.array([1]), 9, success=np.ones((1, 2, 2), bool))
+    assert found.success_rate == 0
+
+
+def test_what_a_policy_says_of_unreachable_states_is_ignored() -> None:
+    model = model_of("CliffWalking-v1")
+    policy = np.where(model.reachable, value_iteration(model, 1.0).policy, 77)
+    assert policy_return(model, policy, 200).expected_return == -13
+    matrix = np.full((model.n_states, 4), 0.25)
+    matrix[~model.reachable] = np.nan
+    assert np.isfinite(policy_return(model, matrix, 200).expected_return)
+
+
+@pytest.mark.parametrize(
+    ("policy", "horizon", "message"),
+    [
+        (np.array([1]), None, "from state 0 the policy never ends the episode"),
+        (np.array([2]), 5, "the policy takes an action outside 0..1"),
+        (np.array([-1]), 5, "the policy takes an action outside 0..1"),
+        (np.zeros((4, 1), int), 5, r"actions have shape \(4, 1\), they must have \(1,\), or \(5"),
+        (np.zeros((4, 1), int), None, r"actions have shape \(4, 1\)"),
+        (np.ones((1, 3)), 5, r"the policy matrix has shape \(1, 3\), it must have \(1, 2\)"),
+        (np.array([[0.5, 0.6]]), 5, r"in state 0 the policy's probabilities are \[0.5 0.6\]"),
+        (np.array([[np.nan, 1.0]]), 5, "in state 0 the policy's probabilities are"),
+        (np.array([[-0.5, 1.5]]), 5, "in state 0 the policy's probabilities are"),
+        (np.array([0]), 0, "horizon is 0, it must be at least 1, or None"),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("function", [policy_return, state_visitation])
+def test_wrong_policies_are_refused(
+    function: Any, policy: Any, horizon: int | None, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        function(coin(0.5), policy, horizon)
+
+
+def test_marks_of_the_wrong_shape_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"success has shape \(1,\), the model has \(1, 2, 2\)"):
+        policy_return(coin(0.5), np.array([0]), 5, success=np.ones(1, bool))
+
+
+def test_evaluation_is_fast() -> None:
+    """Of a policy that wanders for a thousand steps; the limit leaves room for a busy machine."""
+    model = model_of("Warehouse-v0")
+    uniform = blind_policies(model)[0]
+    times = []
+    for _ in range(6):
+        started = time.perf_counter()
+        policy_return(model, uniform, 1000)
+        times.append(time.perf_counter() - started)
+    assert min(times[1:]) < 0.005

@@ -1,0 +1,144 @@
+"""The transition model: what it accepts, what it refuses, what it derives."""
+
+import pickle
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from mdp import TransitionModel
+
+
+def arrays() -> dict[str, Any]:
+    """Two states, two actions, at most two outcomes; the second state is never entered alive."""
+    return {
+        "prob": np.array([[[0.25, 0.75], [1.0, 0.0]], [[1.0, 0.0], [0.5, 0.5]]]),
+        "next_state": np.array([[[0, 1], [0, 0]], [[1, 0], [0, 1]]]),
+        "reward": np.array([[[2.0, 4.0], [-1.0, 99.0]], [[0.0, 0.0], [7.0, 7.0]]]),
+        "terminated": np.array([[[False, True], [False, False]], [[False, False], [False, False]]]),
+        "initial": np.array([1.0, 0.0]),
+    }
+
+
+def test_sizes_and_derived_arrays() -> None:
+    model = TransitionModel(**arrays())
+    assert (model.n_states, model.n_actions, model.n_outcomes) == (2, 2, 2)
+    assert model.expected_reward.tolist() == [[3.5, -1.0], [0.0, 7.0]]
+    assert model.reachable.tolist() == [True, False]
+    assert model.continuing(0).toarray().tolist() == [[0.25, 0.0], [0.0, 1.0]]
+    assert model.continuing(1).toarray().tolist() == [[1.0, 0.0], [0.5, 0.5]]
+
+
+def test_outcomes_that_lead_to_one_state_add_up_in_the_matrix_and_stay_apart_in_the_model() -> None:
+    given = arrays()
+    given["next_state"][1, 1] = [0, 0]
+    model = TransitionModel(**given)
+    assert model.continuing(1).toarray().tolist() == [[1.0, 0.0], [1.0, 0.0]]
+    assert model.prob[1, 1].tolist() == [0.5, 0.5]
+
+
+def test_arrays_are_read_only_and_the_callers_stay_writable() -> None:
+    given = arrays()
+    model = TransitionModel(**given)
+    with pytest.raises(ValueError, match="read-only"):
+        model.prob[0, 0, 0] = 0.5
+    with pytest.raises(ValueError, match="read-only"):
+        model.expected_reward[0, 0] = 0.5
+    given["prob"][0, 0] = [0.5, 0.5]
+    assert np.shares_memory(model.prob, given["prob"])
+
+
+@pytest.mark.parametrize(("given", "kept"), [(np.int32, np.int32), (np.uint8, np.int64)])
+def test_index_types(given: type, kept: type) -> None:
+    model = TransitionModel(**{**arrays(), "next_state": arrays()["next_state"].astype(given)})
+    assert model.next_state.dtype == kept
+
+
+def test_pickling_keeps_everything() -> None:
+    model = TransitionModel(**arrays())
+    copy = pickle.loads(pickle.dumps(model))
+    for name in arrays():
+        np.testing.assert_array_equal(getattr(copy, name), getattr(model, name))
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "message"),
+    [
+        ("prob", (1, 0, 0), 0.9, "state 1, action 0 has probabilities that do not sum to one"),
+        ("prob", (0, 1), [1.5, -0.5], r"state 0, action 1 has a probability outside \[0, 1\]"),
+        ("prob", (0, 1, 0), np.nan, r"state 0, action 1 has a probability outside \[0, 1\]"),
+        ("next_state", (1, 1, 0), 2, r"state 1, action 1 has a next state outside 0..1"),
+        ("next_state", (0, 1, 1), -1, r"state 0, action 1 has a next state outside 0..1"),
+        ("reward", (0, 0, 1), np.inf, "state 0, action 0 has a reward that is not finite"),
+        ("initial", 0, 0.5, "initial sums to 0.5, it must sum to one"),
+        ("initial", slice(None), [1.5, -0.5], r"initial has a probability outside \[0, 1\] at"),
+    ],
+)
+def test_wrong_numbers_are_refused(name: str, place: Any, value: Any, message: str) -> None:
+    given = arrays()
+    given[name][place] = value
+    with pytest.raises(ValueError, match=message):
+        TransitionModel(**given)
+
+
+@pytest.mark.parametrize(
+    ("name", "shape", "message"),
+    [
+        ("prob", (2, 4), r"prob has shape \(2, 4\)"),
+        ("reward", (2, 4), r"reward has shape \(2, 4\), prob has \(2, 2, 2\)"),
+        ("initial", (1, 2), r"initial has shape \(1, 2\), it must be \(2,\)"),
+    ],
+)
+def test_wrong_shapes_are_refused(name: str, shape: tuple[int, ...], message: str) -> None:
+    given = arrays()
+    with pytest.raises(ValueError, match=message):
+        TransitionModel(**{**given, name: given[name].reshape(shape)})
+
+
+def test_rounding_of_probabilities_is_accepted() -> None:
+    given = arrays()
+    given["prob"][1, 1] = [0.5, 0.5 + 5e-10]
+    TransitionModel(**given)
+
+
+def test_from_gymnasium_pads_and_keeps_the_order() -> None:
+    outcomes = [(0.25, 1, 1.0, True), (0.5, 0, 2.0, False), (0.25, 1, 1.0, True)]
+    P = {  # noqa: N806 (Gymnasium's own name)
+        0: {0: outcomes, 1: [(1.0, 1, 3.0, False)]},
+        1: {0: [(1.0, 0, 4.0, False)], 1: [(1.0, 1, 5.0, True)]},
+    }
+    model = TransitionModel.from_gymnasium(P, [1, 0])
+    assert model.prob[0].tolist() == [[0.25, 0.5, 0.25], [1.0, 0.0, 0.0]]
+    assert model.next_state[0, 0].tolist() == [1, 0, 1]
+    assert model.reward[:, 1, 0].tolist() == [3.0, 5.0]
+    assert model.terminated[0, 0].tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("P", "message"),
+    [
+        ({0: {0: [(1.0, 0, 0.0, True)]}, 2: {}}, "P has no state 1"),
+        ({0: {0: [(1.0, 0, 0.0, True)]}, 1: {}}, "state 1 must have the actions 0 to 0"),
+        ({0: {0: []}}, "state 0, action 0 has no outcome"),
+    ],
+)
+def test_from_gymnasium_refuses_gaps(P: Any, message: str) -> None:  # noqa: N803 (as above)
+    with pytest.raises(ValueError, match=message):
+        TransitionModel.from_gymnasium(P, np.ones(len(P)) / len(P))
+
+
+@pytest.mark.parametrize(
+    ("env_id", "shape", "unreachable"),
+    [
+        ("FrozenLake-v1", (16, 4, 3), [5, 7, 11, 12, 15]),
+        ("CliffWalking-v1", (48, 4, 1), [*range(37, 48)]),
+        # The passenger is where he wants to be, and waits there: entered by terminating alone.
+        ("Taxi-v4", (500, 6, 1), [s for s in range(500) if s // 4 % 5 == s % 4]),
+    ],
+)
+def test_gymnasium_models(env_id: str, shape: tuple[int, ...], unreachable: list[int]) -> None:
+    env: Any = gym.make(env_id).unwrapped
+    model = TransitionModel.from_gymnasium(env.P, env.initial_state_distrib)
+    assert model.prob.shape == shape
+    assert np.flatnonzero(~model.reachable).tolist() == unreachable

@@ -1,0 +1,356 @@
+"""What an agent is trained on, and what it is evaluated on."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from stable_baselines3.common import vec_env
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+
+from envs.wrappers import OneHotObservation, ScaleReward, TerminationReward
+from pipeline.environments import (
+    EVALUATION_TIME_LIMIT,
+    check_env_id,
+    evaluation_kwargs,
+    import_gym_packages,
+    make_env,
+    make_evaluation_env,
+    make_single_env,
+    make_training_env,
+    training_kwargs,
+)
+from pipeline.errors import UserError
+from pipeline.hyperparams import split
+from pipeline.specs import TrainSpec
+
+
+def spec_of(env_id, entry=None, **kwargs):
+    entry = {"n_timesteps": 100, **(entry or {})}
+    return TrainSpec("random", env_id, split(entry), entry, seed=0, **kwargs)
+
+
+def layers(env):
+    """The classes around an environment, the outermost first."""
+    classes = [type(env)]
+    while env is not env.unwrapped:
+        env = env.env
+        classes.append(type(env))
+    return classes
+
+
+def time_limit(env):
+    while env is not env.unwrapped:
+        if isinstance(env, gym.wrappers.TimeLimit):
+            return env._max_episode_steps
+        env = env.env
+    return None
+
+
+# --- arguments -----------------------------------------------------------------------------------
+
+
+ENTRY = {
+    "env_kwargs": {"step_reward": -2, "goal_reward": 50},
+    "train_env_kwargs": {"random_start": True, "max_episode_steps": 30, "goal_reward": 60},
+    "eval_env_kwargs": {"slip": 0.1, "max_episode_steps": 40},
+}
+
+
+def test_which_arguments_reach_training_and_which_evaluation():
+    spec = spec_of("Warehouse-v0", ENTRY)
+    assert training_kwargs(spec) == {
+        "step_reward": -2,
+        "goal_reward": 60,
+        "random_start": True,
+        "max_episode_steps": 30,
+    }
+    assert evaluation_kwargs(spec) == {
+        "step_reward": -2,
+        "goal_reward": 50,
+        "slip": 0.1,
+        "max_episode_steps": 40,
+    }
+
+
+def test_the_environments_get_their_arguments(tmp_path):
+    spec = spec_of("Warehouse-v0", {**ENTRY, "n_envs": 2})
+    training, evaluation = make_training_env(spec, tmp_path), make_evaluation_env(spec, 3)
+    assert (training.num_envs, evaluation.num_envs) == (2, 3)
+    for env, goal_reward, limit in ((training, 60, 30), (evaluation, 50, 40)):
+        for single in env.envs:
+            kwargs = single.unwrapped.spec.kwargs
+            assert (kwargs["step_reward"], kwargs["goal_reward"]) == (-2, goal_reward)
+            assert time_limit(single) == limit
+        # Only training begins anywhere.
+        starts = {int(env.reset()[0]) for _ in range(20)}
+        assert (len(starts) > 1) == (env is training)
+    assert "slip" not in training.envs[0].unwrapped.spec.kwargs
+    training.close()
+    assert make_single_env(spec, training=True).unwrapped.spec.kwargs["goal_reward"] == 60
+    assert make_single_env(spec).unwrapped.spec.kwargs["goal_reward"] == 50
+
+
+def test_only_training_is_recorded(tmp_path):
+    spec = spec_of("Warehouse-v0", {"n_envs": 2})
+    make_training_env(spec, tmp_path).close()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.monitor.csv", "1.monitor.csv"]
+    evaluation = make_evaluation_env(spec, 2)
+    assert len(list(tmp_path.iterdir())) == 2
+    assert all(isinstance(env, Monitor) for env in evaluation.envs)
+
+
+def test_training_environments_follow_the_seed_each_with_its_own():
+    def starts(spec):
+        env = make_training_env(spec, None)
+        return [env.reset().tolist() for _ in range(3)]
+
+    entry = {"n_envs": 2}
+    first = starts(spec_of("CartPole-v1", entry))
+    assert starts(spec_of("CartPole-v1", entry)) == first
+    assert all(both[0] != both[1] for both in first)
+
+
+# --- time limits ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("env_id", "entry", "training", "evaluation"),
+    [
+        # Without a limit of its own.
+        ("CliffWalking-v1", {}, None, EVALUATION_TIME_LIMIT),
+        ("CliffWalking-v1", {"eval_env_kwargs": {"max_episode_steps": 200}}, None, 200),
+        ("CliffWalking-v1", {"env_kwargs": {"max_episode_steps": 50}}, 50, 50),
+        (
+            "CliffWalking-v1",
+            {"train_env_kwargs": {"max_episode_steps": 70}},
+            70,
+            EVALUATION_TIME_LIMIT,
+        ),
+        # With one.
+        ("FrozenLake-v1", {}, 100, 100),
+        ("FrozenLake-v1", {"train_env_kwargs": {"max_episode_steps": 7}}, 7, 100),
+        ("envs:Warehouse-v0", {}, 1000, 1000),
+        # Taken away: training may go on without end, evaluation must not.
+        ("CartPole-v1", {"train_env_kwargs": {"max_episode_steps": -1}}, None, 500),
+        ("CartPole-v1", {"env_kwargs": {"max_episode_steps": -1}}, None, EVALUATION_TIME_LIMIT),
+    ],
+)
+def test_evaluation_always_has_a_time_limit(env_id, entry, training, evaluation):
+    spec = spec_of(env_id, entry)
+    assert time_limit(make_single_env(spec, training=True)) == training
+    assert time_limit(make_single_env(spec)) == evaluation
+    assert time_limit(make_training_env(spec, None).envs[0]) == training
+    assert time_limit(make_evaluation_env(spec, 1).envs[0]) == evaluation
+
+
+def test_an_episode_that_goes_in_circles_ends():
+    env = make_evaluation_env(spec_of("CliffWalking-v1"), 1)
+    env.reset()
+    for step in range(1, EVALUATION_TIME_LIMIT + 1):
+        _, _, dones, infos = env.step([0])
+        assert dones[0] == (step == EVALUATION_TIME_LIMIT)
+    assert infos[0]["TimeLimit.truncated"] is True
+    assert infos[0]["episode"]["l"] == EVALUATION_TIME_LIMIT
+
+
+# --- wrappers ------------------------------------------------------------------------------------
+
+WRAPPED = {
+    "env_wrapper": [
+        {"envs.wrappers.TerminationReward": {"reward": 5}},
+        "envs.wrappers.OneHotObservation",
+    ],
+    "train_env_wrapper": [{"envs.wrappers.ScaleReward": {"scale": 0.5}}],
+}
+
+
+def test_wrappers_stand_in_their_order():
+    spec = spec_of("FrozenLake-v1", WRAPPED)
+    both = [OneHotObservation, TerminationReward]
+    training, evaluation = make_training_env(spec, None), make_evaluation_env(spec, 1)
+    # Monitor is inside: it records the rewards of the environment itself.
+    assert layers(training.envs[0])[:4] == [ScaleReward, *both, Monitor]
+    assert layers(evaluation.envs[0])[:3] == [*both, Monitor]
+    assert layers(make_single_env(spec, training=True))[:3] == [ScaleReward, *both]
+    assert layers(make_single_env(spec))[:2] == both
+    assert training.observation_space.shape == evaluation.observation_space.shape == (16,)
+
+
+def test_rewards_are_changed_for_training_and_recorded_unchanged():
+    entry = {
+        "env_kwargs": {"desc": ["SG"]},
+        "train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 0.5}},
+    }
+    spec = spec_of("Warehouse-v0", entry)
+    for env, reward in (
+        (make_training_env(spec, None), 50.0),
+        (make_evaluation_env(spec, 1), 100.0),
+    ):
+        env.reset()
+        _, rewards, dones, infos = env.step([3])
+        assert (rewards[0], dones[0]) == (reward, True)
+        assert infos[0]["episode"]["r"] == 100.0
+
+
+def test_a_wrapper_put_innermost_is_inside_monitor():
+    made = []
+
+    def wrap(env):
+        made.append(ScaleReward(env, 2.0))
+        return made[-1]
+
+    env = make_evaluation_env(spec_of("FrozenLake-v1", WRAPPED), 2, wrap_innermost=wrap)
+    assert [single.get_wrapper_attr("scale") for single in env.envs] == [2.0, 2.0]
+    chain = layers(env.envs[0])
+    assert chain.index(ScaleReward) == chain.index(Monitor) + 1
+    assert len(made) == 2
+
+
+def test_extra_arguments_reach_evaluation():
+    env = make_evaluation_env(spec_of("FrozenLake-v1"), 1, render_mode="ansi")
+    assert env.envs[0].render_mode == "ansi"
+
+
+def test_a_wrapper_that_does_not_fit_is_told_in_one_line():
+    spec = spec_of("CartPole-v1", {"env_wrapper": "envs.wrappers.OneHotObservation"})
+    with pytest.raises(UserError, match="OneHotObservation needs Discrete observations"):
+        make_single_env(spec)
+
+
+# --- vectorised environments ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("given", "training", "evaluation"),
+    [
+        (True, (True, True, 0.9), (True, False, 0.9)),
+        ({"norm_obs": False}, (False, True, 0.9), (False, False, 0.9)),
+        ({"norm_reward": False, "gamma": 0.5}, (True, False, 0.5), (True, False, 0.5)),
+    ],
+)
+def test_normalisation(given, training, evaluation):
+    spec = spec_of("CartPole-v1", {"normalize": given, "gamma": 0.9, "n_envs": 2})
+    env, eval_env = make_training_env(spec, None), make_evaluation_env(spec, 1)
+    assert isinstance(env, VecNormalize)
+    assert isinstance(eval_env, VecNormalize)
+    assert (env.norm_obs, env.norm_reward, env.gamma) == training
+    assert (eval_env.norm_obs, eval_env.norm_reward, eval_env.gamma) == evaluation
+    assert (env.training, eval_env.training) == (True, False)
+
+
+def test_evaluation_leaves_the_statistics_alone_and_reports_rewards_as_they_are():
+    eval_env = make_evaluation_env(spec_of("CartPole-v1", {"normalize": True}), 1)
+    eval_env.reset()
+    before = eval_env.obs_rms.mean.copy()
+    rewards = [eval_env.step([0])[1][0] for _ in range(5)]
+    assert rewards == [1.0] * 5
+    np.testing.assert_array_equal(eval_env.obs_rms.mean, before)
+
+
+def test_nothing_is_normalised_or_stacked_unless_asked_for():
+    for env in (
+        make_training_env(spec_of("CartPole-v1", {"normalize": False}), None),
+        make_evaluation_env(spec_of("CartPole-v1"), 1),
+    ):
+        assert type(env) is DummyVecEnv
+
+
+def test_observations_are_stacked_outside_of_normalisation():
+    spec = spec_of("CartPole-v1", {"frame_stack": 3, "normalize": {"norm_reward": False}})
+    for env in (make_training_env(spec, None), make_evaluation_env(spec, 1)):
+        assert isinstance(env, VecFrameStack)
+        assert isinstance(env.venv, VecNormalize)
+        assert env.observation_space.shape == (12,)
+        first = env.reset()
+        np.testing.assert_array_equal(first[0, :8], 0)
+        second, _, _, _ = env.step([0])
+        np.testing.assert_array_equal(second[0, 4:8], first[0, 8:])
+
+
+def test_wrappers_of_the_vectorised_environment_are_inside_normalisation():
+    spec = spec_of(
+        "CartPole-v1",
+        {
+            "normalize": True,
+            "vec_env_wrapper": "stable_baselines3.common.vec_env.VecCheckNan",
+        },
+    )
+    for env in (make_training_env(spec, None), make_evaluation_env(spec, 1)):
+        assert isinstance(env, VecNormalize)
+        assert type(env.venv).__name__ == "VecCheckNan"
+
+
+def test_pictures_are_turned_for_networks():
+    """Networks want the channels first, whoever made the environment."""
+    gym.register("Picture-v0", entry_point=Picture)
+    try:
+        env = make_evaluation_env(spec_of("Picture-v0"), 1)
+    finally:
+        del gym.registry["Picture-v0"]
+    assert env.observation_space.shape == (3, 36, 40)
+    assert env.reset().shape == (1, 3, 36, 40)
+
+
+class Picture(gym.Env):
+    observation_space = gym.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros((36, 40, 3), np.uint8), {}
+
+
+def test_the_kind_of_vectorised_environment_is_for_training_alone(monkeypatch):
+    class Parallel(DummyVecEnv):
+        """Stands in for the one that starts processes."""
+
+    monkeypatch.setattr(vec_env, "SubprocVecEnv", Parallel)
+    spec = spec_of("FrozenLake-v1", vec_env="subproc")
+    assert type(make_training_env(spec, None)) is Parallel
+    assert type(make_evaluation_env(spec, 1)) is DummyVecEnv
+
+
+# --- names ---------------------------------------------------------------------------------------
+
+
+def test_environments_are_known_by_name_with_or_without_their_module():
+    check_env_id("Warehouse-v0")
+    check_env_id("envs:Warehouse-v0")
+    with pytest.raises(UserError, match=r"unknown environment 'Warehose-v0': .*'Warehouse-v0'"):
+        check_env_id("Warehose-v0")
+    with pytest.raises(UserError, match="cannot import no_such_module"):
+        check_env_id("no_such_module:Warehouse-v0")
+
+
+def test_packages_are_imported_for_what_they_register(tmp_path, monkeypatch):
+    (tmp_path / "more_envs_for_a_test.py").write_text(
+        "import gymnasium\n"
+        "gymnasium.register('MoreCartPole-v0', 'gymnasium.envs.classic_control:CartPoleEnv')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(UserError, match="unknown environment 'MoreCartPole-v0'"):
+        check_env_id("MoreCartPole-v0")
+    import_gym_packages(("more_envs_for_a_test",))
+    try:
+        check_env_id("MoreCartPole-v0")
+    finally:
+        del gym.registry["MoreCartPole-v0"]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "complaint"),
+    [
+        ("FrozenLake-v1", {"slippery": True}, "slippery"),
+        ("Warehouse-v0", {"slip": 2}, "slip"),
+        ("Warehouse-v0", {"desc": "no_such_map.txt"}, "no_such_map.txt"),
+        ("FrozenLake-v1", {"map_name": "9x9"}, "9x9"),
+    ],
+)
+def test_wrong_arguments_are_told_in_one_line(env_id, kwargs, complaint):
+    try:
+        make_env(env_id, kwargs)
+    except UserError as error:
+        message = str(error)
+    assert message.startswith(f"{env_id}: ")
+    assert complaint in message
+    assert "\n" not in message

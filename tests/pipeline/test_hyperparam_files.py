@@ -1,0 +1,87 @@
+"""The hyperparameters that come with the project: every entry makes an agent that fits."""
+
+from pathlib import Path
+
+import gymnasium as gym
+import pytest
+
+from agents import ALGORITHMS, load_algorithm
+from pipeline import hyperparams
+from pipeline.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.components import callbacks, vec_wrapper_factory
+from pipeline.environments import make_single_env, make_training_env
+from pipeline.hyperparams import entry_names, override, read_hyperparams, split
+from pipeline.requests import check_fit
+from pipeline.specs import TrainSpec
+from pipeline.strict_yaml import read_yaml
+
+FOLDER = Path(hyperparams.__file__).parent.parent / "hyperparams"
+FILES = sorted(FOLDER.glob("*.yml"))
+ENTRIES = [(path.stem, key) for path in FILES for key in read_yaml(path)]
+
+# Agents of one environment alone have no entry that stands in for others.
+SPECIALISTS = {"angle"}
+
+
+def spec_of(algo, env_id, **changes):
+    raw = override(read_hyperparams(algo, env_id), changes)
+    return TrainSpec(algo, env_id, split(raw), raw, seed=0)
+
+
+def test_every_file_is_an_agents_and_every_agent_has_one():
+    assert {path.stem for path in FILES} == set(ALGORITHMS)
+    assert {path.name for path in FOLDER.iterdir()} == {f"{name}.yml" for name in ALGORITHMS}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_every_file_names_known_environments(path):
+    names = list(read_yaml(path))
+    assert set(names) - {"default"} <= set(gym.registry)
+    assert entry_names(path.stem) == [name for name in names if name != "default"]
+    assert ("default" in names) == (path.stem not in SPECIALISTS)
+
+
+@pytest.mark.parametrize(("algo", "key"), ENTRIES)
+def test_every_entry_says_how_long_to_train_and_builds_its_agents_arguments(algo, key):
+    entry = read_yaml(FOLDER / f"{algo}.yml")[key]
+    spec = split(entry)
+    assert [spec.n_timesteps, spec.n_episodes].count(None) == 1
+    kwargs = build_algorithm_kwargs(load_algorithm(algo), spec.algorithm, algo)
+    assert set(kwargs) == set(spec.algorithm)
+    assert kwargs["policy"] in load_algorithm(algo).policy_aliases
+    # A budget from the command line replaces the entry's.
+    assert split(override(entry, {"n_episodes": 3})).n_timesteps is None
+
+
+@pytest.mark.parametrize(("algo", "env_id"), [entry for entry in ENTRIES if entry[1] != "default"])
+def test_every_entry_fits_its_environment(algo, env_id):
+    spec = spec_of(algo, env_id)
+    check_fit(spec)
+    training, evaluation = make_single_env(spec, training=True), make_single_env(spec)
+    # What was learnt in the one must be of use in the other.
+    assert training.observation_space == evaluation.observation_space
+    assert training.action_space == evaluation.action_space
+    assert ALGORITHMS[algo].misfit(evaluation.observation_space, evaluation.action_space) == ""
+    for env in (training, evaluation):
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        env.close()
+
+
+@pytest.mark.parametrize(("algo", "key"), ENTRIES)
+def test_every_entry_names_components_that_there_are(algo, key, tmp_path):
+    spec = split(read_yaml(FOLDER / f"{algo}.yml")[key])
+    vec_wrapper_factory(spec.vec_env_wrapper)
+    assert len(callbacks(spec.callback, save_path=tmp_path)) == len(spec.callback)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_an_agent_takes_its_first_steps(algo):
+    """One entry of each file, as it stands there."""
+    spec = spec_of(algo, entry_names(algo)[0])
+    algorithm = load_algorithm(algo)
+    env = make_training_env(spec, None)
+    kwargs = build_algorithm_kwargs(algorithm, spec.hyperparams.algorithm, algo)
+    model = algorithm(env=env, device="cpu", seed=0, **kwargs).learn(2 * env.num_envs)
+    assert model.num_timesteps >= 2 * env.num_envs
+    env.close()
