@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import compiled
+from mdp.compiled import inlined
 
 EPSILON_GREEDY = 0
 BOLTZMANN = 1
@@ -35,7 +35,16 @@ def draws_per_choice(strategy: int, n_actions: int) -> int:
     return {EPSILON_GREEDY: 2, BOLTZMANN: 1, GAUSSIAN_NOISE: n_actions}[strategy]
 
 
-@compiled
+@inlined
+def highest_value(values: Floats) -> float:
+    """The highest of ``values``, shape (A,); a plain loop is faster here than NumPy's."""
+    highest = values[0]
+    for action in range(1, len(values)):
+        highest = max(highest, values[action])
+    return float(highest)
+
+
+@inlined
 def greedy_action(values: Floats, uniform: float) -> int:
     """A best action; ``uniform`` picks among ties, and 0 picks the first, as argmax does.
 
@@ -62,7 +71,7 @@ def greedy_action(values: Floats, uniform: float) -> int:
     return best_action
 
 
-@compiled
+@inlined
 def epsilon_greedy_action(values: Floats, epsilon: float, tie_scale: float, draws: Floats) -> int:
     """A uniformly random action with probability ``epsilon``, else a greedy one."""
     if draws[0] < epsilon:
@@ -70,13 +79,13 @@ def epsilon_greedy_action(values: Floats, epsilon: float, tie_scale: float, draw
     return greedy_action(values, draws[1] * tie_scale)
 
 
-@compiled
+@inlined
 def boltzmann_action(values: Floats, temperature: float, draws: Floats) -> int:
     """An action with probability proportional to exp(value / temperature)."""
-    highest = np.max(values)
+    highest = highest_value(values)
     total = 0.0
-    for value in values:
-        total += math.exp((value - highest) / temperature)
+    for action in range(len(values)):
+        total += math.exp((values[action] - highest) / temperature)
     remaining = draws[0] * total
     for action in range(len(values) - 1):
         remaining -= math.exp((values[action] - highest) / temperature)
@@ -85,7 +94,7 @@ def boltzmann_action(values: Floats, temperature: float, draws: Floats) -> int:
     return len(values) - 1
 
 
-@compiled
+@inlined
 def noisy_greedy_action(values: Floats, noise_std: float, draws: Floats) -> int:
     """The best action after Gaussian noise of standard deviation ``noise_std`` on each value."""
     best_action = 0
@@ -98,7 +107,7 @@ def noisy_greedy_action(values: Floats, noise_std: float, draws: Floats) -> int:
     return best_action
 
 
-@compiled
+@inlined
 def choose_action(
     strategy: int, values: Floats, rate: float, tie_scale: float, draws: Floats
 ) -> int:
@@ -118,22 +127,25 @@ def choose_action(
     return noisy_greedy_action(values, rate, draws)
 
 
-@compiled
+@inlined
 def expected_value(strategy: int, values: Floats, rate: float) -> float:
     """Mean of ``values``, shape (A,), under the exploring policy.
 
     Ties do not matter, since tied actions are of equal value. Gaussian noise has no closed form and
     is refused where an agent is built.
     """
-    highest = np.max(values)
+    highest = highest_value(values)
     if strategy == EPSILON_GREEDY:
-        return rate * np.mean(values) + (1.0 - rate) * highest
+        total = 0.0
+        for action in range(len(values)):
+            total += values[action]
+        return rate * total / len(values) + (1.0 - rate) * highest
     total = 0.0
     weighted = 0.0
-    for value in values:
-        weight = math.exp((value - highest) / rate)
+    for action in range(len(values)):
+        weight = math.exp((values[action] - highest) / rate)
         total += weight
-        weighted += weight * value
+        weighted += weight * values[action]
     return weighted / total
 
 

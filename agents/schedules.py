@@ -12,7 +12,7 @@ import math
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from mdp.compiled import compiled
+from mdp.compiled import inlined
 
 LINEAR = 0.0
 EXPONENTIAL = 1.0
@@ -20,7 +20,7 @@ EXPONENTIAL = 1.0
 ScheduleRow = tuple[float, float, float, float]
 
 
-@compiled
+@inlined
 def schedule_value(row: ScheduleRow, progress_remaining: float) -> float:
     """Value of the schedule ``row`` = (kind, start, end, end_fraction)."""
     kind, start, end, end_fraction = row

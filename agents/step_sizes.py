@@ -5,12 +5,12 @@ Sutton and Barto (2nd edition), section 2.4 (sample averages) and 2.5 (constant 
 
 from __future__ import annotations
 
-from mdp.compiled import compiled
+from mdp.compiled import inlined
 
 SAMPLE_AVERAGE = "sample_average"
 
 
-@compiled
+@inlined
 def step_size(learning_rate: float, sample_average: bool, visit_count: int) -> float:
     """1/N for the N-th visit where ``sample_average``, else the learning rate.
 

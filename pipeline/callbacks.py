@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.utils import ConstantSchedule
@@ -221,6 +222,16 @@ class ExponentialExploration(BaseCallback):
         self.initial_eps = initial_eps
         self.final_eps = final_eps
         self.decay = decay
+
+    def check_model(self, model: BaseAlgorithm) -> None:
+        """Refuse agents whose exploration is no business of this callback.
+
+        Raises:
+            ValueError: if the agent is not a DQN.
+        """
+        if not isinstance(model, DQN):
+            name = type(model).__name__
+            raise ValueError(f"ExponentialExploration is for DQN and its kin, not for {name}")
 
     def _on_rollout_start(self) -> None:
         updates = self.model._n_updates

@@ -17,6 +17,17 @@ from pipeline.specs import TrainSpec
 # policy that runs in a circle would never end.
 EVALUATION_TIME_LIMIT = 1000
 
+# What environments raise when they are made with wrong arguments.
+MISTAKES = (
+    TypeError,
+    ValueError,
+    LookupError,
+    AssertionError,
+    OSError,
+    ImportError,
+    gym.error.Error,
+)
+
 Wrap = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 
 TRAINING_VEC_ENVS = {"dummy": "DummyVecEnv", "subproc": "SubprocVecEnv"}
@@ -56,7 +67,7 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """
     try:
         return gym.make(env_id, **kwargs)
-    except (TypeError, ValueError, AssertionError, OSError, ImportError, gym.error.Error) as error:
+    except MISTAKES as error:
         raise UserError(f"{env_id}: {one_line(error)}") from error
 
 
@@ -68,8 +79,10 @@ def training_kwargs(spec: TrainSpec) -> dict[str, Any]:
 def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
     """Arguments of the environments that it is evaluated on, which always have a time limit."""
     kwargs = {**spec.hyperparams.env_kwargs, **spec.hyperparams.eval_env_kwargs}
-    if gym.spec(spec.env_id).max_episode_steps is None:
-        kwargs.setdefault("max_episode_steps", EVALUATION_TIME_LIMIT)
+    registered = gym.spec(spec.env_id.rpartition(":")[2]).max_episode_steps
+    # Gymnasium takes -1 for no limit at all.
+    if kwargs.get("max_episode_steps", registered) in (None, -1):
+        kwargs["max_episode_steps"] = EVALUATION_TIME_LIMIT
     return kwargs
 
 
@@ -79,9 +92,7 @@ def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
 
     inner = wrapper_factory(spec.hyperparams.env_wrapper, spec.gym_packages)
     outer = (
-        wrapper_factory(
-            spec.hyperparams.train_env_wrapper, spec.gym_packages, "train_env_wrapper"
-        )
+        wrapper_factory(spec.hyperparams.train_env_wrapper, spec.gym_packages, "train_env_wrapper")
         if training
         else None
     )

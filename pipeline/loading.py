@@ -67,7 +67,7 @@ def run_of(path: Path) -> Run | None:
     try:
         info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
         env_name = str(info["env_name"])
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError):
         return None
     return Run(folder, env_name)
 

@@ -66,14 +66,35 @@ def _compress_outliers(axes: Axes, returns: NDArray[np.float64]) -> None:
         axes.set_yscale("symlog", linthresh=max(settled, 1.0))
 
 
-def draw_learning_curve(run: Run, title: str) -> None:
-    """Draw training and evaluation returns by environment steps into the run folder."""
+def _draw_evaluations(axes: Axes, run: Run) -> None:
+    if not run.evaluations_path.exists():
+        return
+    with np.load(run.evaluations_path) as evaluations:
+        axes.plot(
+            evaluations["timesteps"],
+            evaluations["results"].mean(axis=1),
+            "o-",
+            color=BLUE,
+            markersize=4,
+            label="evaluation, mean return",
+        )
+
+
+def draw_learning_curve(run: Run, title: str, first_step: int = 0) -> None:
+    """Draw training and evaluation returns by environment steps into the run folder.
+
+    Args:
+        run: the run.
+        title: what stands above the picture.
+        first_step: environment steps that the agent had behind it when the run began.
+    """
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
     figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
     axes = figure.subplots()
     steps, returns = read_monitors(run.path)
+    steps = steps + first_step
     if len(steps):
         smooth = moving_average(returns, MOVING_AVERAGE_EPISODES)
         stride = max(len(steps) // MAX_POINTS, 1)
@@ -84,16 +105,7 @@ def draw_learning_curve(run: Run, title: str) -> None:
             color=ORANGE,
             label=f"training, mean of {MOVING_AVERAGE_EPISODES} episodes",
         )
-    if run.evaluations_path.exists():
-        with np.load(run.evaluations_path) as evaluations:
-            axes.plot(
-                evaluations["timesteps"],
-                evaluations["results"].mean(axis=1),
-                "o-",
-                color=BLUE,
-                markersize=4,
-                label="evaluation, mean return",
-            )
+    _draw_evaluations(axes, run)
     _compress_outliers(axes, returns)
     axes.set_xlabel("environment steps")
     axes.set_ylabel("return of an episode")

@@ -17,6 +17,8 @@ import yaml
 from rich.console import Console
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents import load_algorithm
@@ -25,6 +27,7 @@ from pipeline import components
 from pipeline.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.callbacks import (
     EvaluationCallback,
+    ExponentialExploration,
     StepCheckpoint,
     save_model,
     save_normalization,
@@ -148,6 +151,8 @@ def _set_up(
     env = make_training_env(spec, run.path)
     undo.callback(env.close)
     model = _make_model(spec, env, kwargs)
+    if _is_unread(spec):
+        model.set_logger(Logger(folder=None, output_formats=[]))
     eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
     undo.callback(eval_env.close)
     evaluation = EvaluationCallback(
@@ -165,6 +170,7 @@ def _set_up(
     callbacks: list[BaseCallback] = components.callbacks(
         spec.hyperparams.callback, spec.gym_packages, run.path
     )
+    _check_callbacks(spec, model, callbacks)
     if spec.save_freq > 0:
         callbacks.append(StepCheckpoint(spec.save_freq, run.path))
     callbacks.append(evaluation)
@@ -173,6 +179,29 @@ def _set_up(
     if spec.verbose > 0:
         callbacks.append(display)
     return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks))
+
+
+def _is_unread(spec: TrainSpec) -> bool:
+    """Whether nobody reads the library's log, so that its figures need not be worked out."""
+    return spec.tensorboard_log is None and spec.verbose < 2
+
+
+def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
+    """Find out now what would end the training half-way."""
+    for callback in callbacks:
+        if isinstance(callback, ExponentialExploration):
+            callback.check_model(model)
+    by_episodes = spec.hyperparams.n_episodes is not None
+    if by_episodes and isinstance(model, OnPolicyAlgorithm) and _has_moving_schedule(model):
+        raise UserError(
+            f"the schedules of {spec.algo} run by steps: give n_timesteps instead of n_episodes, "
+            "or constant values"
+        )
+
+
+def _has_moving_schedule(model: BaseAlgorithm) -> bool:
+    schedules = [getattr(model, name, None) for name in ("lr_schedule", "clip_range")]
+    return any(callable(s) and s(1.0) != s(0.0) for s in schedules)
 
 
 def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlgorithm:
@@ -204,6 +233,8 @@ def _write_settings(training: Training, args: dict[str, Any], command: str) -> N
     """Write what the run was asked to do, as rl_zoo3 does and as our own ``run.json``."""
     run, spec = training.run, training.spec
     write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
+    # rl_zoo3 takes this for the mapping that it makes of the flag, and puts it over config.yml.
+    args = {**args, "env_kwargs": spec.saved_hyperparams.get("env_kwargs")}
     write_text(run.params_path / "args.yml", yaml.safe_dump(args))
     write_text(run.params_path / "command.txt", command + "\n")
     run.update_info(
@@ -239,7 +270,9 @@ def _execute(training: Training) -> Outcome:
 def _learn(training: Training) -> None:
     spec = training.spec
     kwargs: dict[str, Any] = {}
-    if spec.log_interval != -1:
+    if _is_unread(spec):
+        kwargs["log_interval"] = None
+    elif spec.log_interval != -1:
         kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
     training.model.learn(
         spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
@@ -255,7 +288,8 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     save_model(model, run.model_path)
     save_normalization(model, run)
     final = _final_evaluation(training) if state == FINISHED else None
-    draw_learning_curve(run, f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}")
+    title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
+    draw_learning_curve(run, title, model._num_timesteps_at_start)
     best = evaluation.best_mean_reward if evaluation.best_timesteps else None
     run.update_info(
         state=state,
@@ -264,6 +298,7 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
         final=None if final is None else final.summary(),
         best_mean_return=best,
         best_timesteps=evaluation.best_timesteps,
+        engine=getattr(model, "engine_in_use", None),
     )
     return Outcome(run, state, model.num_timesteps, seconds, final, best, evaluation.best_timesteps)
 

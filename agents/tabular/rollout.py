@@ -18,7 +18,8 @@ from agents.exploration import GAUSSIAN_NOISE
 from agents.schedules import ScheduleRow, schedule_value
 from agents.tabular.rules import SARSA, behaviour_action, update
 from agents.tabular.simulator import (
-    CART_POLE,
+    MODEL,
+    CartPole,
     World,
     bin_index,
     cart_pole_step,
@@ -26,7 +27,7 @@ from agents.tabular.simulator import (
     pick_start,
 )
 from agents.tabular.steps import UNDECIDED
-from mdp.compiled import compiled
+from mdp.compiled import inlined, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -110,7 +111,7 @@ class Learner(NamedTuple):
     episode_budget: int
 
 
-@compiled
+@inlined
 def exploration_rate(
     strategy: int, schedule: ScheduleRow, remaining: float, episodes: int
 ) -> float:
@@ -121,7 +122,7 @@ def exploration_rate(
     return rate
 
 
-@compiled
+@inlined
 def draw(strategy: int, rng: np.random.Generator, draws: Floats) -> None:
     """Fill in the random numbers of one choice."""
     for k in range(len(draws)):
@@ -131,7 +132,7 @@ def draw(strategy: int, rng: np.random.Generator, draws: Floats) -> None:
             draws[k] = rng.random()
 
 
-@compiled
+@inlined
 def add_to_return(env: Any, reward: float, compensated: bool) -> None:
     """Add as Python's `sum` does: since 3.12 it keeps track of what rounding takes."""
     total = env.episode_return
@@ -144,64 +145,72 @@ def add_to_return(env: Any, reward: float, compensated: bool) -> None:
     env.episode_return = new_total
 
 
-@compiled
-def begin_episode(world: World, env: Any, uniforms: Floats, i: int) -> None:
-    """Reset an environment, with the next numbers of its row of ``uniforms``."""
+@inlined
+def begin_episode(env: Any) -> None:
+    """Start counting anew."""
     env.elapsed = 0
     env.episode_return = 0.0
     env.compensation = 0.0
-    used = env.uniforms_used
-    if world.kind == CART_POLE:
-        # As Generator.uniform(-0.05, 0.05) computes it.
-        width = 0.05 - -0.05
-        env.x = -0.05 + width * uniforms[i, used]
-        env.x_dot = -0.05 + width * uniforms[i, used + 1]
-        env.theta = -0.05 + width * uniforms[i, used + 2]
-        env.theta_dot = -0.05 + width * uniforms[i, used + 3]
-        env.uniforms_used = used + 4
-        env.new_obs = bin_index(env, world.dims, world.bins)
-    else:
-        env.state = pick_start(world.starts, world.start_cumulative, uniforms[i, used])
-        env.uniforms_used = used + 1
-        env.new_obs = world.observation[env.state]
 
 
-@compiled
-def step_model(world: World, env: Any, uniforms: Floats, i: int) -> None:
-    """One step of a finite model."""
-    uniform = uniforms[i, env.uniforms_used]
+@inlined
+def reset_model(
+    env: Any, starts: Ints, start_cumulative: Floats, observation: Ints, uniforms: Floats, i: int
+) -> None:
+    """Reset a finite model, with the next number of row ``i`` of ``uniforms``."""
+    env.state = pick_start(starts, start_cumulative, uniforms[i, env.uniforms_used])
     env.uniforms_used += 1
-    result = world.outcomes[
-        env.state, env.action, pick_outcome(world.outcomes, env.state, env.action, uniform)
-    ]
+    env.new_obs = observation[env.state]
+
+
+@inlined
+def reset_cart_pole(env: Any, dims: Ints, bins: Floats, uniforms: Floats, i: int) -> None:
+    """Reset CartPole, with the next four numbers, as Generator.uniform(-0.05, 0.05) does."""
+    used = env.uniforms_used
+    width = 0.05 - -0.05
+    env.x = -0.05 + width * uniforms[i, used]
+    env.x_dot = -0.05 + width * uniforms[i, used + 1]
+    env.theta = -0.05 + width * uniforms[i, used + 2]
+    env.theta_dot = -0.05 + width * uniforms[i, used + 3]
+    env.uniforms_used = used + 4
+    env.new_obs = bin_index(env, dims, bins)
+
+
+@inlined
+def step_model(env: Any, outcomes: Any, observation: Ints, uniforms: Floats, i: int) -> None:
+    """One step of a finite model."""
+    outcome = pick_outcome(outcomes, env.state, env.action, uniforms[i, env.uniforms_used])
+    env.uniforms_used += 1
+    result = outcomes[env.state, env.action, outcome]
     env.state = result.next_state
     env.reward = result.agent_reward
     env.monitor_reward = result.reward
     env.terminated = result.terminated
     env.success = result.success
-    env.next_obs = world.observation[env.state]
+    env.next_obs = observation[env.state]
 
 
-@compiled
-def step_cart_pole(world: World, env: Any) -> None:
+@inlined
+def step_cart_pole(env: Any, constants: CartPole, dims: Ints, bins: Floats) -> None:
     """One step of CartPole."""
-    env.terminated = cart_pole_step(env, world.cart_pole)
+    env.terminated = cart_pole_step(env, constants)
     env.reward = 1.0
     env.monitor_reward = 1.0
-    env.next_obs = bin_index(env, world.dims, world.bins)
+    env.success = False
+    env.next_obs = bin_index(env, dims, bins)
 
 
-@compiled
-def end_step(world: World, env: Any, compensated: bool) -> None:
+@inlined
+def end_step(env: Any, time_limit: int, compensated: bool) -> None:
     """Sum up the rewards, and see whether the episode is over."""
     add_to_return(env, env.monitor_reward, compensated)
     env.elapsed += 1
     # A step that terminates and runs out of time counts as terminated, as DummyVecEnv has it.
-    env.done = env.terminated or (world.time_limit > 0 and env.elapsed >= world.time_limit)
+    env.done = env.terminated or (time_limit > 0 and env.elapsed >= time_limit)
     env.new_obs = env.next_obs
 
 
-@compiled
+@inlined
 def log_episode(env: Any, progress: Any, log: Any, i: int, step: int) -> None:
     """Append the episode that has just ended in environment ``i``."""
     entry = log[progress.logged_episodes]
@@ -213,7 +222,27 @@ def log_episode(env: Any, progress: Any, log: Any, i: int, step: int) -> None:
     progress.logged_episodes += 1
 
 
-@compiled
+@inlined
+def act(
+    learner: Learner,
+    env: Any,
+    tables: Floats,
+    rate: float,
+    rng: np.random.Generator,
+    draws: Floats,
+    scratch: Floats,
+) -> None:
+    """Do what was committed to, or choose."""
+    env.action = env.next_action
+    env.next_action = UNDECIDED
+    if env.action == UNDECIDED:
+        draw(learner.strategy, rng, draws)
+        env.action = behaviour_action(
+            tables, env.obs, learner.strategy, rate, learner.tie_scale, draws, scratch
+        )
+
+
+@inlined
 def commit_to_next_action(
     learner: Learner,
     env: Any,
@@ -232,7 +261,7 @@ def commit_to_next_action(
         )
 
 
-@compiled
+@inlined
 def note_progress(learner: Learner, progress: Any, n_done: int) -> None:
     """Count the episodes of a budget, and how much of the training remains."""
     if learner.episode_budget > 0:
@@ -242,8 +271,8 @@ def note_progress(learner: Learner, progress: Any, n_done: int) -> None:
     progress.remaining = 1.0 - float(progress.num_timesteps) / progress.total_timesteps
 
 
-@compiled
-def learn_from_step(
+@inlined
+def learn(
     learner: Learner,
     envs: Any,
     progress: Any,
@@ -312,7 +341,23 @@ def learn_from_step(
     progress.episodes += n_done
 
 
-@compiled
+@kernel
+def learn_from_step(
+    learner: Learner,
+    envs: Any,
+    progress: Any,
+    tables: Floats,
+    visit_counts: Ints,
+    rng: np.random.Generator,
+    draws: Floats,
+    update_draws: Floats,
+    scratch: Floats,
+) -> None:
+    """`learn`, to be called from outside."""
+    learn(learner, envs, progress, tables, visit_counts, rng, draws, update_draws, scratch)
+
+
+@kernel
 def run_block(
     world: World,
     learner: Learner,
@@ -334,11 +379,19 @@ def run_block(
     """Act for ``n_steps``, learning after each of them but the last.
 
     The last step is left to be learnt from by `learn_from_step`, since callbacks come before that.
-    Arguments beside those of `learn_from_step`:
 
     Args:
         world: the dynamics.
+        learner: as in `learn`, and so the next two.
+        envs: environments.
+        progress: how far the training is.
+        tables: as in `learn`, and so the next two.
+        visit_counts: updates of each entry.
+        rng: the agent's generator.
         uniforms: random numbers of the environments, shape (n, capacity).
+        draws: as in `learn`, and so the next two.
+        update_draws: room for random numbers.
+        scratch: room for A values.
         log: records of type `EPISODE`, filled with the episodes that end.
         rewards: filled with what Monitor sees, shape (capacity, n).
         n_steps: steps of every environment.
@@ -348,36 +401,34 @@ def run_block(
     Returns:
         The number of steps taken.
     """
+    is_model = world.kind == MODEL
+    outcomes, observation = world.outcomes, world.observation
+    starts, start_cumulative = world.starts, world.start_cumulative
+    dims, bins = world.dims, world.bins
     progress.logged_episodes = 0
     for step in range(n_steps):
         rate = exploration_rate(
             learner.strategy, learner.exploration, progress.remaining, progress.episodes
         )
         for i in range(len(envs)):
-            env = envs[i]
-            env.action = env.next_action
-            env.next_action = UNDECIDED
-            if env.action == UNDECIDED:
-                draw(learner.strategy, rng, draws)
-                env.action = behaviour_action(
-                    tables, env.obs, learner.strategy, rate, learner.tie_scale, draws, scratch
-                )
+            act(learner, envs[i], tables, rate, rng, draws, scratch)
         for i in range(len(envs)):
             env = envs[i]
-            env.success = False
-            if world.kind == CART_POLE:
-                step_cart_pole(world, env)
+            if is_model:
+                step_model(env, outcomes, observation, uniforms, i)
             else:
-                step_model(world, env, uniforms, i)
-            end_step(world, env, compensated)
+                step_cart_pole(env, world.cart_pole, dims, bins)
+            end_step(env, world.time_limit, compensated)
             rewards[step, i] = env.monitor_reward
             if env.done:
                 log_episode(env, progress, log, i, step)
-                begin_episode(world, env, uniforms, i)
+                begin_episode(env)
+                if is_model:
+                    reset_model(env, starts, start_cumulative, observation, uniforms, i)
+                else:
+                    reset_cart_pole(env, dims, bins, uniforms, i)
         progress.num_timesteps += len(envs)
         if step == n_steps - 1 or progress.logged_episodes >= max_episodes:
             return step + 1
-        learn_from_step(
-            learner, envs, progress, tables, visit_counts, rng, draws, update_draws, scratch
-        )
+        learn(learner, envs, progress, tables, visit_counts, rng, draws, update_draws, scratch)
     return n_steps

@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.exploration import choose_action, expected_value, greedy_action
+from agents.exploration import choose_action, expected_value, greedy_action, highest_value
 from agents.step_sizes import step_size
-from mdp.compiled import compiled
+from mdp.compiled import inlined
 
 Q_LEARNING = 0
 SARSA = 1
@@ -26,25 +26,25 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-@compiled
+@inlined
 def q_learning_value(next_values: Floats) -> float:
     """The best next action's value."""
-    return float(np.max(next_values))
+    return highest_value(next_values)
 
 
-@compiled
+@inlined
 def sarsa_value(next_values: Floats, next_action: int) -> float:
     """The value of the next action that the agent has committed to."""
     return float(next_values[next_action])
 
 
-@compiled
+@inlined
 def expected_sarsa_value(next_values: Floats, strategy: int, rate: float) -> float:
     """The mean value under the exploring policy."""
     return expected_value(strategy, next_values, rate)
 
 
-@compiled
+@inlined
 def double_q_learning_value(
     next_values: Floats, tables: Floats, judge: int, next_obs: int, uniform: float
 ) -> float:
@@ -52,7 +52,7 @@ def double_q_learning_value(
     return float(tables[judge, next_obs, greedy_action(next_values, uniform)])
 
 
-@compiled
+@inlined
 def td_target(
     rule: int,
     tables: Floats,
@@ -94,7 +94,7 @@ def td_target(
     return reward + discount * value
 
 
-@compiled
+@inlined
 def update(
     rule: int,
     tables: Floats,
@@ -141,7 +141,7 @@ def update(
     return float(td_error)
 
 
-@compiled
+@inlined
 def behaviour_action(
     tables: Floats,
     obs: int,

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import compiled
+from mdp.compiled import inlined
 
 MODEL = 0
 CART_POLE = 1
@@ -78,7 +78,7 @@ class World(NamedTuple):
     bins: Floats
 
 
-@compiled
+@inlined
 def pick_outcome(outcomes: Any, state: int, action: int, uniform: float) -> int:
     """The first outcome whose cumulative probability exceeds ``uniform``, else 0, as toy_text."""
     for outcome in range(outcomes.shape[2]):
@@ -87,7 +87,7 @@ def pick_outcome(outcomes: Any, state: int, action: int, uniform: float) -> int:
     return 0
 
 
-@compiled
+@inlined
 def pick_start(starts: Ints, start_cumulative: Floats, uniform: float) -> int:
     """The state that an episode begins in."""
     index = int(np.searchsorted(start_cumulative, uniform, side="right"))
@@ -96,7 +96,7 @@ def pick_start(starts: Ints, start_cumulative: Floats, uniform: float) -> int:
     return int(starts[index])
 
 
-@compiled
+@inlined
 def cart_pole_step(env: Any, world: CartPole) -> bool:
     """One step of Gymnasium's CartPole in its order of operations.
 
@@ -130,7 +130,7 @@ def cart_pole_step(env: Any, world: CartPole) -> bool:
     return bool(abs(x) > world.x_threshold or abs(theta) > world.theta_threshold)
 
 
-@compiled
+@inlined
 def bin_index(env: Any, dims: Ints, bins: Floats) -> int:
     """What `DiscretizeObservation` shows of CartPole's state, rounded to single precision first."""
     index = 0
