@@ -120,6 +120,9 @@ class EvaluationCallback(EvalCallback):
         self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
         if evaluation.success_rate is not None:
             self.logger.record("eval/success_rate", evaluation.success_rate)
+        if evaluation.yardstick is not None:
+            self.logger.record("eval/gap", evaluation.yardstick.gap(evaluation.mean_return))
+            self.logger.record("eval/score", evaluation.yardstick.score(evaluation.mean_return))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
 

@@ -13,19 +13,54 @@ from stable_baselines3.common.vec_env import VecEnv
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Episodes that an agent has played.
+class Yardstick:
+    """What returns on an environment are measured against.
 
     Attributes:
-        returns: undiscounted return of each episode, shape (n_episodes,).
-        lengths: number of steps of each, shape (n_episodes,).
-        successes: whether each succeeded, shape (n_episodes,); None where the environment does not
-            say.
+        optimum: the highest expected return that any policy has under the time limit.
+        blind: the highest that a policy has which ignores what it observes: the better of
+            uniformly random actions and every constant action.
+    """
+
+    optimum: float
+    blind: float
+
+    def gap(self, expected_return: float) -> float:
+        """How far a return stays behind the optimum."""
+        return self.optimum - expected_return
+
+    def score(self, expected_return: float) -> float:
+        """The return on a scale where 1 is the optimum and 0 the best blind policy."""
+        if self.optimum == self.blind:
+            return 1.0 if expected_return >= self.optimum else 0.0
+        return (expected_return - self.blind) / (self.optimum - self.blind)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How good an agent is: episodes that it has played, or their exact expectation.
+
+    Attributes:
+        returns: undiscounted return of each episode, shape (n_episodes,); the expected return,
+            shape (1,), where that is exact.
+        lengths: number of steps, likewise.
+        successes: whether each episode succeeded, or the probability of it, likewise; None where
+            the environment does not say.
+        exact_std: standard deviation of an episode's return, where it is exact; None where
+            episodes were sampled.
+        yardstick: what to measure the return against, where it is known.
     """
 
     returns: NDArray[np.float64]
-    lengths: NDArray[np.int64]
-    successes: NDArray[np.bool_] | None
+    lengths: NDArray[np.floating[Any] | np.integer[Any]]
+    successes: NDArray[np.bool_ | np.floating[Any]] | None
+    exact_std: float | None = None
+    yardstick: Yardstick | None = None
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether the figures are expectations, computed rather than sampled."""
+        return self.exact_std is not None
 
     @property
     def mean_return(self) -> float:
@@ -34,23 +69,32 @@ class Evaluation:
 
     @property
     def std_return(self) -> float:
-        """Standard deviation of the returns."""
-        return float(self.returns.std())
+        """Standard deviation of an episode's return."""
+        return float(self.returns.std()) if self.exact_std is None else self.exact_std
 
     @property
     def success_rate(self) -> float | None:
-        """Share of the episodes that succeeded, if the environment says so."""
+        """Share of the episodes that succeed, if the environment says so."""
         return None if self.successes is None else float(self.successes.mean())
 
     def summary(self) -> dict[str, Any]:
         """The figures as JSON."""
-        return {
+        figures: dict[str, Any] = {
             "mean_return": self.mean_return,
             "std_return": self.std_return,
             "mean_length": float(self.lengths.mean()),
             "success_rate": self.success_rate,
-            "n_episodes": len(self.returns),
+            "exact": self.is_exact,
+            "n_episodes": None if self.is_exact else len(self.returns),
         }
+        if self.yardstick is not None:
+            figures |= {
+                "optimum": self.yardstick.optimum,
+                "best_blind": self.yardstick.blind,
+                "gap": self.yardstick.gap(self.mean_return),
+                "score": self.yardstick.score(self.mean_return),
+            }
+        return figures
 
 
 def evaluate(

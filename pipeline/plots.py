@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.evaluation import Yardstick
 from pipeline.files import replacing
 from pipeline.run import Run
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
+GREEN = "#009E73"
 GREY = "#9A9A9A"
 
 MOVING_AVERAGE_EPISODES = 100
@@ -80,13 +82,22 @@ def _draw_evaluations(axes: Axes, run: Run) -> None:
         )
 
 
-def draw_learning_curve(run: Run, title: str, first_step: int = 0) -> None:
+def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
+    lines = (("optimum", yardstick.optimum, "-"), ("best blind policy", yardstick.blind, ":"))
+    for label, height, style in lines:
+        axes.axhline(height, color=GREEN, linestyle=style, linewidth=1.2, label=label, zorder=1)
+
+
+def draw_learning_curve(
+    run: Run, title: str, first_step: int = 0, yardstick: Yardstick | None = None
+) -> None:
     """Draw training and evaluation returns by environment steps into the run folder.
 
     Args:
         run: the run.
         title: what stands above the picture.
         first_step: environment steps that the agent had behind it when the run began.
+        yardstick: the returns to measure against, where they are known.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
@@ -106,9 +117,10 @@ def draw_learning_curve(run: Run, title: str, first_step: int = 0) -> None:
             label=f"training, mean of {MOVING_AVERAGE_EPISODES} episodes",
         )
     _draw_evaluations(axes, run)
+    if yardstick is not None:
+        _draw_yardstick(axes, yardstick)
     _compress_outliers(axes, returns)
-    axes.set_xlabel("environment steps")
-    axes.set_ylabel("return of an episode")
+    axes.set(xlabel="environment steps", ylabel="return of an episode")
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_title(title, loc="left")
     axes.grid(alpha=0.3)

@@ -17,12 +17,19 @@ if TYPE_CHECKING:
 
 def describe(evaluation: Evaluation) -> str:
     """An evaluation in a few words."""
-    text = (
-        f"return {evaluation.mean_return:.2f} ± {evaluation.std_return:.2f} "
-        f"over {len(evaluation.returns)} episodes"
-    )
+    text = f"return {evaluation.mean_return:.2f}"
+    if evaluation.is_exact:
+        text += " (exact)"
+    else:
+        text += f" ± {evaluation.std_return:.2f} over {len(evaluation.returns)} episodes"
     if evaluation.success_rate is not None:
-        text += f", success {evaluation.success_rate:.0%}"
+        text += f", success {evaluation.success_rate:.1%}"
+    yardstick = evaluation.yardstick
+    if yardstick is not None:
+        text += (
+            f", optimum {yardstick.optimum:.2f}, best blind policy {yardstick.blind:.2f}, "
+            f"score {yardstick.score(evaluation.mean_return):.2f}"
+        )
     return text
 
 

@@ -35,6 +35,7 @@ from pipeline.callbacks import (
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation import Evaluation, evaluate, evaluation_seed
+from pipeline.exact import ExactEvaluator, exact_evaluator
 from pipeline.files import write_text
 from pipeline.loading import load_model
 from pipeline.plots import draw_learning_curve
@@ -155,10 +156,12 @@ def _set_up(
         model.set_logger(Logger(folder=None, output_formats=[]))
     eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
     undo.callback(eval_env.close)
+    exact = exact_evaluator(spec)
     evaluation = EvaluationCallback(
         run,
         eval_env,
-        partial(
+        exact
+        or partial(
             evaluate,
             env=eval_env,
             n_episodes=spec.eval_episodes,
@@ -289,7 +292,8 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     save_normalization(model, run)
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
-    draw_learning_curve(run, title, model._num_timesteps_at_start)
+    yardstick = None if final is None else final.yardstick
+    draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
     best = evaluation.best_mean_reward if evaluation.best_timesteps else None
     run.update_info(
         state=state,
@@ -304,9 +308,12 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
 
 
 def _final_evaluation(training: Training) -> Evaluation | None:
-    """Episodes that have served nothing else; none where evaluation is turned off."""
+    """Exact, or by episodes that have served nothing else; none where evaluation is off."""
+    evaluator = training.evaluation.evaluator
     if training.evaluation.eval_freq == 0:
         return None
+    if isinstance(evaluator, ExactEvaluator):
+        return evaluator(training.model)
     return evaluate(
         training.model,
         training.eval_env,

@@ -15,6 +15,7 @@ from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 from agents.exploration import (
     GAUSSIAN_NOISE,
     STRATEGIES,
+    action_probabilities,
     draws_per_choice,
 )
 from agents.online import OnlineAlgorithm, Transitions
@@ -281,6 +282,19 @@ class TabularAlgorithm(OnlineAlgorithm):
         actions = np.full(obs.size, UNDECIDED)
         self._decide(obs.reshape(-1), actions, self.predict_rng)
         return actions.reshape(obs.shape), state
+
+    def action_probabilities(self) -> NDArray[np.float64]:
+        """What the exploring policy does now, shape (S, A).
+
+        Raises:
+            ValueError: for Gaussian noise, whose probabilities have no closed form.
+        """
+        return action_probabilities(
+            STRATEGIES[self.exploration],
+            self.policy.q_table,
+            self.exploration_rate,
+            random_ties=self.tie_breaking == "random",
+        )
 
     def _record_training(self) -> None:
         self.logger.record("rollout/exploration_rate", self.exploration_rate)

@@ -1,0 +1,116 @@
+"""Exact evaluation: what an agent's policy is worth, computed instead of sampled.
+
+Where the transition model of the environment is known, the policy is asked for every state at once,
+and its return under the time limit follows by arithmetic, without evaluation noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.reference import RandomAgent
+from agents.tabular.base import TabularAlgorithm
+from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
+from mdp import TransitionModel, best_blind_return, finite_horizon_optimum, policy_return
+from pipeline.environments import make_single_env
+from pipeline.evaluation import Evaluation, Yardstick
+from pipeline.specs import TrainSpec
+
+# Beyond this, episodes are sampled: exact evaluation would take longer than training.
+MAX_STATES = 20_000
+
+
+@dataclass(frozen=True)
+class ExactEvaluator:
+    """Evaluates agents on an environment whose model is known.
+
+    Attributes:
+        model: the dynamics of the environment that agents are evaluated on.
+        observations: what an agent observes in each state, states along the first axis.
+        horizon: the time limit.
+        success: the outcomes that count as success, shape (S, A, K), or None.
+        yardstick: the best possible and the best blind return.
+    """
+
+    model: TransitionModel
+    observations: NDArray[Any]
+    horizon: int
+    success: NDArray[np.bool_] | None
+    yardstick: Yardstick
+
+    def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
+        """The exact worth of the agent's policy as it is."""
+        policy = policy_matrix(agent, self.observations, deterministic)
+        result = policy_return(self.model, policy, self.horizon, success=self.success)
+        rate = result.success_rate
+        return Evaluation(
+            returns=np.array([result.expected_return]),
+            lengths=np.array([result.expected_length]),
+            successes=None if rate is None else np.array([rate]),
+            exact_std=float(np.sqrt(result.return_variance)),
+            yardstick=self.yardstick,
+        )
+
+
+def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
+    """The exact evaluator of a run, or None where episodes have to be sampled."""
+    special = spec.hyperparams
+    if special.normalize is not None or special.frame_stack or special.vec_env_wrapper:
+        return None
+    env = make_single_env(spec)
+    try:
+        model, observations = transition_model(env), observations_of_states(env)
+        horizon = time_limit(env)
+        if model is None or observations is None or horizon is None:
+            return None
+        if model.n_states > MAX_STATES:
+            return None
+        success = success_outcomes(env)
+    finally:
+        env.close()
+    yardstick = Yardstick(
+        optimum=float(finite_horizon_optimum(model, horizon).start_value),
+        blind=float(best_blind_return(model, horizon)),
+    )
+    return ExactEvaluator(model, observations, horizon, success, yardstick)
+
+
+def policy_matrix(
+    agent: BaseAlgorithm, observations: NDArray[Any], deterministic: bool = True
+) -> NDArray[np.float64]:
+    """The agent's policy as probabilities of shape (S, A).
+
+    Args:
+        agent: any agent with discrete actions whose policy depends on the observation alone.
+        observations: what it observes in each state, states along the first axis.
+        deterministic: its best actions rather than what it samples.
+
+    Raises:
+        TypeError: if the probabilities that the agent samples from are not known.
+    """
+    n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
+    if isinstance(agent, RandomAgent):
+        return np.full((n_states, n_actions), 1 / n_actions)
+    if deterministic:
+        actions, _ = agent.predict(observations, deterministic=True)
+        return np.eye(n_actions)[np.asarray(actions, dtype=np.int64)]
+    if isinstance(agent, TabularAlgorithm):
+        return agent.action_probabilities()[observations]
+    if isinstance(agent, PPO | A2C):
+        with th.no_grad():
+            tensor, _ = agent.policy.obs_to_tensor(observations)
+            distribution: Any = agent.policy.get_distribution(tensor).distribution
+        probabilities: NDArray[np.float64] = distribution.probs.cpu().numpy().astype(np.float64)
+        return probabilities
+    if isinstance(agent, DQN) or hasattr(agent, "exploration_rate"):
+        epsilon = float(agent.exploration_rate)
+        greedy = policy_matrix(agent, observations)
+        return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
+    raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
