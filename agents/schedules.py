@@ -65,6 +65,24 @@ class ExponentialSchedule:
         )
 
 
+def epsilon_schedule(decay: str, start: float, end: float, end_fraction: float) -> Schedule:
+    """Epsilon over training.
+
+    Args:
+        decay: ``"constant"`` (stays at the start), ``"linear"`` or ``"exponential"``.
+        start: the value at the first step.
+        end: the value from ``end_fraction`` on.
+        end_fraction: the share of training over which it falls, in [0, 1].
+    """
+    if decay == "constant":
+        return FloatSchedule(start)
+    if end_fraction == 0:
+        return FloatSchedule(end)
+    if decay == "exponential":
+        return ExponentialSchedule(start, end, end_fraction)
+    return LinearSchedule(start, end, end_fraction)
+
+
 def _row(kind: float, schedule: ExponentialSchedule | LinearSchedule) -> ScheduleRow:
     return kind, float(schedule.start), float(schedule.end), float(schedule.end_fraction)
 

@@ -102,13 +102,12 @@ def policy_matrix(
         actions, _ = agent.predict(observations, deterministic=True)
         return np.eye(n_actions)[np.asarray(actions, dtype=np.int64)]
     if isinstance(agent, TabularAlgorithm):
-        return agent.action_probabilities()[observations]
+        return np.asarray(agent.action_probabilities()[observations])
     if isinstance(agent, PPO | A2C):
         with th.no_grad():
             tensor, _ = agent.policy.obs_to_tensor(observations)
             distribution: Any = agent.policy.get_distribution(tensor).distribution
-        probabilities: NDArray[np.float64] = distribution.probs.cpu().numpy().astype(np.float64)
-        return probabilities
+        return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
     if isinstance(agent, DQN) or hasattr(agent, "exploration_rate"):
         epsilon = float(agent.exploration_rate)
         greedy = policy_matrix(agent, observations)

@@ -7,7 +7,6 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
@@ -15,63 +14,23 @@ from uuid import uuid4
 import torch as th
 import yaml
 from rich.console import Console
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.vec_env import VecEnv
 
-from agents import load_algorithm
-from agents.blocks import EpisodeBudget
-from pipeline import components
-from pipeline.algorithm_kwargs import build_algorithm_kwargs
-from pipeline.callbacks import (
-    EvaluationCallback,
-    ExponentialExploration,
-    StepCheckpoint,
-    save_model,
-    save_normalization,
-)
-from pipeline.environments import make_evaluation_env, make_training_env
+from pipeline.callbacks import save_model, save_normalization
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation import Evaluation, evaluate, evaluation_seed
-from pipeline.exact import ExactEvaluator, exact_evaluator
+from pipeline.exact import ExactEvaluator
 from pipeline.files import write_text
-from pipeline.loading import load_model
 from pipeline.plots import draw_learning_curve
-from pipeline.progress import ProgressDisplay
+from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.run import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.specs import TrainSpec
 from pipeline.summary import print_header
 
 FINAL_EVALUATION_EPISODES = 100
-EVALUATIONS_PER_RUN = 20
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
 
 RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
-
-
-@dataclass(frozen=True)
-class Training:
-    """A run that is set up and can be started.
-
-    Attributes:
-        spec: what was asked for.
-        run: its folder.
-        model: the agent, with its environments.
-        eval_env: environments to evaluate on.
-        evaluation: the evaluation callback, also part of ``callback``.
-        callback: all callbacks.
-    """
-
-    spec: TrainSpec
-    run: Run
-    model: BaseAlgorithm
-    eval_env: VecEnv
-    evaluation: EvaluationCallback
-    display: ProgressDisplay
-    callback: BaseCallback
 
 
 @dataclass(frozen=True)
@@ -118,22 +77,11 @@ def train(spec: TrainSpec, console: Console, args: dict[str, Any], command: str)
     run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
     with ExitStack() as undo, _library_errors_in_one_line():
         undo.callback(run.discard)
-        training = _set_up(spec, run, kwargs, console, undo)
+        training = set_up(spec, run, kwargs, console, undo)
         _write_settings(training, args, command)
         undo.pop_all()
     print_header(console, spec)
     return _execute(training)
-
-
-def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
-    """The arguments of the agent's constructor, checked and made into objects.
-
-    Raises:
-        UserError: if one is unknown or has a wrong type or range.
-    """
-    return build_algorithm_kwargs(
-        load_algorithm(spec.algo), spec.hyperparams.algorithm, spec.algo, spec.gym_packages
-    )
 
 
 @contextmanager
@@ -143,93 +91,6 @@ def _library_errors_in_one_line() -> Iterator[None]:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError) as error:
         raise UserError(one_line(error)) from error
-
-
-def _set_up(
-    spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
-) -> Training:
-    """Make all parts of the training; ``undo`` is told how to take them back."""
-    env = make_training_env(spec, run.path)
-    undo.callback(env.close)
-    model = _make_model(spec, env, kwargs)
-    if _is_unread(spec):
-        model.set_logger(Logger(folder=None, output_formats=[]))
-    eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
-    undo.callback(eval_env.close)
-    exact = exact_evaluator(spec)
-    evaluation = EvaluationCallback(
-        run,
-        eval_env,
-        exact
-        or partial(
-            evaluate,
-            env=eval_env,
-            n_episodes=spec.eval_episodes,
-            seed=evaluation_seed(spec.seed, 1),
-        ),
-        _evaluation_interval(spec, env.num_envs),
-    )
-    display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
-    callbacks: list[BaseCallback] = components.callbacks(
-        spec.hyperparams.callback, spec.gym_packages, run.path
-    )
-    _check_callbacks(spec, model, callbacks)
-    if spec.save_freq > 0:
-        callbacks.append(StepCheckpoint(spec.save_freq, run.path))
-    callbacks.append(evaluation)
-    if spec.hyperparams.n_episodes is not None:
-        callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
-    if spec.verbose > 0:
-        callbacks.append(display)
-    return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks))
-
-
-def _is_unread(spec: TrainSpec) -> bool:
-    """Whether nobody reads the library's log, so that its figures need not be worked out."""
-    return spec.tensorboard_log is None and spec.verbose < 2
-
-
-def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
-    """Find out now what would end the training half-way."""
-    for callback in callbacks:
-        if isinstance(callback, ExponentialExploration):
-            callback.check_model(model)
-    by_episodes = spec.hyperparams.n_episodes is not None
-    if by_episodes and isinstance(model, OnPolicyAlgorithm) and _has_moving_schedule(model):
-        raise UserError(
-            f"the schedules of {spec.algo} run by steps: give n_timesteps instead of n_episodes, "
-            "or constant values"
-        )
-
-
-def _has_moving_schedule(model: BaseAlgorithm) -> bool:
-    schedules = [getattr(model, name, None) for name in ("lr_schedule", "clip_range")]
-    return any(callable(s) and s(1.0) != s(0.0) for s in schedules)
-
-
-def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlgorithm:
-    common: dict[str, Any] = {
-        "seed": spec.seed,
-        "verbose": max(spec.verbose - 1, 0),
-        "tensorboard_log": None
-        if spec.tensorboard_log is None
-        else str(spec.tensorboard_log / spec.env_id),
-    }
-    if spec.trained_agent is None:
-        return load_algorithm(spec.algo)(env=env, device=spec.device, **common, **kwargs)
-    # The networks are those of the file: their shape cannot change.
-    kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
-    return load_model(spec.algo, spec.trained_agent, env, device=spec.device, **common, **kwargs)
-
-
-def _evaluation_interval(spec: TrainSpec, n_envs: int) -> int:
-    """Calls of `VecEnv.step` between two evaluations; 0 for none."""
-    if spec.eval_freq is not None:
-        return max(spec.eval_freq // n_envs, 1) if spec.eval_freq > 0 else 0
-    n_timesteps = spec.hyperparams.n_timesteps
-    if n_timesteps is None:
-        return 10_000 // n_envs
-    return max(n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1)
 
 
 def _write_settings(training: Training, args: dict[str, Any], command: str) -> None:
@@ -273,7 +134,7 @@ def _execute(training: Training) -> Outcome:
 def _learn(training: Training) -> None:
     spec = training.spec
     kwargs: dict[str, Any] = {}
-    if _is_unread(spec):
+    if is_unread(spec):
         kwargs["log_interval"] = None
     elif spec.log_interval != -1:
         kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
+from stable_baselines3.common.utils import FloatSchedule
 
 from agents.exploration import (
     GAUSSIAN_NOISE,
@@ -19,7 +19,7 @@ from agents.exploration import (
     draws_per_choice,
 )
 from agents.online import OnlineAlgorithm, Transitions
-from agents.schedules import ExponentialSchedule
+from agents.schedules import epsilon_schedule
 from agents.step_sizes import SAMPLE_AVERAGE
 from agents.tabular.arguments import (
     EngineChoice,
@@ -28,7 +28,7 @@ from agents.tabular.arguments import (
     TieBreaking,
     check_arguments,
 )
-from agents.tabular.engine import choose_engine
+from agents.tabular.engine_choice import choose_engine
 from agents.tabular.policy import QTablePolicy
 from agents.tabular.steps import UNDECIDED, choose_actions, update_tables
 
@@ -158,13 +158,12 @@ class TabularAlgorithm(OnlineAlgorithm):
             return FloatSchedule(self.temperature)
         if self.exploration == "gaussian_noise":
             return FloatSchedule(self.noise_std)
-        start, end = self.exploration_initial_eps, self.exploration_final_eps
-        if self.exploration_decay == "constant" or self.exploration_fraction == 0:
-            constant = start if self.exploration_decay == "constant" else end
-            return FloatSchedule(constant)
-        if self.exploration_decay == "exponential":
-            return ExponentialSchedule(start, end, self.exploration_fraction)
-        return LinearSchedule(start, end, self.exploration_fraction)
+        return epsilon_schedule(
+            self.exploration_decay,
+            self.exploration_initial_eps,
+            self.exploration_final_eps,
+            self.exploration_fraction,
+        )
 
     @property
     def averages_samples(self) -> bool:
@@ -267,14 +266,8 @@ class TabularAlgorithm(OnlineAlgorithm):
     ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
         """The greedy action, or an exploring one unless ``deterministic``, as DQN has it.
 
-        Args:
-            observation: one state index, or an array of shape (n,).
-            state: passed through.
-            episode_start: not used.
-            deterministic: take the first of the best actions.
-
-        Returns:
-            Actions, of the observation's shape, and ``state``.
+        Takes one state index or an array of shape (n,), and returns actions of the same shape and
+        ``state``; ``episode_start`` is not used.
         """
         if deterministic:
             return super().predict(observation, state, episode_start, deterministic)

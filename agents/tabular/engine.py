@@ -17,15 +17,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.blocks import EpisodeBudget, horizon, members, pass_over, unknown_callbacks
+from agents.blocks import EpisodeBudget, horizon, members, pass_over
 from agents.exploration import STRATEGIES, draws_per_choice
 from agents.schedules import schedule_row
 from agents.tabular import rollout
 from agents.tabular.episodes import Episodes, record_in_monitors
-from agents.tabular.rollout import ENV, EPISODE, PROGRESS, Learner
+from agents.tabular.records import ENV, EPISODE, PROGRESS, Learner
 from agents.tabular.simulator import CART_POLE, MAX_DRAWS_PER_STEP, World
+from agents.tabular.stepping import add_to_return
 from agents.tabular.streams import UniformStreams
-from agents.tabular.worlds import NotCompilable, compile_world, layers, monitor_of
+from agents.tabular.worlds import layers, monitor_of
 
 if TYPE_CHECKING:
     from agents.tabular.base import TabularAlgorithm
@@ -35,41 +36,6 @@ MAX_BLOCK_STEPS = 65_536
 
 # Python's sum of floats makes up for rounding from this version on.
 COMPENSATED_SUM = sys.version_info >= (3, 12)
-
-
-def choose_engine(
-    agent: TabularAlgorithm, callback: BaseCallback, log_interval: int | None
-) -> CompiledEngine | None:
-    """The compiled engine where the agent wants it and it can be had; None for interpreting.
-
-    The choice and its reason are left in ``agent.engine_in_use``.
-
-    Raises:
-        ValueError: if the agent insists on compiled and it cannot be had.
-    """
-    if agent.engine == "interpreted":
-        agent.engine_in_use = "interpreted: asked for"
-        return None
-    try:
-        world = _world_for(agent, callback)
-    except NotCompilable as reason:
-        if agent.engine == "compiled":
-            raise ValueError(f"engine: compiled is not possible: {reason}") from None
-        agent.engine_in_use = f"interpreted: {reason}"
-        return None
-    agent.engine_in_use = "compiled"
-    return CompiledEngine(agent, world, callback, log_interval)
-
-
-def _world_for(agent: TabularAlgorithm, callback: BaseCallback) -> World:
-    unknown = unknown_callbacks(callback)
-    if unknown:
-        raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
-    for schedule in (agent.exploration_schedule, agent.lr_schedule):
-        if schedule_row(schedule) is None:
-            raise NotCompilable("a schedule is a Python function")
-    assert agent.env is not None
-    return compile_world(agent.env)
 
 
 class CompiledEngine:
@@ -261,7 +227,7 @@ class CompiledEngine:
         monitor = self.monitors[i]
         if monitor is not None:
             for reward in monitor.rewards:
-                rollout.add_to_return(record, reward, COMPENSATED_SUM)
+                add_to_return(record, reward, COMPENSATED_SUM)
             self.unfinished[i] = [np.array(monitor.rewards)] if monitor.rewards else []
 
     def _write_state(self) -> None:
