@@ -23,9 +23,10 @@ from pipeline.loading import check_model_file, hand_written_algorithm, load_mode
 from pipeline.requests import check_algorithm
 from pipeline.run import Run
 from pipeline.specs import TrainSpec
+from pipeline.summary import describe
 
 FILM_SUFFIXES = (".gif", ".mp4")
-FRAMES_PER_SECOND = 8
+FRAMES_PER_SECOND = 10
 
 
 @dataclass(frozen=True)
@@ -145,19 +146,33 @@ def play(chosen: ChosenModel, args: argparse.Namespace) -> None:
     env = _playing_env(chosen, mode)
     model = load_model(chosen.spec.algo, chosen.path, env, device=args.device)
     env.seed(args.seed)
-    frames: list[Any] = []
+    watcher = Watcher(env, mode, console)
     returns, lengths = [], []
-    for total_return, length in _episodes(
-        model, env, args, lambda: _show(env, mode, console, frames)
-    ):
+    for total_return, length in _episodes(model, env, args, watcher.show):
         returns.append(total_return)
         lengths.append(length)
         console.print(f"episode {len(returns)}: return {total_return:.2f}, {length} steps")
     env.close()
     if args.record:
-        write_film(Path(args.record), frames)
+        write_film(Path(args.record), watcher.frames)
         console.print(f"film: {args.record}")
     _print_returns(console, returns, lengths)
+    _print_exact(console, chosen.spec, model, deterministic=not args.stochastic)
+
+
+def _print_exact(console: Console, spec: TrainSpec, model: Any, *, deterministic: bool) -> None:
+    """Say what the policy is worth, where that can be computed."""
+    from pipeline.exact import exact_evaluator
+
+    evaluator = exact_evaluator(spec)
+    if evaluator is None:
+        return
+    try:
+        evaluation = evaluator(model, deterministic)
+    except (TypeError, ValueError):
+        # The probabilities that the agent samples its actions from are not known.
+        return
+    console.print(describe(evaluation))
 
 
 def _print_returns(console: Console, returns: list[float], lengths: list[int]) -> None:
@@ -212,7 +227,7 @@ def collect_frames(env: Any) -> Any:
 
 
 def _episodes(
-    model: Any, env: Any, args: argparse.Namespace, show: Callable[[], None]
+    model: Any, env: Any, args: argparse.Namespace, show: Callable[[bool], None]
 ) -> Iterator[tuple[float, int]]:
     """Return and length of each episode as it ends."""
     obs, state = env.reset(), None
@@ -224,19 +239,42 @@ def _episodes(
         )
         obs, _, starts, infos = env.step(actions)
         steps += 1
-        show()
+        show(bool(starts[0]))
         if starts[0]:
             finished += 1
             yield infos[0]["episode"]["r"], infos[0]["episode"]["l"]
 
 
-def _show(env: Any, mode: str | None, console: Console, frames: list[Any]) -> None:
-    """Print or keep what the environment has drawn since the last call."""
-    if mode == "rgb_array":
-        frames.extend(env.env_method("render")[0])
-    elif mode == "ansi":
-        for text in env.env_method("render")[0]:
-            console.file.write(f"{text}\n")
+class Watcher:
+    """Prints or keeps what the environment draws.
+
+    Args:
+        env: a VecEnv of one environment that keeps its frames.
+        mode: ``"ansi"`` prints, ``"rgb_array"`` keeps them in `frames`; else nothing is done.
+        console: where to.
+    """
+
+    def __init__(self, env: Any, mode: str | None, console: Console) -> None:
+        self.env = env
+        self.mode = mode
+        self.console = console
+        self.frames: list[Any] = []
+        self._first_of_next: list[Any] = []
+
+    def show(self, done: bool) -> None:
+        """Take what was drawn since the last call.
+
+        A VecEnv has begun the next episode by the time that one is done; its first frame waits.
+        """
+        if self.mode not in ("ansi", "rgb_array"):
+            return
+        drawn = self._first_of_next + self.env.env_method("render")[0]
+        self._first_of_next = [drawn.pop()] if done else []
+        if self.mode == "rgb_array":
+            self.frames.extend(drawn)
+            return
+        for text in drawn:
+            self.console.file.write(f"{text}\n")
 
 
 def write_film(path: Path, frames: list[Any]) -> None:

@@ -126,6 +126,6 @@ def draw_learning_curve(
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(frameon=False, loc="lower right")
+        axes.legend(framealpha=0.9, edgecolor="none", loc="center right")
     with replacing(run.curve_path) as draft:
         figure.savefig(draft, format="png")

@@ -86,7 +86,15 @@ def test_global_generators_are_left_alone(name):
 
 @pytest.mark.parametrize("name", TABULAR)
 def test_learning_happens(name):
-    model = make(name, "envs:Warehouse-v0", learning_rate=0.3).learn(60_000)
+    explore = 1.0 if name == "double_qlearning" else 0.1
+    model = make(
+        name,
+        "envs:Warehouse-v0",
+        learning_rate=ExponentialSchedule(0.3, 0.05),
+        exploration_initial_eps=explore,
+        exploration_final_eps=0.01,
+        exploration_fraction=0.8,
+    ).learn(100_000)
     mean_return, _ = evaluate_policy(model, Monitor(gym.make("Warehouse-v0")), 1)
     assert mean_return == 79
 

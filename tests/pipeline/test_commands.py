@@ -67,15 +67,27 @@ def test_a_run_folder_is_whole(type_command, tmp_path):
     info = json.loads((run / "run.json").read_text())
     assert info["state"] == "finished"
     assert info["n_timesteps"] == 500
-    assert info["final"]["n_episodes"] == 100
-    assert f"return {info['final']['mean_return']:.2f}" in out
+    assert info["final"]["exact"]
+    assert info["final"]["optimum"] == pytest.approx(0.7442, abs=1e-4)
+    assert info["engine"] == "compiled"
+    assert f"return {info['final']['mean_return']:.2f} (exact)" in out
     assert "logs/qlearning/FrozenLake-v1_1" in out
     config = yaml.safe_load((run / "FrozenLake-v1" / "config.yml").read_text())
     assert config["n_timesteps"] == 500
     assert "--seed 0" in (run / "FrozenLake-v1" / "command.txt").read_text()
     evaluations = np.load(run / "evaluations.npz")
-    assert evaluations["results"].shape == (20, 20)
+    assert evaluations["results"].shape == (20, 1)
     assert evaluations["timesteps"][-1] == 500
+
+
+def test_sampled_evaluation_where_the_model_is_not_known(type_command, tmp_path):
+    code, out, _ = type_command("train.py", "--algo", "angle", "--env", "CartPole-v1", "-n", "1000")
+    assert code == 0
+    assert "over 100 episodes" in out
+    run = tmp_path / "logs" / "angle" / "CartPole-v1_1"
+    final = json.loads((run / "run.json").read_text())["final"]
+    assert (final["exact"], final["n_episodes"]) == (False, 100)
+    assert np.load(run / "evaluations.npz")["results"].shape == (20, 20)
 
 
 def test_the_same_seed_gives_the_same_run(type_command, tmp_path):
@@ -346,11 +358,14 @@ HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy")
     ],
 )
 def test_answers_without_loading_anything_heavy(words, code, tmp_path):
-    program = f"import sys; sys.path.insert(0, {str(ROOT)!r}); import {words[0][:-3]} as command; " + (
-        "from pipeline.cli import run_command\n"
-        "try: run_command(command.main)\n"
-        "finally: print([name for name in sys.modules if name in {heavy}], file=sys.stderr)"
-    ).replace("{heavy}", repr(HEAVY))
+    program = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r}); import {words[0][:-3]} as command; "
+        + (
+            "from pipeline.cli import run_command\n"
+            "try: run_command(command.main)\n"
+            "finally: print([name for name in sys.modules if name in {heavy}], file=sys.stderr)"
+        ).replace("{heavy}", repr(HEAVY))
+    )
     result = subprocess.run(
         [sys.executable, "-c", program, *words[1:]],
         cwd=tmp_path,

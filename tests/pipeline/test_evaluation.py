@@ -36,12 +36,13 @@ def test_figures_worked_by_hand():
         "std_return": 1.0,
         "mean_length": 15.0,
         "success_rate": 0.5,
+        "exact": False,
         "n_episodes": 2,
     }
     unknown = Evaluation(evaluation.returns, evaluation.lengths, None)
     assert unknown.summary() == {**evaluation.summary(), "success_rate": None}
     kinds = {name: type(value) for name, value in evaluation.summary().items()}
-    assert set(kinds.values()) == {float, int}
+    assert set(kinds.values()) == {float, int, bool}
 
 
 # --- seeds ---------------------------------------------------------------------------------------

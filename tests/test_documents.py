@@ -1,0 +1,74 @@
+"""The commands in the documents: each is accepted as it stands, and what it names exists."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import enjoy
+import train
+from pipeline.requests import train_spec
+
+ROOT = Path(train.__file__).parent
+DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+COMMAND = re.compile(r"python ((?:train|enjoy)\.py [^`\n)]*)")
+
+
+def commands(script):
+    found = [
+        (document.name, command.strip())
+        for document in DOCUMENTS
+        for command in COMMAND.findall(
+            document.read_text().replace("--env\nWarehouse", "--env Warehouse")
+        )
+    ]
+    return [item for item in found if item[1].startswith(script)]
+
+
+def arguments(command):
+    return shlex.split(command)[1:]
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A folder that holds what the commands take for granted."""
+    (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.mark.parametrize(("document", "command"), commands("train.py"))
+def test_train_commands_can_be_carried_out(checkout, document, command):
+    parser = train.build_parser()
+    args = parser.parse_args(arguments(command))
+    if args.list:
+        return
+    args.trained_agent = ""
+    spec = train_spec(args)
+    assert spec.env_id == args.env
+
+
+@pytest.mark.parametrize(("document", "command"), commands("enjoy.py"))
+def test_enjoy_commands_are_accepted(document, command):
+    args = enjoy.build_parser().parse_args(arguments(command))
+    assert args.env == "Warehouse-v0"
+
+
+def test_there_are_commands_to_check():
+    assert len(commands("train.py")) >= 6
+    assert len(commands("enjoy.py")) >= 2
+
+
+def test_what_the_readme_points_to_is_there():
+    text = (ROOT / "README.md").read_text()
+    targets = re.findall(r"\]\(([^)#]+)\)", text) + re.findall(r'src="([^"]+)"', text)
+    files = [target for target in targets if not target.startswith("http")]
+    assert len(files) >= 4
+    assert [name for name in files if not (ROOT / name).exists()] == []
+
+
+def test_make_targets_of_the_readme_exist():
+    targets = set(re.findall(r"\bmake ([a-z]+)", (ROOT / "README.md").read_text()))
+    assert targets == {"train", "test", "bench"}
+    makefile = (ROOT / "Makefile").read_text()
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
