@@ -94,6 +94,18 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         package="sb3_contrib",
         extra="contrib",
     ),
+    "value_iteration": AlgorithmEntry(
+        "agents.planning:ValueIteration",
+        "planning: greedy in the optimal values",
+        DISCRETE,
+        DISCRETE,
+    ),
+    "optimal": AlgorithmEntry(
+        "agents.planning:Optimal",
+        "planning: the optimum under the time limit",
+        DISCRETE,
+        DISCRETE,
+    ),
     "random": AlgorithmEntry(
         "agents.reference:RandomAgent",
         "uniformly random actions",

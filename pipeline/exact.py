@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stable_baselines3 import A2C, DQN, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.base import TabularAlgorithm
 from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
@@ -47,7 +48,7 @@ class ExactEvaluator:
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """The exact worth of the agent's policy as it is."""
-        policy = policy_matrix(agent, self.observations, deterministic)
+        policy = self._policy(agent, deterministic)
         result = policy_return(self.model, policy, self.horizon, success=self.success)
         rate = result.success_rate
         return Evaluation(
@@ -57,6 +58,13 @@ class ExactEvaluator:
             exact_std=float(np.sqrt(result.return_variance)),
             yardstick=self.yardstick,
         )
+
+    def _policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
+        """The agent's policy: of shape (S, A), or (horizon, S) where it depends on the time."""
+        if isinstance(agent, PlanningAgent):
+            steps = np.arange(self.horizon)[:, None]
+            return agent.policy.actions_after(self.observations[None], steps)
+        return policy_matrix(agent, self.observations, deterministic)
 
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:

@@ -160,8 +160,13 @@ class Run:
         write_json(self.info_path, {**self.read_info(), **fields})
 
     def discard(self) -> None:
-        """Remove the folder, where nothing has come of the run."""
+        """Remove the folder, where nothing has come of the run, and those left empty by that."""
         shutil.rmtree(self.path, ignore_errors=True)
+        for folder in list(self.path.parents)[:2]:
+            try:
+                folder.rmdir()
+            except OSError:
+                return
 
 
 def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:

@@ -111,7 +111,7 @@ def _write_settings(training: Training, args: dict[str, Any], command: str) -> N
 
 
 def _execute(training: Training) -> Outcome:
-    run, model = training.run, training.model
+    model = training.model
     started = time.monotonic()
     state = FINISHED
     try:
@@ -123,12 +123,26 @@ def _execute(training: Training) -> Outcome:
             training.display.close()
         return _finish(training, state, time.monotonic() - started)
     except BaseException as error:
-        run.update_info(state=FAILED, reason=one_line(error))
+        _give_up(training, error)
         raise
     finally:
         training.eval_env.close()
         if model.env is not None:
             model.env.close()
+
+
+def _give_up(training: Training, error: BaseException) -> None:
+    """Note the reason; or leave nothing, where the agent saw at once that it cannot work so.
+
+    Raises:
+        UserError: in that case.
+    """
+    run, model = training.run, training.model
+    if isinstance(error, ValueError) and model.num_timesteps == model._num_timesteps_at_start:
+        run.discard()
+        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
+        raise UserError(message) from error
+    run.update_info(state=FAILED, reason=one_line(error))
 
 
 def _learn(training: Training) -> None:

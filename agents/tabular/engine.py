@@ -127,7 +127,8 @@ class CompiledEngine:
         rollout.learn_from_step(
             self.learner, self.envs, self.progress[0], *self.learning, *self.room
         )
-        self._take_over_counts(n_steps, len(episodes.envs))
+        last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
+        self._take_over_counts(1, len(episodes.envs) - last_step)
         self.callback.on_rollout_end()
         return keep_going
 
@@ -143,6 +144,8 @@ class CompiledEngine:
         earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._update_statistics(episodes, 0, earlier, times)
         agent.num_timesteps += n_steps * agent.n_envs
+        # Callbacks come before the last step is learnt from: until then the counters end before it.
+        self._take_over_counts(n_steps - 1, earlier)
         pass_over(self.callback, n_steps - 1, earlier)
         local = self._last_step(episodes, earlier, times)
         self.callback.update_locals(local)
@@ -188,8 +191,13 @@ class CompiledEngine:
         agent._current_progress_remaining = float(progress["remaining"])
         agent.mean_td_error = float(progress["mean_td_error"])
         agent._n_updates += n_steps * agent.n_envs
+        self._take_over_position()
         if n_episodes:
             agent._count_episodes(n_episodes, self.log_interval)
+
+    def _take_over_position(self) -> None:
+        self.agent._last_obs = self.envs["obs"].copy()
+        self.agent._next_actions = self.envs["next_action"].copy()
 
     def _keep_unfinished_rewards(self, episodes: Episodes, n_steps: int) -> None:
         """Monitor holds the rewards of the episode that is under way: so must we."""
@@ -232,11 +240,8 @@ class CompiledEngine:
 
     def _write_state(self) -> None:
         """Put agent and environments where the arrays are."""
-        agent = self.agent
         self.streams.give_back()
-        agent._last_obs = self.envs["obs"].copy()
-        agent._next_actions = self.envs["next_action"].copy()
-        agent._last_episode_starts = self.envs["done"].copy()
+        self._take_over_position()
         for i, env in enumerate(self.vec_env.envs):
             self._write_env(i, env)
 

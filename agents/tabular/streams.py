@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 
@@ -34,6 +36,11 @@ class UniformStreams:
         """Put the generators to where they would be had only the used numbers been drawn."""
         capacity = self.uniforms.shape[1]
         for used, generator in zip(self.used.tolist(), self.generators, strict=True):
+            bits: Any = generator.bit_generator
+            ahead = bits.state
             # One double takes one output of the bit generator, whose period is 2**128.
-            generator.bit_generator.advance(2**128 - (capacity - used))  # type: ignore[attr-defined]
+            bits.advance(2**128 - (capacity - used))
+            # Advancing forgets the half of an output that waits for the next 32-bit number.
+            waiting = {name: ahead[name] for name in ("has_uint32", "uinteger")}
+            bits.state = {**bits.state, **waiting}
         self.used[:] = capacity

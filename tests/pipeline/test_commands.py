@@ -244,7 +244,28 @@ def test_settings_that_the_library_refuses_leave_no_folder(type_command, tmp_pat
     )
     assert code == 2
     assert err.count("\n") == 1
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    assert contents(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([*QUICK, "-params", "engine:compiled", "--vec-env", "subproc"], "is not DummyVecEnv"),
+        (
+            ["--algo", "optimal", "--env", "CliffWalking-v1", "--conf-file", "plain.yml"],
+            "needs a time limit",
+        ),
+    ],
+)
+def test_what_an_agent_cannot_work_with_leaves_nothing(
+    type_command, tmp_path, arguments, complaint
+):
+    plain = tmp_path / "plain.yml"
+    plain.write_text("CliffWalking-v1: {n_timesteps: 10, policy: ActionTablePolicy}\n")
+    code, _, err = type_command("train.py", *arguments)
+    assert (code, err.count("\n")) == (2, 1)
+    assert complaint in err
+    assert contents(tmp_path) == ["plain.yml"]
 
 
 def damaged_zips(folder, whole):
@@ -314,7 +335,7 @@ def test_a_full_disk(type_command, tmp_path, monkeypatch):
     code, _, err = type_command("train.py", *QUICK)
     assert (code, err.count("\n")) == (2, 1)
     assert "No space left on device" in err
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    assert contents(tmp_path) == []
 
 
 def test_ctrl_c_saves_what_was_learnt(tmp_path):

@@ -1,0 +1,230 @@
+"""Agents that know the transition model and plan: the best that others can become.
+
+They are trained by planning. `learn` then plays their policy, so that callbacks, Monitor and logger
+see what they see of any other agent.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents.online import OnlineAlgorithm
+from envs.model import observations_of_states, time_limit, transition_model
+from mdp import TransitionModel, finite_horizon_optimum, value_iteration
+
+
+class ActionTablePolicy(BasePolicy):
+    """One action for each observation, or for each observation and number of steps left.
+
+    Attributes:
+        actions: int64 of shape (m, S): with 1, 2, ... steps left; with more than m, the last row.
+        horizon: steps of an episode, int64 of shape (); only looked at where m is above 1.
+    """
+
+    actions: th.Tensor
+    horizon: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Discrete,
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
+        shape = (1, int(observation_space.n))
+        self.register_buffer("actions", th.zeros(shape, dtype=th.int64))
+        self.register_buffer("horizon", th.tensor(1))
+
+    def set_actions(self, actions: NDArray[np.integer[Any]], horizon: int) -> None:
+        """Put a plan in place: actions of shape (m, S) and the number of steps of an episode."""
+        self.actions = th.from_numpy(actions.astype(np.int64))
+        self.horizon = th.tensor(horizon)
+
+    def actions_after(self, obs: NDArray[np.int64], steps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """What to do in ``obs`` after ``steps`` steps of the episode, all of shape (n,)."""
+        steps_left = np.clip(int(self.horizon) - steps, 1, len(self.actions))
+        return np.asarray(self.actions.numpy()[steps_left - 1, obs])
+
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Take over a plan of any number of steps."""
+        if "actions" in state_dict:
+            self.actions = th.zeros_like(state_dict["actions"])
+        return super().load_state_dict(state_dict, strict, assign)
+
+    def _predict(
+        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
+    ) -> th.Tensor:
+        assert isinstance(observation, th.Tensor)
+        obs = observation.long().flatten().numpy()
+        return th.from_numpy(self.actions_after(obs, np.zeros(len(obs), dtype=np.int64)))
+
+
+class PlanningAgent(OnlineAlgorithm):
+    """The base of the agents that plan.
+
+    Args:
+        policy: ``"ActionTablePolicy"``.
+        env: environment whose transition model is known, or its id.
+        gamma: discount factor of the planning; by default 0.99 for value iteration, and 1 for the
+            optimum under the time limit.
+        stats_window_size: episodes over which logged statistics are averaged.
+        tensorboard_log: folder for TensorBoard, or None.
+        verbose: 0 silent, 1 information.
+        seed: seeds the agent's generators, its action space and its environments.
+        device: not used.
+
+    Raises:
+        ValueError: if ``gamma`` lies outside [0, 1]; by `learn`, if the model is not known.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
+    policy: ActionTablePolicy
+    default_gamma: ClassVar[float]
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "ActionTablePolicy",
+        env: GymEnv | str | None = None,
+        gamma: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate=0.0,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device="cpu",
+            support_multi_env=True,
+            seed=seed,
+            supported_action_spaces=(spaces.Discrete,),
+        )
+        self.gamma = self.default_gamma if gamma is None else gamma
+        self._steps = np.zeros(0, dtype=np.int64)
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        if not 0 <= self.gamma <= 1:
+            raise ValueError(f"gamma must lie between 0 and 1, not {self.gamma}")
+        self._setup_lr_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self.policy_class(self.observation_space, self.action_space)  # type: ignore[assignment]
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, Any]:
+        if reset_num_timesteps or self._last_obs is None:
+            self._steps = np.zeros(self.n_envs, dtype=np.int64)
+        self.plan()
+        return super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+
+    def plan(self) -> None:
+        """Work out the policy from the transition model of the environment.
+
+        Raises:
+            ValueError: if the model is not known, or one observation stands for several states.
+        """
+        assert self.env is not None
+        name, vec_env = type(self).__name__, self.env.unwrapped
+        if not isinstance(vec_env, DummyVecEnv):
+            raise ValueError(f"{name} needs environments in its own process: --vec-env dummy")
+        env = vec_env.envs[0]
+        model, observations = transition_model(env), observations_of_states(env)
+        if model is None or observations is None:
+            raise ValueError(f"{name} needs an environment whose transition model is known")
+        if observations.ndim != 1 or len(np.unique(observations)) < len(observations):
+            raise ValueError(f"{name} needs observations that are the numbers of the states")
+        by_state, horizon = self._plan(model, time_limit(env))
+        actions = np.zeros((len(by_state), int(self.observation_space.n)), dtype=np.int64)  # type: ignore[attr-defined]
+        actions[:, observations] = by_state
+        self.policy.set_actions(actions, horizon)
+
+    def _plan(
+        self, model: TransitionModel, limit: int | None
+    ) -> tuple[NDArray[np.integer[Any]], int]:
+        """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon."""
+        raise NotImplementedError
+
+    def _choose_actions(self) -> NDArray[np.int64]:
+        actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)
+        self._steps = self._steps + 1
+        return actions
+
+    def _learn_from(self, transitions: Any) -> None:
+        self._steps[transitions.dones] = 0
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The planned actions; ``state`` carries the number of steps of each episode so far.
+
+        Args:
+            observation: one state index, or an array of shape (n,).
+            state: what the last call returned, or None at the start.
+            episode_start: whether an episode begins, shape (n,).
+            deterministic: not used, as plans are.
+
+        Returns:
+            Actions, of the observation's shape, and the new ``state``.
+        """
+        obs = np.asarray(observation, dtype=np.int64)
+        steps = np.zeros(obs.size, dtype=np.int64) if state is None else state[0].copy()
+        if episode_start is not None:
+            steps[np.asarray(episode_start, dtype=np.bool_)] = 0
+        actions = self.policy.actions_after(obs.reshape(-1), steps)
+        return actions.reshape(obs.shape), (steps + 1,)
+
+
+class ValueIteration(PlanningAgent):
+    """Greedy in the optimal values without a time limit (Sutton and Barto, section 4.4).
+
+    Without a discount, ways that lead to the goal sooner or later are all alike.
+    """
+
+    default_gamma = 0.99
+
+    def _plan(
+        self, model: TransitionModel, limit: int | None
+    ) -> tuple[NDArray[np.integer[Any]], int]:
+        return value_iteration(model, self.gamma).policy[None], 1
+
+
+class Optimal(PlanningAgent):
+    """The optimum under the time limit, whose actions may depend on the time that is left."""
+
+    default_gamma = 1.0
+
+    def _plan(
+        self, model: TransitionModel, limit: int | None
+    ) -> tuple[NDArray[np.integer[Any]], int]:
+        if limit is None:
+            raise ValueError("Optimal needs a time limit: give the environment max_episode_steps")
+        plan = finite_horizon_optimum(model, limit, self.gamma)
+        return plan.actions_left, limit

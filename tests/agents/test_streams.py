@@ -1,0 +1,61 @@
+"""Numbers drawn ahead are those that would have been drawn one by one."""
+
+import copy
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents.tabular.streams import UniformStreams
+
+CAPACITY = 7
+N = 3
+
+# What each generator uses up between two refills.
+ROUND = st.lists(st.integers(0, CAPACITY), min_size=N, max_size=N)
+# Rounds between two times that the generators are given back.
+SESSIONS = st.lists(st.lists(ROUND, max_size=4), max_size=4)
+
+
+def generators(seed=0):
+    return [np.random.default_rng([seed, i]) for i in range(N)]
+
+
+def states(made):
+    return [generator.bit_generator.state for generator in made]
+
+
+@given(SESSIONS, st.integers(0, 2**32))
+def test_any_pattern_of_use(sessions, seed):
+    ahead, direct = generators(seed), generators(seed)
+    streams = UniformStreams(ahead, CAPACITY)
+    for session in sessions:
+        for use in session:
+            streams.refill()
+            assert streams.used.tolist() == [0] * N
+            for i, used in enumerate(use):
+                expected = [direct[i].random() for _ in range(used)]
+                assert streams.uniforms[i, :used].tolist() == expected
+            streams.used[:] = use
+        streams.give_back()
+        assert states(ahead) == states(direct)
+        # Whoever has the generators meanwhile may draw from them in any way.
+        for generator in (*ahead, *direct):
+            generator.standard_normal()
+
+
+@given(st.integers(0, CAPACITY), st.integers(0, 5))
+def test_giving_back_restores_the_generator(used, half_words):
+    (generator, *others) = generators()
+    # Numbers of 32 bits come in pairs: after an odd number of them one waits to be used.
+    generator.integers(0, 1000, half_words, dtype=np.uint32)
+    expected = copy.deepcopy(generator)
+    expected.random(used)
+    streams = UniformStreams([generator, *others], CAPACITY)
+    streams.refill()
+    streams.used[:] = used
+    streams.give_back()
+    assert states([generator]) == states([expected])
+    # Once more changes nothing.
+    streams.give_back()
+    assert states([generator]) == states([expected])

@@ -1,0 +1,235 @@
+"""Exact evaluations agree with sampled ones, for every kind of agent whose policy is known."""
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from agents import load_algorithm
+from mdp import policy_return, value_iteration
+from pipeline.environments import make_evaluation_env, make_training_env
+from pipeline.evaluation import Yardstick, evaluate
+from pipeline.exact import exact_evaluator, policy_matrix
+from pipeline.hyperparams import split
+from pipeline.specs import TrainSpec
+
+# Two-sided, of the normal distribution.
+WITHIN_999 = 3.2905
+N_EPISODES = 20_000
+
+ENVS = {
+    "Warehouse": ("Warehouse-v0", {"slip": 0.1, "max_episode_steps": 60, "shelf_reward": -3}),
+    "FrozenLake": ("FrozenLake-v1", {}),
+    "MineMaze": ("MineMaze-v0", {"random_start": True, "slip": 0.2, "max_episode_steps": 50}),
+    "still Warehouse": ("Warehouse-v0", {"max_episode_steps": 100}),
+    "still FrozenLake": ("FrozenLake-v1", {"is_slippery": False}),
+    "still MineMaze": ("MineMaze-v0", {}),
+}
+SMALL = {"policy_kwargs": {"net_arch": [16]}, "device": "cpu"}
+AGENTS = {
+    "qlearning": {"learning_rate": 0.5, "exploration_final_eps": 0.3},
+    "ppo": {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2},
+    "a2c": SMALL,
+    "dqn": {**SMALL, "buffer_size": 500, "learning_starts": 50, "exploration_final_eps": 0.2},
+    "random": {},
+}
+BRIEFLY = {"qlearning": 5000, "ppo": 256, "a2c": 100, "dqn": 300, "random": 0}
+
+
+def spec_of(env, **entry):
+    env_id, env_kwargs = ENVS.get(env, (env, {}))
+    entry = {"n_timesteps": 1, "env_kwargs": env_kwargs, **entry}
+    return TrainSpec("qlearning", env_id, split(entry), entry, seed=0)
+
+
+def briefly_trained(name, spec):
+    algorithm = load_algorithm(name)
+    env = make_training_env(spec, None)
+    policy = next(iter(algorithm.policy_aliases))
+    return algorithm(policy, env, seed=0, **AGENTS[name]).learn(BRIEFLY[name])
+
+
+def sampled_returns(evaluator, policy, n_episodes, seed=0):
+    """Returns of many episodes that follow the policy matrix in the model, all at once."""
+    model, rng = evaluator.model, np.random.default_rng(seed)
+    actions_up_to = policy.cumsum(axis=1)
+    outcomes_up_to = model.prob.cumsum(axis=2)
+    states = rng.choice(model.n_states, n_episodes, p=model.initial)
+    returns, playing = np.zeros(n_episodes), np.arange(n_episodes)
+    for _ in range(evaluator.horizon):
+        drawn = rng.random((2, len(playing), 1))
+        # Rounding may leave a last sum just below 1.
+        actions = (actions_up_to[states, :-1] <= drawn[0]).sum(axis=1)
+        outcomes = (outcomes_up_to[states, actions, :-1] <= drawn[1]).sum(axis=1)
+        at = states, actions, outcomes
+        returns[playing] += model.reward[at]
+        going_on = ~model.terminated[at]
+        states, playing = model.next_state[at][going_on], playing[going_on]
+    return returns
+
+
+def assert_mean_is(expected, std, returns):
+    """The mean of sampled returns lies in its 99.9 % interval around the exact one."""
+    margin = WITHIN_999 * std / np.sqrt(len(returns))
+    assert np.mean(returns) == pytest.approx(expected, abs=margin + 1e-4)
+
+
+# --- against sampling ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("env", ["Warehouse", "FrozenLake", "MineMaze"])
+@pytest.mark.parametrize("name", AGENTS)
+def test_the_exact_return_is_that_of_sampled_episodes(name, env):
+    spec = spec_of(env)
+    evaluator = exact_evaluator(spec)
+    agent = briefly_trained(name, spec)
+    for deterministic in (True, False):
+        exact = evaluator(agent, deterministic)
+        policy = policy_matrix(agent, evaluator.observations, deterministic)
+        np.testing.assert_allclose(policy.sum(axis=1), 1, atol=1e-6)
+        returns = sampled_returns(evaluator, policy, N_EPISODES)
+        assert exact.is_exact
+        assert_mean_is(exact.mean_return, exact.std_return, returns)
+        # The standard deviation itself, whose error depends on the tails: loosely.
+        assert returns.std() == pytest.approx(exact.std_return, rel=0.15, abs=0.01)
+
+
+@pytest.mark.parametrize("name", ["qlearning", "ppo", "dqn", "random"])
+@pytest.mark.parametrize("deterministic", [True, False])
+def test_the_exact_return_is_that_of_the_agents_own_actions(name, deterministic):
+    spec = spec_of("FrozenLake")
+    evaluator = exact_evaluator(spec)
+    agent = briefly_trained(name, spec)
+    exact = evaluator(agent, deterministic)
+    played = evaluate(agent, make_evaluation_env(spec, 50), 1000, 5, deterministic)
+    assert_mean_is(exact.mean_return, exact.std_return, played.returns)
+    assert played.lengths.mean() == pytest.approx(exact.lengths[0], rel=0.15)
+
+
+@pytest.mark.parametrize("env", ["still Warehouse", "still FrozenLake", "still MineMaze"])
+@pytest.mark.parametrize("name", ["qlearning", "ppo", "a2c", "dqn"])
+def test_where_nothing_is_random_one_episode_says_it_all(name, env):
+    spec = spec_of(env)
+    agent = briefly_trained(name, spec)
+    exact = exact_evaluator(spec)(agent)
+    played = evaluate(agent, make_evaluation_env(spec, 1), 1, 0)
+    assert exact.mean_return == pytest.approx(played.mean_return, abs=1e-4)
+    assert exact.lengths[0] == pytest.approx(played.lengths[0], abs=1e-9)
+    assert exact.std_return == pytest.approx(0, abs=1e-4)
+
+
+# --- observations --------------------------------------------------------------------------------
+
+
+class Lookup:
+    """Acts by a table of actions, on whatever it recognises the state by."""
+
+    def __init__(self, actions, state_of):
+        self.actions = actions
+        self.state_of = state_of
+        self.action_space = spaces.Discrete(4)
+
+    def predict(self, observation, deterministic=True):
+        return self.actions[self.state_of(observation)], None
+
+
+def cell_of(position):
+    return (np.rint(position * 9) @ [10, 1]).astype(int)
+
+
+ENCODINGS = {
+    "position": ({"env_kwargs": {"observation": "position", "slip": 0.1}}, cell_of),
+    "one_hot": (
+        {"env_kwargs": {"observation": "one_hot", "slip": 0.1}},
+        lambda hot: hot.argmax(axis=1),
+    ),
+    "wrapper": (
+        {"env_kwargs": {"slip": 0.1}, "env_wrapper": "envs.wrappers.OneHotObservation"},
+        lambda hot: hot.argmax(axis=1),
+    ),
+}
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_other_observations_of_the_same_states(encoding):
+    entry, state_of = ENCODINGS[encoding]
+    plain = exact_evaluator(spec_of("Warehouse-v0", env_kwargs={"slip": 0.1}))
+    encoded = exact_evaluator(spec_of("Warehouse-v0", **entry))
+    assert encoded.observations.dtype == np.float32
+    plan = value_iteration(plain.model, 1.0)
+    for actions in (plan.policy, np.random.default_rng(0).integers(0, 4, 100)):
+        expected = plain(Lookup(actions, lambda state: state))
+        seen = encoded(Lookup(actions, state_of))
+        assert seen.summary() == expected.summary()
+
+
+@pytest.mark.parametrize("name", ["ppo", "dqn"])
+def test_networks_on_other_observations(name):
+    kwargs = {"observation": "position", "max_episode_steps": 60, "slip": 0.1}
+    spec = spec_of("Warehouse-v0", env_kwargs=kwargs)
+    evaluator, agent = exact_evaluator(spec), briefly_trained(name, spec)
+    exact = evaluator(agent)
+    played = evaluate(agent, make_evaluation_env(spec, 20), 200, 5)
+    assert_mean_is(exact.mean_return, exact.std_return, played.returns)
+
+
+@pytest.mark.parametrize(
+    ("env", "entry"),
+    [
+        ("CartPole-v1", {}),
+        ("FrozenLake-v1", {"normalize": {"norm_obs": False}}),
+        ("FrozenLake-v1", {"frame_stack": 2}),
+        (
+            "FrozenLake-v1",
+            {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"},
+        ),
+        ("Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}),
+        # Twenty-two thousand states and more take longer than episodes.
+        ("envs:RandomWarehouse-v0", {"env_kwargs": {"size": 150}}),
+    ],
+)
+def test_where_episodes_must_be_sampled(env, entry):
+    assert exact_evaluator(spec_of(env, **entry)) is None
+
+
+def test_what_an_unknown_agent_samples_from_is_not_guessed():
+    env = exact_evaluator(spec_of("FrozenLake"))
+    with pytest.raises(TypeError, match="action probabilities of Lookup are not known"):
+        policy_matrix(Lookup(np.zeros(16, int), lambda state: state), env.observations, False)
+
+
+# --- the yardstick -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("env", "optimum", "blind"),
+    [("Warehouse-v0", 79.0, -1000.0), ("MineMaze-v0", 91.0, None), ("FrozenLake-v1", 0.7442, None)],
+)
+def test_the_best_policy_scores_1_and_the_best_blind_one_0(env, optimum, blind):
+    evaluator = exact_evaluator(spec_of(env))
+    n_states, n_actions = evaluator.model.prob.shape[:2]
+    best = Lookup(value_iteration(evaluator.model, 1.0).policy, lambda state: state)
+    assert evaluator.yardstick.optimum == pytest.approx(optimum, abs=5e-5)
+    # On the slippery lake the best policy depends on the time that is left.
+    least = 0.95 if env == "FrozenLake-v1" else 1 - 1e-12
+    assert least <= evaluator(best).summary()["score"] <= 1 + 1e-12
+    policies = [np.eye(n_actions)[[action] * n_states] for action in range(n_actions)]
+    policies.append(np.full((n_states, n_actions), 1 / n_actions))
+    returns = [
+        policy_return(evaluator.model, policy, evaluator.horizon).expected_return
+        for policy in policies
+    ]
+    scores = [evaluator.yardstick.score(value) for value in returns]
+    assert max(scores) == pytest.approx(0, abs=1e-12)
+    if blind is not None:
+        assert max(returns) == blind
+
+
+def test_figures_of_the_yardstick():
+    yardstick = Yardstick(optimum=79.0, blind=-1000.0)
+    assert yardstick.gap(70.0) == 9.0
+    assert yardstick.score(79.0) == 1.0
+    assert yardstick.score(-1000.0) == 0.0
+    assert yardstick.score(-460.5) == 0.5
+    assert yardstick.score(-2079.0) == -1.0
+    flat = Yardstick(optimum=5.0, blind=5.0)
+    assert (flat.score(5.0), flat.score(4.0)) == (1.0, 0.0)
