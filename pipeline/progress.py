@@ -15,6 +15,8 @@ from rich.progress import (
 )
 
 from agents.blocks import BlockCallback
+from agents.tabular.base import TabularAlgorithm
+from agents.tabular.engine_choice import must_compile
 
 SECONDS_BETWEEN_UPDATES = 0.1
 LINES_WITHOUT_TERMINAL = 10
@@ -39,6 +41,8 @@ class ProgressDisplay(BlockCallback):
 
     def _on_training_start(self) -> None:
         self.started = self.updated = time.monotonic()
+        if isinstance(self.model, TabularAlgorithm) and must_compile(self.model):
+            self.console.print("compiling the training loop (the first time, some seconds)")
         self.first_step = self.num_timesteps
         if self.live:
             self.bar = Progress(

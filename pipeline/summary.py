@@ -52,6 +52,8 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     table.add_row(
         done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)"
     )
+    if outcome.engine:
+        table.add_row("engine", outcome.engine)
     if outcome.final is not None:
         table.add_row("final", describe(outcome.final))
     if outcome.best_return is not None:

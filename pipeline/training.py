@@ -46,6 +46,7 @@ class Outcome:
             evaluation was turned off.
         best_return: mean return of the best evaluation during training, if there was one.
         best_timesteps: when that was.
+        engine: for tabular agents, whether training was compiled, and if not, why.
     """
 
     run: Run
@@ -55,6 +56,7 @@ class Outcome:
     final: Evaluation | None
     best_return: float | None
     best_timesteps: int
+    engine: str | None
 
 
 def train(spec: TrainSpec, console: Console, args: dict[str, Any], command: str) -> Outcome:
@@ -170,6 +172,7 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     yardstick = None if final is None else final.yardstick
     draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
     best = evaluation.best_mean_reward if evaluation.best_timesteps else None
+    engine = getattr(model, "engine_in_use", None)
     run.update_info(
         state=state,
         n_timesteps=model.num_timesteps,
@@ -177,9 +180,11 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
         final=None if final is None else final.summary(),
         best_mean_return=best,
         best_timesteps=evaluation.best_timesteps,
-        engine=getattr(model, "engine_in_use", None),
+        engine=engine,
     )
-    return Outcome(run, state, model.num_timesteps, seconds, final, best, evaluation.best_timesteps)
+    return Outcome(
+        run, state, model.num_timesteps, seconds, final, best, evaluation.best_timesteps, engine
+    )
 
 
 def _final_evaluation(training: Training) -> Evaluation | None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.blocks import unknown_callbacks
 from agents.schedules import schedule_row
+from agents.tabular import rollout
 from agents.tabular.engine import CompiledEngine
 from agents.tabular.simulator import World
 from agents.tabular.worlds import NotCompilable, compile_world
@@ -38,6 +40,12 @@ def choose_engine(
         return None
     agent.engine_in_use = "compiled"
     return CompiledEngine(agent, world, callback, log_interval)
+
+
+def must_compile(agent: TabularAlgorithm) -> bool:
+    """Whether training will compile the loop first, since no earlier run has left it behind."""
+    cache = Path(rollout.__file__).parent / "__pycache__"
+    return agent.engine != "interpreted" and not any(cache.glob("rollout.run_block-*.nbi"))
 
 
 def _world_for(agent: TabularAlgorithm, callback: BaseCallback) -> World:

@@ -131,7 +131,6 @@ def env_state(env):
         state[name] = env.get_wrapper_attr(name)
     if env.has_wrapper_attr("_elapsed_steps"):
         state["elapsed"] = env.get_wrapper_attr("_elapsed_steps")
-    assert len(state["episode_returns"]) == len(state["episode_lengths"])
     return state
 
 
@@ -168,7 +167,6 @@ def test_cases_cover_every_pair():
     for (i, first), (j, second) in itertools.combinations(enumerate(FACTORS), 2):
         for levels in itertools.product(first, second):
             assert (((i, levels[0]), (j, levels[1])) in met) == allowed(levels)
-    # With what the tests below add, about a million steps.
     assert len(CASES) * STEPS >= 800_000
 
 

@@ -71,9 +71,9 @@ def test_environments_without_compiled_counterpart(reason, make_env):
     env = make_env()
     model = load_algorithm("qlearning")(env=env, engine="compiled", seed=0)
     with pytest.raises(ValueError, match=f"engine: compiled is not possible: .*{reason}"):
-        model.learn(20)
+        model.learn(2)
     model.engine = "auto"
-    model.learn(20)
+    model.learn(2)
     assert model.engine_in_use.startswith("interpreted: ")
     assert reason in model.engine_in_use
     env.close()
