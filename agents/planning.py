@@ -6,14 +6,16 @@ see what they see of any other agent.
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.online import OnlineAlgorithm
@@ -126,20 +128,12 @@ class PlanningAgent(OnlineAlgorithm):
         self.set_random_seed(self.seed)
         self.policy = self.policy_class(self.observation_space, self.action_space)  # type: ignore[assignment]
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, Any]:
-        if reset_num_timesteps or self._last_obs is None:
-            self._steps = np.zeros(self.n_envs, dtype=np.int64)
+    def _begin_episodes(self) -> None:
+        self._steps = np.zeros(self.n_envs, dtype=np.int64)
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
         self.plan()
-        return super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
+        super()._run(total_timesteps, callback, log_interval)
 
     def plan(self) -> None:
         """Work out the policy from the transition model of the environment.
@@ -162,11 +156,11 @@ class PlanningAgent(OnlineAlgorithm):
         actions[:, observations] = by_state
         self.policy.set_actions(actions, horizon)
 
+    @abstractmethod
     def _plan(
         self, model: TransitionModel, limit: int | None
     ) -> tuple[NDArray[np.integer[Any]], int]:
         """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon."""
-        raise NotImplementedError
 
     def _choose_actions(self) -> NDArray[np.int64]:
         actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)

@@ -9,7 +9,7 @@ import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from agents.exploration import (
@@ -178,21 +178,8 @@ class TabularAlgorithm(OnlineAlgorithm):
             return rate / (self._episode_num + 1)
         return rate
 
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, Any]:
-        if reset_num_timesteps or self._last_obs is None:
-            self._next_actions = np.full(self.n_envs, UNDECIDED)
-        total_timesteps, callback = super()._setup_learn(
-            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
-        )
-        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-        return total_timesteps, callback
+    def _begin_episodes(self) -> None:
+        self._next_actions = np.full(self.n_envs, UNDECIDED)
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
         engine = choose_engine(self, callback, log_interval)
