@@ -109,7 +109,8 @@ class OnlineAlgorithm(JsonAlgorithm):
         total_timesteps, callback = super()._setup_learn(
             total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
         )
-        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        # As in the library, a training of no steps is none, and no error.
+        self._update_current_progress_remaining(self.num_timesteps, max(self._total_timesteps, 1))
         return total_timesteps, callback
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:

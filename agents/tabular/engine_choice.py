@@ -17,6 +17,9 @@ from agents.tabular.worlds import NotCompilable, compile_world
 if TYPE_CHECKING:
     from agents.tabular.base import TabularAlgorithm
 
+# Where the agents are defined whose rules the engine knows; a subclass may change anything.
+ALGORITHMS = "agents.tabular.algorithms"
+
 
 def choose_engine(
     agent: TabularAlgorithm, callback: BaseCallback, log_interval: int | None
@@ -49,6 +52,8 @@ def must_compile(agent: TabularAlgorithm) -> bool:
 
 
 def _world_for(agent: TabularAlgorithm, callback: BaseCallback) -> World:
+    if type(agent).__module__ != ALGORITHMS:
+        raise NotCompilable(f"{type(agent).__name__} may act and learn in its own way")
     unknown = unknown_callbacks(callback)
     if unknown:
         raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")

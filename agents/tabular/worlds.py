@@ -13,14 +13,23 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.tabular.simulator import CART_POLE, MODEL, OUTCOME, CartPole, World
 from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
-from envs.wrappers import DiscretizeObservation
+from envs.wrappers import (
+    DiscretizeObservation,
+    FlattenToDiscrete,
+    ScaleReward,
+    TerminationReward,
+)
 from mdp.model import TransitionModel
 
 Env = gym.Env[Any, Any]
 
 NO_CART_POLE = CartPole(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, False, 0.0, 0.0)
 NO_INTS = np.empty(0, dtype=np.int64)
-CART_POLE_WRAPPERS = {DiscretizeObservation, Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
+
+# Wrappers whose work the engine does itself, or that have none to do.
+COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
+CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
+MODEL_WRAPPERS = {FlattenToDiscrete, ScaleReward, TerminationReward, *COMMON_WRAPPERS}
 
 
 class NotCompilable(Exception):  # noqa: N818  # no error: the interpreted loop takes over
@@ -73,6 +82,8 @@ def _check_monitor(env: Env) -> None:
     monitor = monitor_of(env)
     if monitor is None:
         return
+    if any(isinstance(layer, Monitor) for layer in layers(monitor.env)):
+        raise NotCompilable("there is more than one Monitor")
     if monitor.info_keywords or monitor.reset_keywords:
         raise NotCompilable("Monitor records further keys")
     if time_limit(monitor.env) != time_limit(env):
@@ -86,6 +97,11 @@ def _model_world(env: Env) -> World:
         raise NotCompilable("the environment's transition model is not known")
     if not np.issubdtype(observations.dtype, np.integer) or observations.ndim != 1:
         raise NotCompilable("the observations are not single numbers")
+    # A wrapper may leave the dynamics alone and yet have to see every step, to film it say.
+    watching = {type(layer) for layer in layers(env)[:-1]} - MODEL_WRAPPERS
+    if watching:
+        names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
+        raise NotCompilable(f"{names} must see every step")
     monitor = monitor_of(env)
     seen_by_monitor = model if monitor is None else transition_model(monitor.env)
     assert seen_by_monitor is not None

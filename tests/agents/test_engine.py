@@ -6,10 +6,10 @@ from functools import partial
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import PassiveEnvChecker
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
-from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.utils import LinearSchedule
 
 from agents import load_algorithm
@@ -212,8 +212,7 @@ def both_shaped(env):
         partial(TerminationReward, reward=-7.7),
         both_shaped,
         FlattenToDiscrete,
-        # Outside Monitor too there may be wrappers that change nothing.
-        Monitor,
+        PassiveEnvChecker,
     ],
 )
 @pytest.mark.parametrize("env", ["slippery Warehouse", "Taxi"])
@@ -223,7 +222,7 @@ def test_wrappers_are_folded_in(env, wrapper):
     shaped, _ = assert_engines_agree(make_model, lambda model: model.learn(4000))
     plain = make("sarsa", env_id, 2, env_kwargs, learning_rate=0.3).learn(4000)
     same = np.array_equal(shaped.policy.q_table, plain.policy.q_table)
-    assert same == (wrapper in (FlattenToDiscrete, Monitor))
+    assert same == (wrapper in (FlattenToDiscrete, PassiveEnvChecker))
 
 
 @pytest.mark.parametrize("decay", ["linear", "exponential"])

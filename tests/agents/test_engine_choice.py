@@ -7,6 +7,7 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from agents import load_algorithm
@@ -60,6 +61,10 @@ UNSUITED = {
     "model is not known": lambda: lake(
         wrapper_class=partial(TerminationReward, reward=0.0, on_truncation=True)
     ),
+    "more than one Monitor": lambda: lake(wrapper_class=Monitor),
+    "RecordEpisodeStatistics must see every step": lambda: lake(
+        wrapper_class=gym.wrappers.RecordEpisodeStatistics
+    ),
     "the environment is shown on the screen": lambda: lake(env_kwargs={"render_mode": "human"}),
     "under DiscretizeObservation and Monitor alone": lambda: pole(gym.wrappers.Autoreset),
     "with its default reward alone": lambda: pole(sutton_barto_reward=True),
@@ -101,6 +106,30 @@ def test_what_must_be_asked_after_each_step(kwargs, callback, reason):
     model.learn(20, callback=callback)
     assert model.engine_in_use.startswith("interpreted: ")
     assert reason in model.engine_in_use
+
+
+def test_an_agent_that_learns_in_its_own_way():
+    class Unteachable(load_algorithm("qlearning")):
+        def _learn_from(self, transitions):
+            pass
+
+    model = Unteachable(env="FrozenLake-v1", seed=0).learn(100)
+    assert model.engine_in_use == "interpreted: Unteachable may act and learn in its own way"
+    assert int(model.policy.visit_counts.sum()) == 0
+
+
+@pytest.mark.parametrize("engine", ["interpreted", "compiled"])
+def test_a_training_of_no_steps(engine):
+    model = load_algorithm("sarsa")(env="FrozenLake-v1", engine=engine, seed=0).learn(0)
+    assert (model.num_timesteps, model._current_progress_remaining) == (0, 1.0)
+    model.learn(99)
+    states = []
+    for _ in range(2):
+        generator = model.env.envs[0].unwrapped.np_random
+        pending = model._last_obs.tolist(), model._next_actions.tolist()
+        states.append((pending, model.num_timesteps, generator.bit_generator.state))
+        model.learn(0, reset_num_timesteps=False)
+    assert states[0] == states[1]
 
 
 def test_the_engine_that_was_asked_for():
