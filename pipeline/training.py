@@ -167,6 +167,9 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     run, model, evaluation = training.run, training.model, training.evaluation
     save_model(model, run.model_path)
     save_normalization(model, run)
+    if evaluation.eval_freq > 0 and not evaluation.evaluations_timesteps:
+        # The run was shorter than the time to its first evaluation.
+        evaluation.evaluate_now()
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
     yardstick = None if final is None else final.yardstick

@@ -166,6 +166,9 @@ def test_a_budget_in_episodes(type_command, tmp_path):
     rows = sum(len(path.read_text().splitlines()) - 2 for path in run.glob("*.monitor.csv"))
     # The last step may end an episode in several environments.
     assert 70 <= rows <= 72
+    # Too short for an evaluation under way: there is one at the end, and a best model.
+    assert (run / "best_model.zip").exists()
+    assert len(np.load(run / "evaluations.npz")["timesteps"]) == 1
 
 
 def test_environment_arguments_reach_training_and_evaluation(type_command, tmp_path):
