@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from stable_baselines3 import A2C, DQN, PPO
+from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
@@ -116,7 +116,8 @@ def policy_matrix(
             tensor, _ = agent.policy.obs_to_tensor(observations)
             distribution: Any = agent.policy.get_distribution(tensor).distribution
         return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
-    if isinstance(agent, DQN) or hasattr(agent, "exploration_rate"):
+    if hasattr(agent, "exploration_rate"):
+        # DQN and its kin, QR-DQN too, which may not be installed and is no subclass of DQN.
         epsilon = float(agent.exploration_rate)
         greedy = policy_matrix(agent, observations)
         return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
