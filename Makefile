@@ -47,5 +47,5 @@ $(STAMP): pyproject.toml constraints.txt
 	  { echo "Yardstick needs Python 3.11 or newer; $(PYTHON) is not. Name one: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "Setting up .venv (once, some minutes: PyTorch is large)"
 	@test -x $(BIN)/pip || $(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev,contrib,tensorboard,video]'
+	@$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
 	@touch $@

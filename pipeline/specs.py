@@ -35,6 +35,7 @@ class TrainSpec:
         progress: draw a live bar wherever the output goes.
         gym_packages: modules to import for the environments that they register.
         unique_id: give the folder a name that no other machine's run can have.
+        pictures: draw the learning curve and the like into the run folder.
     """
 
     algo: str
@@ -57,6 +58,7 @@ class TrainSpec:
     progress: bool = False
     gym_packages: tuple[str, ...] = field(default=())
     unique_id: bool = False
+    pictures: bool = True
 
     def as_data(self) -> dict[str, Any]:
         """The spec as JSON."""

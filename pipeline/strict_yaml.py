@@ -8,12 +8,13 @@ has it, not a text.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
 from yaml.constructor import ConstructorError
-from yaml.nodes import MappingNode, Node, ScalarNode
+from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from pipeline.errors import UserError, shown
 
@@ -100,6 +101,38 @@ def read_yaml(path: Path) -> Any:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UserError(f"{path}: cannot be read: {reason}") from error
     return parse_yaml(content, str(path))
+
+
+def key_lines(path: Path) -> dict[tuple[str | int, ...], int]:
+    """The line on which each value of a file stands, for messages about what it means.
+
+    Args:
+        path: a file that `read_yaml` has read.
+
+    Returns:
+        Line numbers, counted from 1, by the keys and indexes that lead to the value.
+    """
+    loader = _StrictLoader(path.read_bytes())
+    try:
+        node = loader.get_single_node()
+        return {} if node is None else dict(_node_lines(node, ()))
+    finally:
+        loader.dispose()
+
+
+def _node_lines(
+    node: Node, keys: tuple[str | int, ...]
+) -> Iterator[tuple[tuple[str | int, ...], int]]:
+    yield keys, node.start_mark.line + 1
+    if isinstance(node, MappingNode):
+        for key, value in node.value:
+            inner = (*keys, str(key.value))
+            yield from _node_lines(value, inner)
+            # Where the key stands, and not where its value begins.
+            yield inner, key.start_mark.line + 1
+    elif isinstance(node, SequenceNode):
+        for index, value in enumerate(node.value):
+            yield from _node_lines(value, (*keys, index))
 
 
 def _load(content: str | bytes) -> Any:

@@ -59,7 +59,9 @@ class Outcome:
     engine: str | None
 
 
-def train(spec: TrainSpec, console: Console, args: dict[str, Any], command: str) -> Outcome:
+def train(
+    spec: TrainSpec, console: Console, args: dict[str, Any], command: str, run: Run | None = None
+) -> Outcome:
     """Train the agent and leave a run folder.
 
     Ctrl-C ends the training early; what has been learnt is saved all the same.
@@ -69,6 +71,7 @@ def train(spec: TrainSpec, console: Console, args: dict[str, Any], command: str)
         console: where to report to.
         args: the command's arguments, for the run folder.
         command: the command itself, likewise.
+        run: the run folder, made already; by default a new one in the spec's log folder.
 
     Raises:
         UserError: if the spec does not work out; no folder is left behind then.
@@ -76,7 +79,8 @@ def train(spec: TrainSpec, console: Console, args: dict[str, Any], command: str)
     th.set_num_threads(spec.num_threads)
     kwargs = algorithm_kwargs(spec)
     suffix = f"_{uuid4()}" if spec.unique_id else ""
-    run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
+    if run is None:
+        run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
     with ExitStack() as undo, _library_errors_in_one_line():
         undo.callback(run.discard)
         training = set_up(spec, run, kwargs, console, undo)
@@ -173,7 +177,8 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
     yardstick = None if final is None else final.yardstick
-    draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
+    if training.spec.pictures:
+        draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
     best = evaluation.best_mean_reward if evaluation.best_timesteps else None
     engine = getattr(model, "engine_in_use", None)
     run.update_info(

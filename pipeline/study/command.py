@@ -1,0 +1,87 @@
+"""What ``compare.py`` does: run what is missing, then judge what is there."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from pipeline.study.execution import RunFailure, available_cores, execute
+from pipeline.study.planning import PlannedRun, plan
+from pipeline.study.progress import StudyProgress
+from pipeline.study.results import StudyResults, read_results
+from pipeline.study.spec import StudySpec
+
+WIDTH_WITHOUT_TERMINAL = 120
+
+
+def run_study(study: StudySpec, args: argparse.Namespace, command: str) -> int:
+    """Do a study; the exit code is 1 where a run failed."""
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH_WITHOUT_TERMINAL)
+    root = Path(args.log_folder) / study.name
+    planned = plan(study, root)
+    console.print(f"[bold]{study.title}[/]", highlight=False)
+    failures = _do_missing(console, planned, root, args, command)
+    results = read_results(study, planned, root)
+    if len(results.summary):
+        _judge(console, results, args, command)
+    for failure in failures:
+        console.print(
+            f"failed: {failure.planned.agent} on {failure.planned.environment}, "
+            f"seed {failure.planned.seed}: {failure.reason}; see {failure.log}",
+            markup=False,
+            highlight=False,
+        )
+    return 1 if failures else 0
+
+
+def _do_missing(
+    console: Console,
+    planned: Sequence[PlannedRun],
+    root: Path,
+    args: argparse.Namespace,
+    command: str,
+) -> list[RunFailure]:
+    missing = [run for run in planned if not run.is_finished]
+    done = [run for run in planned if run.is_finished]
+    n_workers = args.jobs if args.jobs > 0 else available_cores()
+    console.print(
+        f"{len(planned)} runs, {len(done)} of them there already; {n_workers} at once, in {root}",
+        highlight=False,
+    )
+    with StudyProgress(console, planned, done) as progress:
+        return execute(missing, root, command, n_workers, progress.note)
+
+
+def _judge(console: Console, results: StudyResults, args: argparse.Namespace, command: str) -> None:
+    from pipeline.study.analysis import analyse
+    from pipeline.study.tables import (
+        episodes_table,
+        print_analysis,
+        print_episodes_table,
+        write_tables,
+    )
+
+    analysis = analyse(results)
+    print_analysis(console, analysis)
+    width = results.study.episodes_table
+    blocks = episodes_table(results, width) if width else None
+    if blocks is not None:
+        print_episodes_table(console, blocks, width)
+    files = write_tables(results)
+    if not args.no_report:
+        from pipeline.report import write_report
+        from pipeline.study.figures import write_figures
+
+        files += write_figures(analysis, blocks)
+        page = results.root / "report.html"
+        write_report(analysis, page, command)
+        files.append(page)
+    console.print()
+    console.print(f"files: {results.root}", highlight=False)
+    for path in files:
+        console.print(f"  {path.relative_to(results.root)}", highlight=False)

@@ -1,0 +1,90 @@
+"""Doing the runs of a study: those that are missing, over all cores, in the order of the plan."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, as_completed
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pipeline.files import write_text
+from pipeline.study.launchers import StoppedError, WorkFailedError, local_executor, supervise
+from pipeline.study.planning import PlannedRun
+from pipeline.study.spec import file_name
+from pipeline.study.work import do_run, draft_path, remove_dead_drafts, remove_draft
+
+
+@dataclass(frozen=True)
+class RunFailure:
+    """A run that came to nothing.
+
+    Attributes:
+        planned: the run.
+        reason: why, in one line.
+        log: the file with the details.
+    """
+
+    planned: PlannedRun
+    reason: str
+    log: Path
+
+
+Listener = Callable[[PlannedRun, RunFailure | None], None]
+
+
+def available_cores() -> int:
+    """The cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def execute(
+    runs: Sequence[PlannedRun], root: Path, command: str, n_workers: int, listener: Listener
+) -> list[RunFailure]:
+    """Do the runs, each in a process of its own.
+
+    Args:
+        runs: those to do.
+        root: the study's folder.
+        command: the command that asked for it, noted in every run folder.
+        n_workers: how many at once.
+        listener: told of every run that has ended, and how it failed if it did.
+
+    Returns:
+        Those that failed.
+    """
+    remove_dead_drafts(root)
+    if not runs:
+        return []
+    with local_executor(min(n_workers, len(runs))) as executor:
+        return execute_on(executor, runs, root, command, listener)
+
+
+def execute_on(
+    executor: Executor, runs: Sequence[PlannedRun], root: Path, command: str, listener: Listener
+) -> list[RunFailure]:
+    """As `execute`, wherever the workers of ``executor`` are, if they share the folder."""
+    failures = []
+    futures = {executor.submit(_supervised_run, run, root, command): run for run in runs}
+    for future in as_completed(futures):
+        failure = future.result()
+        listener(futures[future], failure)
+        if failure is not None:
+            failures.append(failure)
+    return failures
+
+
+def _supervised_run(planned: PlannedRun, root: Path, command: str) -> RunFailure | None:
+    log = root / "failures" / f"{file_name(planned.agent)}_{planned.path.name}.txt"
+    draft = draft_path(root, planned)
+    try:
+        supervise(do_run, planned, draft, command, clean_up=partial(remove_draft, draft))
+    except StoppedError:
+        return None
+    except WorkFailedError as error:
+        log.parent.mkdir(parents=True, exist_ok=True)
+        write_text(log, error.details)
+        return RunFailure(planned, str(error), log)
+    log.unlink(missing_ok=True)
+    return None

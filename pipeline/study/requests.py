@@ -1,0 +1,77 @@
+"""From the arguments of ``compare.py`` to a study."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from agents import ALGORITHMS
+from pipeline.errors import UserError, unknown
+from pipeline.hyperparams import override
+from pipeline.literals import parse_assignments
+from pipeline.study.reading import read_study
+from pipeline.study.spec import METRICS, AgentSpec, EnvironmentSpec, StudySpec, file_name
+
+
+def study_spec(args: argparse.Namespace) -> StudySpec:
+    """The study that the arguments mean, with what they change in it.
+
+    Raises:
+        UserError: if it is not clear what to compare, or on what.
+    """
+    study = _study_of_file(args) if args.study else _study_of_flags(args)
+    changes: dict[str, Any] = {
+        "n_seeds": args.seeds,
+        "metric": args.metric,
+        "margin": args.margin,
+        "episodes_table": args.episodes_table,
+        "name": args.name,
+    }
+    changes = {key: value for key, value in changes.items() if value is not None}
+    for key in ("n_seeds", "episodes_table"):
+        if changes.get(key, 1) < 1:
+            raise UserError(f"--{key.removeprefix('n_').replace('_', '-')} must be at least 1")
+    if args.metric is not None and args.metric not in METRICS:
+        raise unknown("--metric: unknown metric", args.metric, METRICS)
+    study = replace(_with_settings(study, args), **changes)
+    return study.quickened() if args.quick else study
+
+
+def _study_of_file(args: argparse.Namespace) -> StudySpec:
+    if args.env or args.algos:
+        raise UserError("give a study file, or --env and --algos, not both")
+    return read_study(Path(args.study))
+
+
+def _study_of_flags(args: argparse.Namespace) -> StudySpec:
+    if not (args.env and args.algos):
+        raise UserError("what to compare? give --env and --algos, or a study file")
+    for algo in args.algos:
+        if algo not in ALGORITHMS:
+            raise unknown("unknown agent", algo, ALGORITHMS)
+    for flag, names in (("--env", args.env), ("--algos", args.algos)):
+        if len(set(names)) < len(names):
+            raise UserError(f"{flag} names one of them twice")
+    agents, environments = ", ".join(args.algos), ", ".join(args.env)
+    return StudySpec(
+        name=file_name(f"{'-'.join(args.env)}_{'-'.join(args.algos)}"),
+        title=f"{agents} on {environments}",
+        agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
+        environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),
+    )
+
+
+def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
+    """The study with the settings of the command line in every agent."""
+    changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
+    if args.env_kwargs:
+        changes["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
+    for key in ("n_timesteps", "n_episodes"):
+        if getattr(args, key) is not None:
+            changes[key] = getattr(args, key)
+    agents = tuple(
+        replace(agent, settings=override(agent.settings, changes)) for agent in study.agents
+    )
+    return replace(study, agents=agents)

@@ -1,0 +1,123 @@
+"""What a study is asked to do, as one immutable value."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+Metric = Literal["final", "best", "area", "training", "last_episodes"]
+METRICS = get_args(Metric)
+
+METRIC_WORDS: dict[str, str] = {
+    "final": "return of the final policy",
+    "best": "return of the best policy during training",
+    "area": "mean return over the learning curve",
+    "training": "mean return of all training episodes",
+    "last_episodes": "mean return of the last 100 training episodes",
+}
+
+
+def file_name(label: str) -> str:
+    """The label as the name of a folder."""
+    return re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_"
+
+
+@dataclass(frozen=True)
+class AgentSpec:
+    """One of the agents that are compared.
+
+    Attributes:
+        label: what it is called in tables and figures.
+        algo: its name in the table of agents.
+        settings: hyperparameters, put over those of its file.
+        tuned: whether to begin with the entry of ``hyperparams/<algo>.yml``; otherwise with the
+            defaults of its constructor.
+        summary: a few words on it, for the report.
+    """
+
+    label: str
+    algo: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    tuned: bool = True
+    summary: str = ""
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """One of the environments that they are compared on.
+
+    Attributes:
+        label: what it is called in tables and figures.
+        env_id: its Gymnasium id.
+        settings: hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``,
+            put over those of the agents' files.
+    """
+
+    label: str
+    env_id: str
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class QuickSpec:
+    """How a study is cut down for a first look.
+
+    Attributes:
+        seeds: how many seeds then.
+        budget: share of each run's steps or episodes.
+    """
+
+    seeds: int = 2
+    budget: float = 0.1
+
+
+@dataclass(frozen=True)
+class StudySpec:
+    """A study: every agent on every environment with every seed.
+
+    Attributes:
+        name: the name of its folder.
+        title: one line on what it asks.
+        description: what it asks, and what is known beforehand.
+        agents: what is compared.
+        environments: where.
+        n_seeds: the seeds are 0 to ``n_seeds`` - 1.
+        eval_freq: environment steps between two evaluations, or None for twenty in a run.
+        eval_episodes: episodes of each evaluation that has to be sampled.
+        metric: what the verdicts are about.
+        margin: difference of the metric within which two agents count as equivalent; None for 2 %
+            of the way from the best blind policy to the optimum, where that is known.
+        threshold: return that counts as solved; None for 95 % of that way, or else what the
+            environment has registered.
+        episodes_table: episodes in each row of the table of training returns; 0 for no table.
+        quick: how it is cut down for a first look.
+        is_quick: whether it has been.
+        source: the file that it was read from, or None.
+    """
+
+    name: str
+    title: str
+    agents: tuple[AgentSpec, ...]
+    environments: tuple[EnvironmentSpec, ...]
+    n_seeds: int = 10
+    description: str = ""
+    eval_freq: int | None = None
+    eval_episodes: int = 20
+    metric: Metric = "final"
+    margin: float | None = None
+    threshold: float | None = None
+    episodes_table: int = 0
+    quick: QuickSpec = field(default_factory=QuickSpec)
+    is_quick: bool = False
+    source: Path | None = None
+
+    def quickened(self) -> StudySpec:
+        """The study with few seeds and a small budget, in a folder of its own."""
+        return replace(
+            self,
+            name=f"{self.name}-quick",
+            n_seeds=min(self.quick.seeds, self.n_seeds),
+            is_quick=True,
+        )

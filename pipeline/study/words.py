@@ -1,0 +1,161 @@
+"""What a study has shown, in sentences, and figures as a reader wants them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+from pipeline.statistics import Estimate, PairComparison
+from pipeline.study.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from pipeline.study.spec import METRIC_WORDS, StudySpec
+
+SIGNIFICANT = 4
+
+
+def number(value: float | None) -> str:
+    """A figure with four significant digits, or a dash where there is none."""
+    if value is None or math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "never" if value > 0 else "-∞"
+    if value == 0 or abs(value) >= 10 ** (SIGNIFICANT - 1):
+        return f"{value:,.0f}"
+    digits = SIGNIFICANT - 1 - math.floor(math.log10(abs(value)))
+    return f"{value:.{min(max(digits, 0), SIGNIFICANT)}f}".rstrip("0").rstrip(".")
+
+
+def interval(estimate: Estimate) -> str:
+    """A figure with its interval in brackets, where it has one."""
+    if math.isnan(estimate.low) or estimate.low == estimate.high:
+        return number(estimate.point)
+    return f"{number(estimate.point)} [{number(estimate.low)}, {number(estimate.high)}]"
+
+
+def enumeration(words: Sequence[str]) -> str:
+    """Words joined by commas, the last by "and"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)
+
+
+def sentences(analysis: StudyAnalysis) -> list[str]:
+    """What the study has shown, the most important first within each environment."""
+    result = []
+    for environment in analysis.environments:
+        result += environment_sentences(analysis.study, environment)
+    return result
+
+
+def environment_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
+    """What it has shown on one environment."""
+    return [
+        _on_the_best(study, environment),
+        *_on_the_pairs(study, environment),
+        *_on_the_speed(environment),
+        *_on_failures(environment),
+    ]
+
+
+def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    top = environment.agents[0]
+    value = top.metric.mean.point
+    best = [a for a in environment.agents if math.isclose(a.metric.mean.point, value)]
+    names = enumeration([agent.agent for agent in best])
+    verb = "has" if len(best) == 1 else "have"
+    seeds = f"{study.n_seeds} seed{'s' if study.n_seeds > 1 else ''}"
+    text = (
+        f"On {environment.environment}, over {seeds}, {names} {verb} the highest "
+        f"{METRIC_WORDS[study.metric]}: {interval(top.metric.mean)}"
+    )
+    if environment.optimum is None or study.metric not in ("final", "best"):
+        return f"{text}."
+    if math.isclose(value, environment.optimum, rel_tol=1e-6, abs_tol=1e-6):
+        return f"{text}, the optimum."
+    share = top.score.mean.point if top.score is not None else float("nan")
+    score = f", a score of {number(share)}" if study.metric == "final" else ""
+    return f"{text}{score}; the optimum is {number(environment.optimum)}."
+
+
+def _on_the_pairs(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
+    """The verdicts, those with the same first agent and the same verdict in one sentence."""
+    texts = []
+    place = f"On {environment.environment}"
+    for agent in environment.agents:
+        pairs = [pair for pair in environment.pairs if pair.first == agent.agent]
+        better = [p for p in pairs if p.verdict == "better"]
+        equal = [p for p in pairs if p.verdict == "equivalent"]
+        open_ = [p for p in pairs if p.verdict == "undecided"]
+        if better:
+            texts.append(f"{place}, {agent.agent} is better than {_by_how_much(better)}.")
+        if equal:
+            others = enumeration([p.second for p in equal])
+            within = f" within {number(environment.margin)}" if environment.margin > 0 else ""
+            texts.append(f"{place}, {agent.agent} and {others} are equivalent{within}.")
+        texts += [_on_undecided(study, place, pair) for pair in open_]
+        texts += [
+            f"{place}, {pair.first} is worse than {_by_how_much([pair.swapped()])}."
+            for pair in pairs
+            if pair.verdict == "worse"
+        ]
+    return texts
+
+
+def _by_how_much(pairs: Sequence[PairComparison]) -> str:
+    return enumeration([f"{pair.second} (by {interval(pair.difference)})" for pair in pairs])
+
+
+def _on_undecided(study: StudySpec, place: str, pair: PairComparison) -> str:
+    text = (
+        f"{place}, {pair.first} and {pair.second} are not distinguishable with {study.n_seeds} "
+        f"seeds (difference {interval(pair.difference)})"
+    )
+    if pair.seeds_needed is not None:
+        text += f"; {pair.seeds_needed:,} seeds would probably tell"
+    return f"{text}."
+
+
+def _on_the_speed(environment: EnvironmentAnalysis) -> list[str]:
+    """How many times the steps of the fastest the others take to the threshold."""
+    reached = [
+        (agent.steps_to_threshold.median.point, agent)
+        for agent in environment.agents
+        if agent.steps_to_threshold is not None
+    ]
+    arrived = sorted((steps, a.agent) for steps, a in reached if math.isfinite(steps))
+    if len(reached) < 2 or not arrived:
+        return []
+    goal = _goal(environment)
+    fastest_steps, fastest = arrived[0]
+    text = (
+        f"On {environment.environment}, {fastest} reaches {goal} after {fastest_steps:,.0f} steps"
+    )
+    slower = [
+        f"{agent} needs {number(steps / fastest_steps)} times the steps"
+        for steps, agent in arrived[1:]
+        if steps > 1.05 * fastest_steps
+    ]
+    never = [agent.agent for steps, agent in reached if math.isinf(steps)]
+    if never:
+        slower.append(f"{enumeration(never)} did not in half of the runs or more")
+    return [f"{'; '.join([text, *slower])} (medians over seeds)."]
+
+
+def _goal(environment: EnvironmentAnalysis) -> str:
+    threshold, optimum, blind = environment.threshold, environment.optimum, environment.best_blind
+    if threshold is not None and optimum is not None and blind is not None:
+        share = (threshold - blind) / (optimum - blind) if optimum > blind else float("nan")
+        if math.isclose(share, 0.95):
+            return "a score of 0.95"
+    return f"a return of {number(threshold)}"
+
+
+def _on_failures(environment: EnvironmentAnalysis) -> Iterable[str]:
+    for agent in environment.agents:
+        if agent.n_missing:
+            yield (
+                f"On {environment.environment}, {agent.n_missing} of "
+                f"{agent.n_missing + agent.n_runs} runs of {agent.agent} are missing."
+            )
+
+
+def verdict_word(pair: PairComparison, agent: AgentAnalysis) -> str:
+    """The verdict of a pair as seen from ``agent``."""
+    return (pair if pair.first == agent.agent else pair.swapped()).verdict
