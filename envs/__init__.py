@@ -6,6 +6,14 @@ from gymnasium.envs.registration import WrapperSpec
 from envs.grid_map import MAX_STATES
 
 PATH_MULTIPLE = 10
+BANDITS = {
+    "BernoulliBandit-v0": "envs.bandits.clicks:BernoulliBandit",
+    "GaussianBandit-v0": "envs.bandits.gaussian:GaussianBandit",
+    "LinearBandit-v0": "envs.bandits.linear:LinearBandit",
+    "ReplayBandit-v0": "envs.bandits.replay:ReplayBandit",
+    "SegmentBandit-v0": "envs.bandits.clicks:SegmentBandit",
+}
+DEFAULT_PULLS = 1000
 
 gym.register(
     id="Warehouse-v0",
@@ -31,3 +39,17 @@ gym.register(
         ),
     ),
 )
+for bandit_id, entry_point in BANDITS.items():
+    gym.register(
+        id=bandit_id,
+        entry_point=entry_point,
+        # Stands in for the bandit's own `pulls`, as the largest map's limit does above.
+        max_episode_steps=DEFAULT_PULLS,
+        additional_wrappers=(
+            WrapperSpec(
+                name="PullsLimit",
+                entry_point="envs.wrappers:limit_by_pulls",
+                kwargs={"instead_of": DEFAULT_PULLS},
+            ),
+        ),
+    )

@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 
 def check_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
@@ -56,3 +57,35 @@ def check_flag(name: str, value: object) -> bool:
     if isinstance(value, bool):
         return value
     raise ValueError(f"{name} must be true or false, not {value!r}")
+
+
+def check_numbers(
+    name: str, values: object, low: float = -math.inf, high: float = math.inf, fewest: int = 2
+) -> tuple[float, ...]:
+    """The values as floats, if they are a list of finite numbers as `check_number` takes them.
+
+    Raises:
+        ValueError: if they are not; the message names the place, counted from 0.
+    """
+    if isinstance(values, str) or not isinstance(values, Sequence | np.ndarray):
+        raise ValueError(f"{name} must be a list of numbers, not {values!r}")
+    if len(values) < fewest:
+        raise ValueError(f"{name} must hold {fewest} numbers or more, not {len(values)}")
+    return tuple(check_number(f"{name}[{i}]", value, low, high) for i, value in enumerate(values))
+
+
+def check_table(
+    name: str, rows: object, low: float = -math.inf, high: float = math.inf
+) -> NDArray[np.float64]:
+    """Rows of numbers, all as long as the first, as an array of shape (rows, columns).
+
+    Raises:
+        ValueError: if they are not; the message names the row.
+    """
+    if isinstance(rows, str) or not isinstance(rows, Sequence | np.ndarray) or not len(rows):
+        raise ValueError(f"{name} must be a list of rows of numbers, not {rows!r}")
+    checked = [check_numbers(f"{name}[{i}]", row, low, high, 1) for i, row in enumerate(rows)]
+    for i, row in enumerate(checked):
+        if len(row) != len(checked[0]):
+            raise ValueError(f"{name}[{i}] has length {len(row)}, {name}[0] has {len(checked[0])}")
+    return np.array(checked)

@@ -14,6 +14,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from envs.bandits.clicks import ClickBandit
 from envs.grid import GridWorld
 from envs.grid_map import GOAL
 from envs.wrappers import (
@@ -48,10 +49,10 @@ OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservat
 def transition_model(env: Env) -> TransitionModel | None:
     """The exact dynamics of an environment, with the rewards that its outermost wrapper gives.
 
-    Known are this project's grid worlds, and environments that hold ``P`` and
-    ``initial_state_distrib`` as Gymnasium's FrozenLake, CliffWalking and Taxi do, under wrappers
-    that leave the dynamics alone, `ScaleReward`, and `TerminationReward` where it gives its
-    reward at terminations only. A time limit is no part of the model: see `time_limit`.
+    Known are this project's grid worlds, its bandits with click rates, and environments that hold
+    ``P`` and ``initial_state_distrib`` as Gymnasium's FrozenLake, CliffWalking and Taxi do, under
+    wrappers that leave the dynamics alone, `ScaleReward`, and `TerminationReward` where it gives
+    its reward at terminations only. A time limit is no part of the model: see `time_limit`.
 
     Returns:
         The model, or None where it is not known.
@@ -113,6 +114,8 @@ def observations_of_states(env: Env) -> NDArray[Any] | None:
     base, wrappers = _layers(env)
     if isinstance(base, GridWorld):
         observations = base.observation_of(np.arange(base.dynamics.n_states))
+    elif isinstance(base, ClickBandit):
+        observations = np.arange(base.n_contexts)
     elif _holds_model(base) and isinstance(base.observation_space, gym.spaces.Discrete):
         observations = np.arange(base.observation_space.n)
     else:
@@ -144,7 +147,7 @@ def _folds(wrapper: Wrapper) -> bool:
 
 
 def _base_model(base: Env) -> TransitionModel | None:
-    if isinstance(base, GridWorld):
+    if isinstance(base, GridWorld | ClickBandit):
         return base.transition_model()
     if not _holds_model(base):
         return None

@@ -1,4 +1,4 @@
-"""Grid worlds as pictures and in a window; the only module that draws with pygame.
+"""Environments as pictures and in a window; the only module that draws with pygame.
 
 pygame is imported when the first picture is drawn.
 """
@@ -7,14 +7,14 @@ from __future__ import annotations
 
 from collections import defaultdict
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from envs import sprites
-from envs.scene import Scene
-from envs.sprites import Disc, Polygon, Ring, Shape
+from envs.scene import Chart, Scene
+from envs.sprites import Disc, Label, Polygon, Ring, Shape
 
 if TYPE_CHECKING:
     import pygame
@@ -171,40 +171,38 @@ class GridPainter:
         return self._sprites[shapes, size]
 
 
-class GridRenderer:
-    """Shows one map, as pixels or in a window.
+class Renderer:
+    """Shows scenes, as pixels or in a window.
 
     Copies, pickled ones included, share no window: they open their own when they need it.
 
     Args:
-        rows: the map.
         fps: pictures a second in a window.
         title: what the window is called.
     """
 
-    def __init__(self, rows: tuple[str, ...], fps: int, title: str) -> None:
-        self.rows = rows
+    def __init__(self, fps: int, title: str) -> None:
         self.fps = fps
         self.title = title
-        self._painter = GridPainter(rows)
         self._window: pygame.Surface | None = None
         self._clock: pygame.time.Clock | None = None
 
-    def __reduce__(self) -> tuple[type[GridRenderer], tuple[tuple[str, ...], int, str]]:
-        return GridRenderer, (self.rows, self.fps, self.title)
+    def paint(self, scene: Any) -> pygame.Surface:
+        """Draw a scene."""
+        raise NotImplementedError
 
-    def pixels(self, scene: Scene) -> NDArray[np.uint8]:
+    def pixels(self, scene: Any) -> NDArray[np.uint8]:
         """The picture of a scene, shape (height, width, 3)."""
         import pygame
 
-        picture = self._painter.paint(scene)
+        picture = self.paint(scene)
         return np.ascontiguousarray(pygame.surfarray.array3d(picture).swapaxes(0, 1))
 
-    def show(self, scene: Scene) -> None:
+    def show(self, scene: Any) -> None:
         """Draw a scene into the window, no sooner than the time for it has come."""
         import pygame
 
-        picture = self._painter.paint(scene)
+        picture = self.paint(scene)
         if self._window is None:
             pygame.display.init()
             pygame.display.set_caption(self.title)
@@ -225,6 +223,43 @@ class GridRenderer:
             self._window = None
 
 
+class GridRenderer(Renderer):
+    """Shows one map.
+
+    Args:
+        rows: the map.
+        fps: see `Renderer`.
+        title: see `Renderer`.
+    """
+
+    def __init__(self, rows: tuple[str, ...], fps: int, title: str) -> None:
+        super().__init__(fps, title)
+        self.rows = rows
+        self._painter = GridPainter(rows)
+
+    def __reduce__(self) -> tuple[type[GridRenderer], tuple[tuple[str, ...], int, str]]:
+        return GridRenderer, (self.rows, self.fps, self.title)
+
+    def paint(self, scene: Scene) -> pygame.Surface:
+        return self._painter.paint(scene)
+
+
+class ChartRenderer(Renderer):
+    """Shows charts."""
+
+    def __reduce__(self) -> tuple[type[ChartRenderer], tuple[int, str]]:
+        return ChartRenderer, (self.fps, self.title)
+
+    def paint(self, scene: Chart) -> pygame.Surface:
+        import pygame
+
+        picture = pygame.Surface(scene.size)
+        picture.fill(sprites.FLOOR)
+        for shape in scene.shapes:
+            _draw(picture, shape, 1)
+        return picture
+
+
 def _draw(surface: pygame.Surface, shape: Shape, scale: int) -> None:
     import pygame
 
@@ -240,6 +275,12 @@ def _draw(surface: pygame.Surface, shape: Shape, scale: int) -> None:
             width = max(1, round(shape.width * scale))
             radius = shape.radius * scale
             pygame.draw.circle(surface, shape.colour, point(shape.centre), radius, width)
+        case Label():
+            pygame.font.init()
+            font = pygame.font.Font(None, round(shape.height * scale))
+            text = font.render(shape.text, True, shape.colour)
+            x, y = point(shape.at)
+            surface.blit(text, (x - shape.align * text.get_width(), y - text.get_height() // 2))
         case _:
             area = pygame.Rect(point(shape.corner), point(shape.size))
             rounding = round(shape.rounding * scale)

@@ -1,14 +1,16 @@
-"""What a picture of a grid world shows."""
+"""What pictures show."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+
+from envs.sprites import Shape
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A moment of an episode; cells are numbered row by row.
+    """A moment of an episode in a grid world; cells are numbered row by row.
 
     Attributes:
         rows: the map.
@@ -27,3 +29,16 @@ class Scene:
     def place(self, cell: int) -> tuple[int, int]:
         """Row and column of a cell."""
         return divmod(cell, len(self.rows[0]))
+
+
+@dataclass(frozen=True)
+class Chart:
+    """A picture made of shapes whose coordinates are pixels.
+
+    Attributes:
+        size: width and height in pixels.
+        shapes: what it is made of, the hindmost first.
+    """
+
+    size: tuple[int, int]
+    shapes: Sequence[Shape]

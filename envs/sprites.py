@@ -63,7 +63,18 @@ class Polygon(NamedTuple):
     colour: Colour
 
 
-Shape = Disc | Ring | Box | Polygon
+class Label(NamedTuple):
+    """A line of text."""
+
+    text: str
+    at: Point
+    height: float
+    colour: Colour
+    # Which part of the text stands there: 0 its left end, 0.5 its middle, 1 its right end.
+    align: float = 0.5
+
+
+Shape = Disc | Ring | Box | Polygon | Label
 
 
 def _star(n_rays: int, outer: float, inner: float) -> tuple[Point, ...]:

@@ -7,7 +7,7 @@ evaluation needs: it asks a policy for every state at once.
 from envs.wrappers.discretize import DiscretizeObservation
 from envs.wrappers.encodings import FlattenToDiscrete, OneHotObservation
 from envs.wrappers.rewards import ScaleReward, TerminationReward
-from envs.wrappers.time_limit import limit_by_shortest_path
+from envs.wrappers.time_limit import limit_by_pulls, limit_by_shortest_path
 
 __all__ = [
     "DiscretizeObservation",
@@ -15,5 +15,6 @@ __all__ = [
     "OneHotObservation",
     "ScaleReward",
     "TerminationReward",
+    "limit_by_pulls",
     "limit_by_shortest_path",
 ]

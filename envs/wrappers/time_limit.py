@@ -1,4 +1,4 @@
-"""A time limit that grows with the map."""
+"""Time limits that depend on the environment's arguments."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from envs.bandits.base import Bandit
 from envs.grid import GridWorld
 
 
@@ -29,3 +30,21 @@ def limit_by_shortest_path(
     if env.spec.max_episode_steps != instead_of or not isinstance(grid_world, GridWorld):
         return env
     return gym.wrappers.TimeLimit(env.env, multiple * grid_world.shortest_path_length)
+
+
+def limit_by_pulls(env: gym.Env[Any, Any], instead_of: int) -> gym.Env[Any, Any]:
+    """Limit the episodes of a bandit to its `pulls`.
+
+    Args:
+        env: a bandit as `gymnasium.make` returns it.
+        instead_of: see `limit_by_shortest_path`.
+
+    Returns:
+        The environment under the limit.
+    """
+    bandit = env.unwrapped
+    if not isinstance(env, gym.wrappers.TimeLimit) or env.spec is None:
+        return env
+    if env.spec.max_episode_steps != instead_of or not isinstance(bandit, Bandit):
+        return env
+    return gym.wrappers.TimeLimit(env.env, bandit.pulls)

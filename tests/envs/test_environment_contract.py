@@ -4,6 +4,7 @@ import copy
 import pickle
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -19,7 +20,7 @@ import envs  # noqa: F401
 from envs.grid import GridWorld
 from mdp.model import TransitionModel
 
-VARIANTS: list[tuple[str, dict[str, Any]]] = [
+GRID_WORLDS: list[tuple[str, dict[str, Any]]] = [
     ("Warehouse-v0", {}),
     ("Warehouse-v0", {"slip": 0.3, "random_start": True}),
     ("Warehouse-v0", {"slip": 1, "shelf_reward": -1, "observation": "position"}),
@@ -30,6 +31,22 @@ VARIANTS: list[tuple[str, dict[str, Any]]] = [
     ("RandomWarehouse-v0", {}),
     ("RandomWarehouse-v0", {"size": 15, "map_seed": 3, "slip": 0.1, "random_start": True}),
 ]
+LOG = str(Path(__file__).parent / "uniform_log.csv")
+BANDITS: list[tuple[str, dict[str, Any]]] = [
+    ("BernoulliBandit-v0", {}),
+    ("BernoulliBandit-v0", {"probabilities": [0, 1], "pulls": 20}),
+    ("GaussianBandit-v0", {}),
+    ("GaussianBandit-v0", {"means": [0.0] * 10, "drift_std": 0.01}),
+    ("GaussianBandit-v0", {"n_arms": 3, "mean_loc": 4, "reward_std": 0, "pulls": 50}),
+    ("LinearBandit-v0", {}),
+    ("LinearBandit-v0", {"arm_parameters": [[1.0, 0.0], [0.0, 1.0]], "pulls": 30}),
+    ("SegmentBandit-v0", {}),
+    ("SegmentBandit-v0", {"batch_size": 7, "pulls": 25}),
+    ("ReplayBandit-v0", {"log": LOG}),
+]
+VARIANTS = GRID_WORLDS + BANDITS
+# The first variant of each id.
+SIMPLEST = dict(reversed(VARIANTS))
 HEADINGS = [
     "Description",
     "Action Space",
@@ -43,6 +60,8 @@ HEADINGS = [
 ]
 
 every_variant = pytest.mark.parametrize(("env_id", "kwargs"), VARIANTS)
+every_grid_world = pytest.mark.parametrize(("env_id", "kwargs"), GRID_WORLDS)
+every_id = pytest.mark.parametrize(("env_id", "kwargs"), sorted(SIMPLEST.items()))
 
 
 def grid_world(env_id: str, kwargs: dict[str, Any]) -> GridWorld:
@@ -53,7 +72,8 @@ def grid_world(env_id: str, kwargs: dict[str, Any]) -> GridWorld:
 
 def play(env: gym.Env[Any, Any], n_steps: int, seed: int) -> list[Any]:
     """What `reset` and `step` return while random actions are taken."""
-    actions = np.random.default_rng(seed).integers(4, size=n_steps)
+    n_actions = int(getattr(env.action_space, "n", 0))
+    actions = np.random.default_rng(seed).integers(n_actions, size=n_steps)
     history: list[Any] = []
     for action in actions:
         history.append(env.step(int(action)))
@@ -66,17 +86,15 @@ def equal(left: list[Any], right: list[Any]) -> bool:
     return env_checker.data_equivalence(tuple(left), tuple(right), exact=True)
 
 
-def registered() -> list[EnvSpec]:
-    return [spec for spec in gym.registry.values() if str(spec.entry_point).startswith("envs.")]
-
-
 def test_the_variants_cover_every_registered_id() -> None:
-    assert {spec.id for spec in registered()} == {env_id for env_id, _ in VARIANTS}
+    specs = gym.registry.values()
+    registered = {spec.id for spec in specs if str(spec.entry_point).startswith("envs.")}
+    assert registered == {env_id for env_id, _ in VARIANTS}
 
 
-@pytest.mark.parametrize("spec", registered(), ids=lambda spec: spec.id)
-def test_the_docstring_has_the_headings_of_toy_text(spec: EnvSpec) -> None:
-    documentation = type(gym.make(spec).unwrapped).__doc__ or ""
+@every_id
+def test_the_docstring_has_the_headings_of_toy_text(env_id: str, kwargs: dict[str, Any]) -> None:
+    documentation = type(gym.make(env_id, **kwargs).unwrapped).__doc__ or ""
     lines = [line.strip() for line in documentation.splitlines()]
     assert [line[3:] for line in lines if line.startswith("## ")] == HEADINGS
 
@@ -125,7 +143,7 @@ def test_the_spec_makes_the_same_environment_again(env_id: str, kwargs: dict[str
     assert equal(play(env, 200, seed=4), play(again, 200, seed=4))
 
 
-@every_variant
+@every_grid_world
 def test_simulating_the_model_with_the_same_generator_replays_every_step(
     env_id: str, kwargs: dict[str, Any]
 ) -> None:
@@ -161,7 +179,7 @@ class Fixed:
         return self.uniform
 
 
-@every_variant
+@every_grid_world
 def test_uniform_numbers_on_the_edge_choose_as_toy_text_does(
     env_id: str, kwargs: dict[str, Any]
 ) -> None:
@@ -181,7 +199,7 @@ def test_uniform_numbers_on_the_edge_choose_as_toy_text_does(
         assert env.s == listed[chosen][1]
 
 
-@every_variant
+@every_grid_world
 def test_p_and_the_arrays_say_the_same(env_id: str, kwargs: dict[str, Any]) -> None:
     env = grid_world(env_id, kwargs)
     arrays = env.transition_model()
@@ -194,7 +212,7 @@ def test_p_and_the_arrays_say_the_same(env_id: str, kwargs: dict[str, Any]) -> N
     assert arrays.n_outcomes == (3 if kwargs.get("slip") else 1)
 
 
-@every_variant
+@every_grid_world
 def test_every_move_of_every_state_is_in_the_model(env_id: str, kwargs: dict[str, Any]) -> None:
     env = grid_world(env_id, {**kwargs, "slip": 0})
     model = env.transition_model()
@@ -206,7 +224,7 @@ def test_every_move_of_every_state_is_in_the_model(env_id: str, kwargs: dict[str
             assert (env.s, reward, terminated) == tuple(a[state, action, 0] for a in listed)
 
 
-@every_variant
+@every_grid_world
 def test_starts_are_drawn_by_the_stated_probabilities(env_id: str, kwargs: dict[str, Any]) -> None:
     env = grid_world(env_id, kwargs)
     possible = np.flatnonzero(env.initial_state_distrib)
@@ -222,7 +240,7 @@ def test_starts_are_drawn_by_the_stated_probabilities(env_id: str, kwargs: dict[
     assert drawn == set(possible.tolist())
 
 
-@every_variant
+@every_grid_world
 def test_one_uniform_number_is_drawn_each_time(env_id: str, kwargs: dict[str, Any]) -> None:
     env = grid_world(env_id, kwargs)
     rng, _ = np_random(11)
@@ -244,7 +262,7 @@ def test_every_render_mode_renders_and_closes_twice(env_id: str, kwargs: dict[st
         env.close()
 
 
-@every_variant
+@every_grid_world
 def test_information_is_complete_and_fresh(env_id: str, kwargs: dict[str, Any]) -> None:
     env = gym.make(env_id, **kwargs)
     _, first = env.reset(seed=0)
@@ -257,7 +275,7 @@ def test_information_is_complete_and_fresh(env_id: str, kwargs: dict[str, Any]) 
     assert (first["bumped"], first["is_success"]) == (False, False)
 
 
-@pytest.mark.parametrize("env_id", [env_id for env_id, kwargs in VARIANTS if not kwargs])
+@pytest.mark.parametrize("env_id", [env_id for env_id, kwargs in GRID_WORLDS if not kwargs])
 @pytest.mark.parametrize("action", [-1, 4])
 def test_an_action_that_does_not_exist_is_refused(env_id: str, action: int) -> None:
     env = gym.make(env_id).unwrapped
@@ -281,7 +299,7 @@ def test_rendering_without_a_mode_warns() -> None:
         assert env.render() is None
 
 
-@pytest.mark.parametrize("env_id", [env_id for env_id, kwargs in VARIANTS if not kwargs])
+@pytest.mark.parametrize("env_id", [env_id for env_id, kwargs in GRID_WORLDS if not kwargs])
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
@@ -309,10 +327,11 @@ def test_an_unknown_render_mode_is_refused() -> None:
         WarehouseEnv(render_mode="ansy")
 
 
-@pytest.mark.parametrize("spec", registered(), ids=lambda spec: spec.id)
-def test_an_id_with_the_package_in_front_registers_it(spec: EnvSpec) -> None:
-    code = f"import gymnasium; print(gymnasium.make('envs:{spec.id}').unwrapped.spec.id)"
+@every_id
+def test_an_id_with_the_package_in_front_registers_it(env_id: str, kwargs: dict[str, Any]) -> None:
+    made = f"gymnasium.make('envs:{env_id}', **{kwargs!r})"
+    code = f"import gymnasium; print({made}.unwrapped.spec.id)"
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", code], capture_output=True, text=True, check=False
     )
-    assert (done.stdout.strip(), done.stderr) == (spec.id, "")
+    assert (done.stdout.strip(), done.stderr) == (env_id, "")

@@ -1,0 +1,21 @@
+"""Bandits: each step pulls one arm, and no pull changes what the next ones give."""
+
+from envs.bandits.base import Bandit
+from envs.bandits.clicks import BernoulliBandit, ClickBandit, SegmentBandit
+from envs.bandits.gaussian import GaussianBandit
+from envs.bandits.linear import LinearBandit
+from envs.bandits.logged_data import LoggedData, log_uniformly, read_log
+from envs.bandits.replay import ReplayBandit
+
+__all__ = [
+    "Bandit",
+    "BernoulliBandit",
+    "ClickBandit",
+    "GaussianBandit",
+    "LinearBandit",
+    "LoggedData",
+    "ReplayBandit",
+    "SegmentBandit",
+    "log_uniformly",
+    "read_log",
+]
