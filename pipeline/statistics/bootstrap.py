@@ -17,6 +17,9 @@ Counts = NDArray[np.int64]
 
 # The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would be unsteady.
 N_RESAMPLES = 10_000
+# Those over many seeds lie further in, and need fewer.
+ENOUGH_RESAMPLES = 1_000
+_MOST_DRAWS = 2_000_000
 
 
 def as_columns(scores: ArrayLike) -> Floats:
@@ -50,6 +53,11 @@ def resample_counts(n: int, n_resamples: int, rng: np.random.Generator) -> Count
     """How often each of ``n`` seeds occurs in each resample, shape (n_resamples, n)."""
     drawn = rng.integers(n, size=(n_resamples, n)) + n * np.arange(n_resamples)[:, None]
     return np.bincount(drawn.ravel(), minlength=n_resamples * n).reshape(n_resamples, n)
+
+
+def enough_resamples(n_resamples: int, n_seeds: int) -> int:
+    """So many resamples as are asked for, or fewer where there are many seeds to draw."""
+    return min(n_resamples, max(ENOUGH_RESAMPLES, _MOST_DRAWS // n_seeds))
 
 
 def interval_tail(strata: Sequence[Floats], confidence: float) -> float:

@@ -13,6 +13,7 @@ from pipeline.statistics.bootstrap import (
     N_RESAMPLES,
     Floats,
     as_columns,
+    enough_resamples,
     interval_tail,
     percentile_interval,
     resample_counts,
@@ -81,7 +82,7 @@ def summarise(
             are NaN: leave it out for every agent, or say what a failed run is worth.
         seed: of the resampling.
         confidence: of the intervals.
-        n_resamples: how many resamples they come from.
+        n_resamples: how many resamples they come from; fewer with hundreds of seeds.
 
     Raises:
         ValueError: for arguments out of range or of another shape.
@@ -142,6 +143,7 @@ def _resample(scores: ArrayLike, seed: int, confidence: float, n_resamples: int)
     if any(len(stratum) == 0 for stratum in strata):
         return _Resampled(values, np.empty((0, 0)), tail, n_missing)
     rng = np.random.default_rng(seed)
+    n_resamples = enough_resamples(n_resamples, max(map(len, strata)))
     counts = [
         np.vstack([np.ones(n, dtype=np.int64), resample_counts(n, n_resamples, rng)])
         * (len(values) / (len(strata) * n))

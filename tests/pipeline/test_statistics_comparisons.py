@@ -15,6 +15,7 @@ from pipeline.statistics import (
     seeds_for_equivalence,
     seeds_needed,
 )
+from pipeline.statistics.bootstrap import interval_tail
 
 NAN = np.nan
 QUICK = {"seed": 0, "n_resamples": 50}
@@ -72,6 +73,21 @@ def test_environments_are_averaged():
     found = probability_of_improvement(first, second, seed=0)
     assert found.point == 0.75
     assert (found.n, found.n_missing) == (5, 1)
+    turned = probability_of_improvement(second, first, seed=0)
+    assert (turned.point, turned.n, turned.n_missing) == (0.25, 5, 1)
+
+
+def test_seeds_of_each_environment_are_resampled_by_themselves():
+    first, second = np.random.default_rng(0).normal([[[0.3, 2]]], 1, size=(2, 6, 2))
+    rng = np.random.default_rng(3)
+    wins, influence = [], []
+    for x, y in zip(first.T, second.T, strict=True):
+        drawn = rng.integers(6, size=(500, 6))
+        wins.append([np.mean(x[rows][:, None] > y[rows]) for rows in drawn])
+        influence.append([np.mean(x[i] > y) + np.mean(x > y[i]) for i in range(6)])
+    tail = interval_tail([np.array(values) for values in influence], 0.95)
+    found = probability_of_improvement(first, second, seed=3, n_resamples=500)
+    assert interval(found) == pytest.approx(np.quantile(np.mean(wins, axis=0), [tail, 1 - tail]))
 
 
 def test_winning_always_leaves_a_doubt():
@@ -81,6 +97,18 @@ def test_winning_always_leaves_a_doubt():
     lost = probability_of_improvement([[1, 1]] * 5, [[2, 2]] * 5, seed=0)
     exact = stats.binomtest(0, 10).proportion_ci(method="exact")
     assert [lost.point, *interval(lost)] == pytest.approx([0, 0, exact.high])
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_with_many_seeds_the_normal_interval_agrees_with_resampling(n_envs, monkeypatch):
+    first, second = np.random.default_rng(0).normal([[[0.4]], [[0]]], 1, size=(2, 201, n_envs))
+    normal = probability_of_improvement(first, second, seed=0)
+    monkeypatch.setattr("pipeline.statistics.improvement.MANY_SEEDS", 201)
+    resampled = probability_of_improvement(first, second, seed=0)
+    assert normal.point == resampled.point
+    assert interval(normal) != interval(resampled)
+    # A tenth of its half width.
+    assert interval(normal) == pytest.approx(interval(resampled), abs=0.006 / n_envs**0.5)
 
 
 def test_infinite_scores_are_compared():
@@ -123,8 +151,8 @@ def test_the_paired_test_is_scipys():
 
 
 def test_seeds_that_one_agent_lacks_do_not_count():
-    found = paired_difference([1, NAN, 5, np.inf, 9], [0, 3, 2, 1, 4])
-    assert (found.point, found.n, found.n_missing) == (3, 3, 2)
+    found = paired_difference([1, NAN, 5, np.inf, 9, 7], [0, 3, 2, 1, 4, -np.inf])
+    assert (found.point, found.n, found.n_missing) == (3, 3, 3)
     assert paired_test([1, NAN, 5], [0, 3, 2]) == paired_test([1, 5], [0, 2])
 
 
@@ -202,6 +230,17 @@ def test_seeds_needed_are_those_of_the_tables(effect, n):
     assert seeds_needed(-3 * effect, 3) == n
 
 
+@given(st.floats(0.1, 5), st.sampled_from([0.05, 0.01, 0.05 / 15]))
+def test_one_seed_fewer_has_not_the_power(effect, level):
+    found = seeds_needed(effect, 1, level)
+
+    def power(n):
+        return stats.nct.sf(stats.t.isf(level / 2, n - 1), n - 1, effect * np.sqrt(n))
+
+    assert power(found) >= 0.8
+    assert found == 3 or power(found - 1) < 0.8
+
+
 def test_seeds_needed_give_the_power_in_simulation():
     n = seeds_needed(0.9, 1, level=0.05 / 6)
     rng = np.random.default_rng(0)
@@ -234,10 +273,12 @@ def test_more_seeds_than_anybody_runs():
     assert seeds_needed(0.03, 1) == pytest.approx(8723, abs=20)
     assert seeds_needed(1, 0) is None
     assert seeds_needed(1, NAN) is None
-    assert seeds_needed(1e9, 1) == 3
+    assert seeds_needed(1e12, 1) == 3
     assert seeds_for_equivalence(2, 1, margin=1) is None
     assert seeds_for_equivalence(0, 0, margin=1) is None
-    assert seeds_for_equivalence(0, 1e-9, margin=1) == 3
+    assert seeds_for_equivalence(0, 1e-12, margin=1) == 3
+    # Half a standard deviation inside of the margin: one of the two tests decides alone.
+    assert seeds_for_equivalence(1 - 0.5e-10, 1e-10, margin=1) == 27
 
 
 # --- verdicts ------------------------------------------------------------------------------------
@@ -273,7 +314,7 @@ def test_each_verdict():
 def test_a_comparison_holds_its_parts_together():
     rng = np.random.default_rng(2)
     first, second = rng.normal(size=8) + 1, rng.normal(size=8)
-    first[0] = NAN
+    first[0] = np.inf
     (one,) = compare_pairs({"x": first, "y": second}, 0.1, seed=5)
     assert one.difference == paired_difference(first, second)
     assert one.p_value == one.adjusted_p_value == paired_test(first, second)
@@ -310,13 +351,22 @@ def test_many_pairs_ask_for_more():
     among = compare_pairs({"x": 0.28 + NOISE, "y": np.zeros(6), **crowd}, **QUICK)[0]
     assert among.p_value == alone.p_value < 0.05 < among.adjusted_p_value
     assert among.verdict == "undecided"
+    spread = np.std(NOISE, ddof=1)
     # Fewer seeds than there are would be a contradiction.
-    assert among.seeds_needed > 6
+    assert among.seeds_needed == seeds_needed(0.28, spread, 0.05 / 10) > 6
+
+
+def test_a_p_value_above_the_level_decides_nothing():
+    (one,) = compare_pairs({"x": 0.2 + NOISE, "y": np.zeros(6)}, **QUICK)
+    assert 0.05 < one.p_value < 0.1
+    assert one.verdict == "undecided"
+    (bold,) = compare_pairs({"x": 0.2 + NOISE, "y": np.zeros(6)}, **QUICK, confidence=0.9)
+    assert bold.verdict == "better"
 
 
 def test_undecided_within_the_margin_asks_for_the_seeds_of_equivalence():
     first = 0.05 + 3 * NOISE
-    (one,) = compare_pairs({"x": first, "y": np.zeros(6)}, 0.4, **QUICK)
+    one = compare_pairs({"x": first, "y": np.zeros(6), "z": np.ones(6)}, 0.4, **QUICK)[0]
     assert one.verdict == "undecided"
     spread = np.std(first, ddof=1)
     assert one.seeds_needed == seeds_for_equivalence(np.mean(first), spread, 0.4) < 100

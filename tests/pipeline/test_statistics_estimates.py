@@ -17,7 +17,7 @@ from pipeline.statistics import (
     performance_profile,
     summarise,
 )
-from pipeline.statistics.bootstrap import interval_tail
+from pipeline.statistics.bootstrap import enough_resamples, interval_tail
 
 STATISTICS = ("mean", "median", "iqm")
 PLAIN = {"mean": np.mean, "median": np.median, "iqm": lambda x: stats.trim_mean(x, 0.25)}
@@ -107,6 +107,17 @@ def test_the_interval_of_a_mean_is_about_the_t_interval():
     mean = estimate(scores, "mean", seed=0, n_resamples=100_000)
     half = stats.t.ppf(0.975, 11) * stats.sem(scores)
     assert [mean.low, mean.high] == pytest.approx([-half, half], rel=0.05)
+
+
+def test_many_seeds_need_fewer_resamples():
+    found = [enough_resamples(10_000, n) for n in (5, 200, 500, 2000, 100_000)]
+    assert found == [10_000, 10_000, 4000, 1000, 1000]
+    assert enough_resamples(50, 2000) == 50
+    many = np.random.default_rng(0).normal(size=2000)
+    mean = estimate(many, "mean", seed=0)
+    assert mean == estimate(many, "mean", seed=0, n_resamples=1000)
+    half = stats.norm.isf(0.025) * stats.sem(many)
+    assert (mean.high - mean.low) / 2 == pytest.approx(half, rel=0.1)
 
 
 def test_equal_scores_have_the_point_as_interval():
