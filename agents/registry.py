@@ -1,4 +1,4 @@
-"""The table of agents: a name, where the class lives, and the spaces it can work with."""
+"""The table of agents: a name, where the class lives, and what it can work with."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import importlib.util
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 from gymnasium import spaces
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 DISCRETE = ("Discrete",)
+LINEAR_INPUTS = ("Box", "Discrete")
 NETWORK_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict")
 POLICY_GRADIENT_OUTPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
@@ -27,6 +29,7 @@ class AlgorithmEntry:
         observations: names of the Gymnasium spaces that it can observe.
         actions: names of the Gymnasium spaces that it can act in.
         observation_shape: the one observation shape that it understands, or None for any.
+        for_bandits: whether it looks no further than the next reward.
         package: the import name of an optional package that it needs, or None.
         extra: the extra of this distribution that installs that package.
     """
@@ -36,6 +39,7 @@ class AlgorithmEntry:
     observations: tuple[str, ...]
     actions: tuple[str, ...]
     observation_shape: tuple[int, ...] | None = None
+    for_bandits: bool = False
     package: str | None = None
     extra: str | None = None
 
@@ -60,6 +64,19 @@ class AlgorithmEntry:
             return f"it needs observations of shape {shape}, not {observation_space.shape}"
         return ""
 
+    def env_misfit(self, env: gym.Env[Any, Any]) -> str:
+        """Say why the agent cannot work with the environment; empty where it can."""
+        if self.for_bandits and not is_bandit(env):
+            return "it is for bandits, where a pull changes nothing but its own reward"
+        return self.misfit(env.observation_space, env.action_space)
+
+
+def is_bandit(env: gym.Env[Any, Any]) -> bool:
+    """Whether the environment is one of `envs.bandits`."""
+    from envs.bandits import Bandit
+
+    return isinstance(env.unwrapped, Bandit)
+
 
 def _tabular(name: str, summary: str) -> AlgorithmEntry:
     return AlgorithmEntry(f"agents.tabular.algorithms:{name}", summary, DISCRETE, DISCRETE)
@@ -67,6 +84,29 @@ def _tabular(name: str, summary: str) -> AlgorithmEntry:
 
 def _deep(entry_point: str, summary: str, actions: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
     return AlgorithmEntry(entry_point, summary, NETWORK_INPUTS, actions)
+
+
+def _bandit(entry_point: str, summary: str) -> AlgorithmEntry:
+    entry_point = f"agents.bandits.{entry_point}"
+    return AlgorithmEntry(entry_point, summary, DISCRETE, DISCRETE, for_bandits=True)
+
+
+def _linear(name: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"agents.bandits.linear:{name}", summary, LINEAR_INPUTS, DISCRETE, for_bandits=True
+    )
+
+
+def _mabwiser(name: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"agents.bandits.mabwiser_agents:{name}",
+        f"{summary} (MABWiser)",
+        observations,
+        DISCRETE,
+        for_bandits=True,
+        package="mabwiser",
+        extra="bandits",
+    )
 
 
 ALGORITHMS: dict[str, AlgorithmEntry] = {
@@ -119,6 +159,20 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         DISCRETE,
         observation_shape=(4,),
     ),
+    "epsilon_greedy": _bandit("values:EpsilonGreedy", "bandit: epsilon-greedy"),
+    "boltzmann": _bandit("values:Boltzmann", "bandit: softmax of the estimates"),
+    "ucb": _bandit("bounds:UCB", "bandit: upper confidence bounds"),
+    "kl_ucb": _bandit("bounds:KLUCB", "bandit: upper bounds by the divergence of coins"),
+    "gradient_bandit": _bandit("preferences:GradientBandit", "bandit: gradient on preferences"),
+    "exp3": _bandit("preferences:Exp3", "bandit: exponential weights against an adversary"),
+    "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),
+    "linucb": _linear("LinUCB", "contextual bandit: linear upper confidence bounds"),
+    "lin_thompson": _linear("LinThompson", "contextual bandit: linear Thompson sampling"),
+    "lin_epsilon_greedy": _linear("LinEpsilonGreedy", "contextual bandit: linear, epsilon-greedy"),
+    "mabwiser_epsilon_greedy": _mabwiser("MABWiserEpsilonGreedy", "bandit: epsilon-greedy"),
+    "mabwiser_ucb1": _mabwiser("MABWiserUCB1", "bandit: UCB1"),
+    "mabwiser_thompson": _mabwiser("MABWiserThompson", "bandit: Thompson sampling"),
+    "mabwiser_linucb": _mabwiser("MABWiserLinUCB", "contextual bandit: LinUCB", LINEAR_INPUTS),
 }
 
 
@@ -135,11 +189,17 @@ def load_algorithm(name: str) -> type[BaseAlgorithm]:
 
 
 def fitting_algorithms(
-    observation_space: spaces.Space[Any], action_space: spaces.Space[Any]
+    observation_space: spaces.Space[Any], action_space: spaces.Space[Any], bandit: bool = False
 ) -> list[str]:
-    """Names of the agents that can work with these spaces, in the order of the table."""
+    """Names of the agents that can work with these spaces, in the order of the table.
+
+    Args:
+        observation_space: what is observed.
+        action_space: what can be done.
+        bandit: whether the environment is a bandit.
+    """
     return [
         name
         for name, entry in ALGORITHMS.items()
-        if not entry.misfit(observation_space, action_space)
+        if bandit >= entry.for_bandits and not entry.misfit(observation_space, action_space)
     ]

@@ -8,6 +8,7 @@ from secrets import randbelow
 from typing import Any
 
 from agents import ALGORITHMS, fitting_algorithms
+from agents.registry import is_bandit
 from pipeline import hyperparams
 from pipeline.environments import check_env_id, import_gym_packages, make_single_env
 from pipeline.errors import UserError, unknown
@@ -38,8 +39,8 @@ def check_fit(spec: TrainSpec) -> None:
         UserError: if it cannot; it names the agents that could.
     """
     env = make_single_env(spec, training=True)
-    misfit = ALGORITHMS[spec.algo].misfit(env.observation_space, env.action_space)
-    fitting = fitting_algorithms(env.observation_space, env.action_space)
+    misfit = ALGORITHMS[spec.algo].env_misfit(env)
+    fitting = fitting_algorithms(env.observation_space, env.action_space, is_bandit(env))
     env.close()
     if misfit:
         others = f"fitting agents: {', '.join(fitting)}" if fitting else "no agent here fits"

@@ -255,6 +255,8 @@ class CompiledEngine:
             base.s = int(record["state"])
             if hasattr(base, "lastaction"):
                 base.lastaction = None if record["elapsed"] == 0 else int(record["action"])
+            if hasattr(base, "pulls_done"):
+                base.pulls_done = int(record["elapsed"])
         for layer in layers(env):
             if isinstance(layer, TimeLimit):
                 vars(layer)["_elapsed_steps"] = int(record["elapsed"])

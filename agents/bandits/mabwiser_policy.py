@@ -1,0 +1,127 @@
+"""MABWiser's bandits as policies: the library's traps walked round in one place.
+
+MABWiser 2.7.4 keeps its state in Python objects and refuses to predict before it has seen a reward.
+Here the state travels as one tensor, since a model file holds no pickle, and random numbers come
+from a generator that is handed in.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import Schedule
+
+from agents.bandits.policy import features
+
+Floats = NDArray[np.float64]
+
+
+class MABWiserPolicy(BasePolicy):
+    """Holds a `mabwiser.mab.MAB` over arms numbered from 0.
+
+    Args:
+        observation_space: what arms are chosen in.
+        action_space: `Discrete`: the arms.
+        lr_schedule: not used; here because every policy is handed one.
+        learning_policy: one of `mabwiser.mab.LearningPolicy`.
+        statistics: names of the implementation's attributes that hold a number for each arm: sum
+            and count of the rewards, or what stands for them, first.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        learning_policy: Any = None,
+        statistics: tuple[str, ...] = (),
+        **kwargs: Any,
+    ) -> None:
+        from mabwiser.mab import MAB
+
+        super().__init__(observation_space, action_space, **kwargs)
+        self.statistics = statistics
+        self.mab: Any = MAB(list(range(int(action_space.n))), learning_policy)
+        self.fitted = False
+
+    @property
+    def is_contextual(self) -> bool:
+        """Whether it looks at the context."""
+        return bool(self.mab.is_contextual)
+
+    @property
+    def parts(self) -> Floats:
+        """A row of numbers for each arm, shape (arms, ...); what `_extra_state` holds."""
+        inside = self.mab._imp
+        if self.is_contextual:
+            models = [inside.arm_to_model[arm] for arm in self.mab.arms]
+            rows = [[m.A.ravel(), m.A_inv.ravel(), m.Xty, m.beta] for m in models]
+            return np.stack([np.concatenate(row) for row in rows])
+        columns = [getattr(inside, name) for name in self.statistics]
+        return np.array([[column[arm] for column in columns] for arm in self.mab.arms], dtype=float)
+
+    def choose(self, context: Floats, rng: np.random.Generator) -> int:
+        """The library's choice of an arm in ``context``, of shape (features,)."""
+        self.mab._rng.rng = rng
+        given = (context[None],) if self.is_contextual else ()
+        return int(self.mab.predict(*given))
+
+    def learn(self, arm: int, reward: float, context: Floats) -> None:
+        """Hand the library one reward."""
+        given = (context[None],) if self.is_contextual else ()
+        learn = self.mab.partial_fit if self.fitted else self.mab.fit
+        learn([arm], [reward], *given)
+        self.fitted = True
+
+    def judged(self, contexts: Floats) -> Floats:
+        """What the arms are taken to be worth, shape (n, arms)."""
+        scores = np.zeros((len(contexts), len(self.mab.arms)))
+        if not self.fitted:
+            return scores
+        if self.is_contextual:
+            models = [self.mab._imp.arm_to_model[arm] for arm in self.mab.arms]
+            return np.stack([contexts @ model.beta for model in models], axis=1)
+        won, seen = self.parts[:, 0], self.parts[:, 1]
+        if "arm_to_fail_count" in self.statistics:
+            seen = won + seen
+        scores[:] = np.divide(won, seen, out=np.full(len(won), -np.inf), where=seen > 0)
+        return scores
+
+    def _predict(
+        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
+    ) -> th.Tensor:
+        """The first of the best arms; shapes (n,) or (n, d) to (n,)."""
+        assert isinstance(observation, th.Tensor)
+        contexts = features(self.observation_space, observation.numpy())
+        return th.from_numpy(self.judged(contexts).argmax(axis=1))
+
+    def get_extra_state(self) -> th.Tensor:
+        """The state as a tensor, empty before the first reward."""
+        return th.from_numpy(self.parts) if self.fitted else th.zeros(0, dtype=th.float64)
+
+    def set_extra_state(self, state: th.Tensor) -> None:
+        """Take over the state of another policy of the kind."""
+        if len(state) == 0:
+            return
+        width = len(features(self.observation_space, self._any_observation())[0])
+        self.learn(0, 0.0, np.zeros(width))
+        inside, rows = self.mab._imp, state.numpy()
+        if self.is_contextual:
+            for arm, row in enumerate(rows):
+                model = inside.arm_to_model[arm]
+                a, a_inv, model.Xty, model.beta = np.split(
+                    row.copy(), np.cumsum([width**2, width**2, width])
+                )
+                model.A, model.A_inv = a.reshape(width, width), a_inv.reshape(width, width)
+            return
+        for name, column in zip(self.statistics, rows.T.tolist(), strict=True):
+            getattr(inside, name).update(enumerate(column))
+        inside.total_count = sum(column[1] for column in rows.tolist())
+
+    def _any_observation(self) -> NDArray[Any]:
+        return np.zeros((1, *(self.observation_space.shape or ())))

@@ -1,0 +1,320 @@
+"""The rules of the bandit agents, on updates that were worked by hand and on closed forms."""
+
+import math
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents import load_algorithm
+from agents.bandits.base import Pull
+from agents.bandits.choosing import kl_ucb_index, ucb_index
+from agents.bandits.kl import bernoulli_kl, kl_upper_bound
+
+ARMS = 3
+
+
+class Arms(gym.Env):
+    """Spaces alone; nothing here is ever pulled."""
+
+    def __init__(self, observation_space=None):
+        self.observation_space = observation_space or spaces.Discrete(1)
+        self.action_space = spaces.Discrete(ARMS)
+
+
+def agent(name, observation_space=None, **kwargs):
+    return load_algorithm(name)(env=Arms(observation_space), seed=0, **kwargs)
+
+
+def taught(name, pulls, **kwargs):
+    """An agent that has learnt from pairs of arm and reward."""
+    model = agent(name, **kwargs)
+    for arm, reward in pulls:
+        model._learn(Pull(0, arm, reward, 1.0))
+    return model
+
+
+def scores(model):
+    return model.policy.scores.numpy()[0]
+
+
+def choices(model, n=2000):
+    """Arms that the exploring agent chooses, what it knows staying as it is."""
+    return model._choose(np.zeros(n, dtype=np.int64), np.random.default_rng(0))[0]
+
+
+def shares(model, n=20_000):
+    return np.bincount(choices(model, n), minlength=ARMS) / n
+
+
+def test_sample_averages():
+    model = taught("epsilon_greedy", [(0, 1.0), (0, 4.0), (2, -2.0), (0, 1.0)])
+    assert scores(model).tolist() == [2.0, 0.0, -2.0]
+    assert model.policy.counts.tolist() == [[3, 0, 1]]
+    assert model.policy.sums.tolist() == [[6.0, 0.0, -2.0]]
+
+
+def test_constant_step_from_an_optimistic_start():
+    model = taught("epsilon_greedy", [(1, 1.0), (1, 3.0)], learning_rate=0.5, initial_q=5.0)
+    assert scores(model).tolist() == [5.0, 3.0, 5.0]
+
+
+def test_epsilon_greedy_explores_by_epsilon():
+    model = taught("epsilon_greedy", [(1, 1.0)], exploration_initial_eps=0.3)
+    assert shares(model) == pytest.approx([0.1, 0.8, 0.1], abs=0.01)
+    assert set(choices(taught("epsilon_greedy", [(1, 1.0)], exploration_initial_eps=0.0))) == {1}
+
+
+def test_boltzmann_draws_by_the_softmax_of_the_estimates():
+    model = taught("boltzmann", [(0, 0.1), (1, 0.3), (2, 0.2)], temperature=0.1)
+    expected = np.exp([1.0, 3.0, 2.0]) / np.exp([1.0, 3.0, 2.0]).sum()
+    assert shares(model) == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "indices"),
+    [
+        # After 6 pulls: UCB1 takes 2 ln 6, Sutton and Barto the logarithm of the seventh.
+        ({}, [0.5 + math.sqrt(2 * math.log(6) / 4), 1 + math.sqrt(2 * math.log(6))]),
+        ({"c": 0.1}, [0.5 + 0.1 * math.sqrt(2 * math.log(6) / 4)]),
+        (
+            {"variant": "sutton_barto"},
+            [0.5 + 2 * math.sqrt(math.log(7) / 4), 1 + 2 * math.sqrt(math.log(7))],
+        ),
+        ({"variant": "sutton_barto", "c": 1.0}, [0.5 + math.sqrt(math.log(7) / 4)]),
+    ],
+)
+def test_ucb_index(kwargs, indices):
+    parameters = agent("ucb", **kwargs)._parameters()
+    values = [ucb_index(0.5, 4, 6, parameters), ucb_index(1.0, 1, 6, parameters)]
+    assert values[: len(indices)] == pytest.approx(indices, rel=1e-15)
+
+
+def test_ucb_prefers_what_is_uncertain():
+    # Means .5, 1 and .4; bounds .5 + 1.19, 1 + .69 sqrt(...)
+    pulls = [(0, 1.0), (0, 0.0)] + [(1, 1.0)] * 20 + [(2, 1.0)] * 4 + [(2, 0.0)] * 6
+    model = taught("ucb", pulls, tie_breaking="first")
+    bonus = [math.sqrt(2 * math.log(32) / n) for n in (2, 20, 10)]
+    assert np.argmax(np.array([0.5, 1.0, 0.4]) + bonus) == 0
+    assert set(choices(model, 5)) == {0}
+    assert model.predict(0, deterministic=True)[0] == 1
+
+
+@pytest.mark.parametrize("name", ["ucb", "kl_ucb"])
+def test_arms_not_tried_come_first(name):
+    model = taught(name, [(1, 1.0)], tie_breaking="first")
+    assert set(choices(model, 5)) == {0}
+    assert set(choices(taught(name, [(1, 1.0)]))) == {0, 2}
+    assert set(choices(taught(name, [(0, 1.0), (2, 1.0)], tie_breaking="first"), 5)) == {1}
+    # What is recommended has been seen to be good, however bad that is.
+    assert model.predict(0, deterministic=True)[0] == 1
+
+
+@given(
+    st.floats(0.0, 0.999),
+    st.integers(1, 10_000),
+    st.integers(2, 10**6),
+)
+def test_kl_ucb_index_solves_its_equation(mean, count, pulls):
+    index = kl_ucb_index(mean, count, pulls, (0.0, 0.0, 0.0))
+    assert mean <= index < 1.0
+    budget = math.log(pulls) / count
+    if index < 1 - 1e-9:
+        assert bernoulli_kl(mean, index) == pytest.approx(budget, rel=1e-5, abs=1e-9)
+    else:
+        # So near to 1, the next number on is already too high, or is 1.
+        assert bernoulli_kl(mean, 1 - 1e-9) <= budget
+
+
+def test_kl_ucb_where_it_has_a_closed_form():
+    for budget in (1e-6, 0.1, 1.0, 5.0):
+        assert kl_upper_bound(0.0, budget) == pytest.approx(1 - math.exp(-budget), rel=1e-12)
+        assert kl_upper_bound(1.0, budget) == 1.0
+    assert kl_upper_bound(0.3, 0.0) == 0.3
+    with_c = kl_ucb_index(0.3, 10, 100, (3.0, 0.0, 0.0))
+    budget = (math.log(100) + 3 * math.log(math.log(100))) / 10
+    assert with_c == pytest.approx(kl_upper_bound(0.3, budget), rel=1e-15)
+
+
+def test_gradient_step_by_hand():
+    """The first reward is its own baseline and moves nothing; the second is 2 above it."""
+    model = taught("gradient_bandit", [(0, 1.0)], learning_rate=0.3)
+    assert scores(model).tolist() == [0.0, 0.0, 0.0]
+    model._learn(Pull(0, 1, 3.0, 1.0))
+    assert scores(model) == pytest.approx([-0.2, 0.4, -0.2], rel=1e-15)
+    # The baseline is now the mean of 1 and 3, before the reward 5 is counted in.
+    before = th.tensor(scores(model))
+    model._learn(Pull(0, 2, 5.0, 1.0))
+    step = (5.0 - 2.0) * (th.tensor([0.0, 0.0, 1.0]) - th.softmax(before, 0))
+    assert scores(model) == pytest.approx((before + 0.3 * step).numpy(), rel=1e-12)
+
+
+@pytest.mark.parametrize("baseline", [False, True])
+def test_gradient_step_is_that_of_automatic_differentiation(baseline):
+    rng = np.random.default_rng(1)
+    model = agent("gradient_bandit", learning_rate=0.1, baseline=baseline)
+    seen = []
+    for arm, reward in zip(rng.integers(0, ARMS, 50), rng.normal(2, 1, 50), strict=True):
+        preferences = th.tensor(scores(model), requires_grad=True)
+        th.log_softmax(preferences, 0)[int(arm)].backward()
+        reference = (np.mean(seen) if seen else reward) if baseline else 0.0
+        expected = scores(model) + 0.1 * (reward - reference) * preferences.grad.numpy()
+        model._learn(Pull(0, int(arm), float(reward), 1.0))
+        seen.append(reward)
+        assert scores(model) == pytest.approx(expected, rel=1e-9, abs=1e-12)
+
+
+def test_exp3_weighs_a_reward_by_how_unlikely_it_was():
+    model = agent("exp3", mixing=0.3)
+    assert model._choose(np.zeros(1, np.int64), model.rng)[1] == pytest.approx([1 / 3], rel=1e-15)
+    model._learn(Pull(0, 1, 0.5, 0.25))
+    # exp(gamma / K * reward / probability), as a logarithm.
+    assert scores(model).tolist() == pytest.approx([0.0, 0.3 / 3 * 0.5 / 0.25, 0.0], rel=1e-15)
+    weights = np.exp(scores(model))
+    expected = 0.7 * weights / weights.sum() + 0.1
+    assert shares(model) == pytest.approx(expected, abs=0.01)
+    arms, probabilities = model._choose(np.zeros(20, np.int64), model.rng)
+    assert probabilities == pytest.approx(expected[arms], rel=1e-12)
+
+
+def test_thompson_beta_posterior():
+    model = taught("thompson", [(0, 1.0), (0, 1.0), (0, 0.0), (2, 0.0)])
+    assert model.posterior(model.policy.tables)[0].tolist() == [[3, 2], [1, 1], [1, 2]]
+    assert scores(model).tolist() == pytest.approx([3 / 5, 1 / 2, 1 / 3], rel=1e-15)
+    # How often each of three Beta draws is the highest, from a sample of NumPy's.
+    draws = np.random.default_rng(5).beta([3, 1, 1], [2, 1, 2], size=(200_000, 3))
+    expected = np.bincount(draws.argmax(axis=1)) / 200_000
+    assert shares(model) == pytest.approx(expected, abs=0.015)
+
+
+def test_thompson_gaussian_posterior():
+    model = taught(
+        "thompson",
+        [(0, 3.0), (0, 5.0)],
+        likelihood="gaussian",
+        prior_mean=1.0,
+        prior_std=2.0,
+        reward_std=0.5,
+    )
+    precision = 1 / 4 + 2 / 0.25
+    mean = (1 / 4 * 1.0 + (3.0 + 5.0) / 0.25) / precision
+    assert model.posterior(model.policy.tables)[0, 0] == pytest.approx([mean, precision**-0.5])
+    assert model.posterior(model.policy.tables)[0, 1].tolist() == [1.0, 2.0]
+    assert scores(model) == pytest.approx([mean, 1.0, 1.0], rel=1e-15)
+
+
+def test_contexts_are_learnt_apart_or_together():
+    for kwargs, expected in (({}, [[1, 0, 0], [0, 2, 0]]), ({"ignore_context": True}, [[1, 2, 0]])):
+        model = agent("ucb", spaces.Discrete(2), **kwargs)
+        for obs, arm in ((0, 0), (1, 1), (1, 1)):
+            row = int(model._contexts(np.array([obs]))[0])
+            model._learn(Pull(row, arm, 1.0, 1.0))
+        assert model.policy.counts.tolist() == expected
+
+
+CONTEXT_SPACE = spaces.Box(-1, 1, (4,))
+
+
+def ridge_regressions(pulls, ridge):
+    """What each arm's regression comes to, by NumPy's solver."""
+    matrices = [ridge * np.eye(4) for _ in range(ARMS)]
+    moments = np.zeros((ARMS, 4))
+    for arm, context, reward in pulls:
+        matrices[arm] += np.outer(context, context)
+        moments[arm] += reward * context
+    return matrices, moments
+
+
+def linear_pulls(n=200):
+    rng = np.random.default_rng(2)
+    arms = rng.integers(0, ARMS - 1, n)  # the last arm is never pulled
+    return list(zip(arms.tolist(), rng.uniform(-1, 1, (n, 4)), rng.normal(size=n), strict=True))
+
+
+@pytest.mark.parametrize("ridge", [1.0, 0.01])
+def test_linear_models_are_ridge_regressions(ridge):
+    model = agent("linucb", CONTEXT_SPACE, alpha=0.7, ridge=ridge, tie_breaking="first")
+    pulls = linear_pulls()
+    for arm, context, reward in pulls:
+        model._learn(Pull(context.tolist(), arm, reward, 1.0))
+    matrices, moments = ridge_regressions(pulls, ridge)
+    solutions = np.array([np.linalg.solve(a, b) for a, b in zip(matrices, moments, strict=True)])
+    assert model.policy.coefficients.numpy() == pytest.approx(solutions, rel=1e-10)
+    for arm, factors in enumerate(model.policy.factors.numpy()):
+        lower = np.tril(factors, -1) + np.eye(4)
+        assert lower @ np.diag(np.diag(factors)) @ lower.T == pytest.approx(matrices[arm])
+    for context in np.random.default_rng(3).uniform(-1, 1, (50, 4)):
+        bounds = [
+            context @ solution + 0.7 * math.sqrt(context @ np.linalg.inv(a) @ context)
+            for solution, a in zip(solutions, matrices, strict=True)
+        ]
+        chosen, _ = model._choose(context[None], model.rng)
+        assert chosen[0] == np.argmax(bounds)
+        best = model.predict(context, deterministic=True)[0]
+        assert best == np.argmax(context.astype(np.float32) @ solutions.T)
+
+
+def test_linear_thompson_samples_from_the_posterior():
+    """A draw of all coefficients and one of the mean reward choose alike."""
+    model = agent("lin_thompson", CONTEXT_SPACE, alpha=0.5)
+    pulls = linear_pulls(40)
+    for arm, context, reward in pulls:
+        model._learn(Pull(context.tolist(), arm, reward, 1.0))
+    matrices, moments = ridge_regressions(pulls, 1.0)
+    context, rng = np.array([0.2, -0.4, 0.1, 0.9]), np.random.default_rng(4)
+    sampled = np.stack(
+        [
+            rng.multivariate_normal(np.linalg.solve(a, b), 0.25 * np.linalg.inv(a), 40_000)
+            @ context
+            for a, b in zip(matrices, moments, strict=True)
+        ]
+    )
+    expected = np.bincount(sampled.argmax(axis=0), minlength=ARMS) / 40_000
+    chosen, _ = model._choose(np.tile(context, (40_000, 1)), np.random.default_rng(0))
+    assert np.bincount(chosen, minlength=ARMS) / 40_000 == pytest.approx(expected, abs=0.012)
+    assert expected.min() > 0.02
+
+
+def test_one_hot_contexts_are_averages_with_a_ridge():
+    model = agent("linucb", spaces.Discrete(2))
+    for row, arm, reward in ((0, 1, 1.0), (0, 1, 1.0), (1, 2, 4.0)):
+        context = model._contexts(np.array([row]))[0]
+        model._learn(Pull(context.tolist(), arm, reward, 1.0))
+    assert model.policy.coefficients.tolist() == [[0, 0], [2 / 3, 0], [0, 2]]
+    assert model.predict(np.array([0, 1]), deterministic=True)[0].tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("name", "kwargs", "message"),
+    [
+        ("epsilon_greedy", {"exploration_initial_eps": 1.5}, "must lie between 0 and 1, not 1.5"),
+        ("epsilon_greedy", {"exploration_decay": "slow"}, "constant, linear, exponential, not 'sl"),
+        ("epsilon_greedy", {"learning_rate": "averge"}, "a schedule or 'sample_average', not 'av"),
+        ("boltzmann", {"temperature": 0.0}, "temperature must be above 0, not 0.0"),
+        ("ucb", {"variant": "ucb2"}, "variant must be one of ucb1, sutton_barto, not 'ucb2'"),
+        ("ucb", {"c": -1.0}, "c must be at least 0, not -1.0"),
+        ("kl_ucb", {"c": math.nan}, "c must be at least 0, not nan"),
+        ("exp3", {"mixing": 0.0}, "mixing must be above 0, not 0.0"),
+        ("exp3", {"mixing": 1.1}, "mixing must lie between 0 and 1, not 1.1"),
+        ("thompson", {"likelihood": "poisson"}, "bernoulli, gaussian, not 'poisson'"),
+        ("thompson", {"prior_failures": 0.0}, "prior_failures must be above 0, not 0.0"),
+        ("thompson", {"prior_mean": math.inf}, "prior_mean must be finite, not inf"),
+        ("linucb", {"ridge": 0.0}, "ridge must be above 0, not 0.0"),
+        ("lin_thompson", {"alpha": -0.5}, "alpha must be at least 0, not -0.5"),
+        ("ucb", {"tie_breaking": "last"}, "tie_breaking must be one of random, first, not 'last'"),
+        ("mabwiser_ucb1", {"tie_breaking": "random"}, "tie_breaking must be first: MABWiser"),
+        ("ucb", {"observation_space": CONTEXT_SPACE}, "observations in a Discrete space"),
+        (
+            "linucb",
+            {"observation_space": spaces.Box(-1, 1, (2, 2))},
+            r"observations of shape \(d,\) in a Box space or in a Discrete space",
+        ),
+    ],
+)
+def test_wrong_arguments(name, kwargs, message):
+    with pytest.raises(ValueError, match=message):
+        agent(name, **kwargs)
