@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from pipeline.cli import OneLineParser, command_line, run_command
 
@@ -12,6 +13,7 @@ examples:
   python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --n-episodes 500
   python compare.py studies/warehouse-learning-rate.yml
   python compare.py studies/warehouse-learning-rate.yml --quick
+  python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
 
 The same command again does the runs that are missing, and no other.
 """
@@ -41,9 +43,18 @@ def build_parser() -> argparse.ArgumentParser:
         help="hyperparameters to change in every agent",
     )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
     add("--quick", action="store_true", help="few seeds and a small budget, for a first look")
     _add_output_flags(parser)
+    _add_log_flags(parser)
     return parser
+
+
+def _add_log_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
+    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
+    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
+    add("--trust", action="store_true", help="load a library zip from outside logs/")
 
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:
@@ -62,12 +73,19 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
 def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
     args = build_parser().parse_args()
+    if args.logged or args.policy:
+        from pipeline.logged_tables import compare_on_log
+
+        return compare_on_log(args)
     from pipeline.study.requests import study_spec
 
     study = study_spec(args)
+    from pipeline.study.planning import plan
+
+    planned = plan(study, Path(args.log_folder) / study.name)
     from pipeline.study.command import run_study
 
-    return run_study(study, args, command_line())
+    return run_study(study, planned, args, command_line())
 
 
 if __name__ == "__main__":

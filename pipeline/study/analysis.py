@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -26,7 +26,7 @@ from pipeline.statistics import (
     summarise_steps,
 )
 from pipeline.study.results import StudyResults
-from pipeline.study.spec import StudySpec
+from pipeline.study.spec import COSTS, StudySpec
 
 SEED = 0  # of all resampling: the same runs give the same figures
 MARGIN = 0.02  # of the way from the best blind policy to the optimum
@@ -49,6 +49,7 @@ class AgentAnalysis:
         final: mean return of the final policy.
         area: mean return over the learning curve.
         last_episodes: mean return of the last training episodes.
+        regret: on bandits, the sum over all pulls; else without a figure.
         steps_to_threshold: when the learning curve reached the threshold; None without one.
         episodes_to_threshold: likewise.
         success_rate: of the final policy; None where the environment does not say.
@@ -64,6 +65,7 @@ class AgentAnalysis:
     final: Estimate
     area: Estimate
     last_episodes: Estimate
+    regret: Estimate
     steps_to_threshold: ThresholdSummary | None
     episodes_to_threshold: ThresholdSummary | None
     success_rate: Estimate | None
@@ -84,6 +86,7 @@ class EnvironmentAnalysis:
         exact: whether all final returns are expectations rather than means of episodes.
         agents: the agents, the best first.
         pairs: every two of them, the better ranked first.
+        missing: by agent, also those of which no run has finished, the runs that are not there.
     """
 
     environment: str
@@ -95,6 +98,7 @@ class EnvironmentAnalysis:
     exact: bool
     agents: tuple[AgentAnalysis, ...]
     pairs: tuple[PairComparison, ...]
+    missing: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -164,9 +168,11 @@ def _analyse_environment(results: StudyResults, environment: str) -> Environment
     study, table = results.study, results.summary
     table = table[table["environment"] == environment]
     metric = values_over_seeds(results, environment, study.metric)
+    sign = -1.0 if study.metric in COSTS else 1.0
     agents = [_analyse_agent(results, environment, agent.label) for agent in study.agents]
+    missing = {agent.agent: agent.n_missing for agent in agents}
     agents = [agent for agent in agents if agent.n_runs]
-    agents.sort(key=lambda agent: _rank(agent.metric.mean.point), reverse=True)
+    agents.sort(key=lambda agent: _rank(sign * agent.metric.mean.point), reverse=True)
     optimum, blind = _first(table, "optimum"), _first(table, "best_blind")
     margin = study.margin
     if margin is None:
@@ -181,7 +187,10 @@ def _analyse_environment(results: StudyResults, environment: str) -> Environment
         margin=margin,
         exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is no False here
         agents=tuple(agents),
-        pairs=tuple(compare_pairs({a.agent: metric[a.agent] for a in agents}, margin, seed=SEED)),
+        pairs=tuple(
+            compare_pairs({a.agent: sign * metric[a.agent] for a in agents}, margin, seed=SEED)
+        ),
+        missing=missing,
     )
 
 
@@ -211,6 +220,7 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         final=mean("final"),
         area=mean("area"),
         last_episodes=mean("last_episodes"),
+        regret=mean("regret"),
         steps_to_threshold=summarise_steps(values("steps_to_threshold")) if has_threshold else None,
         episodes_to_threshold=summarise_steps(values("episodes_to_threshold"))
         if has_threshold
@@ -263,7 +273,8 @@ def mean_curve(
         by: ``"step"``, ``"episode"`` or ``"seconds"``.
 
     Returns:
-        The points, shape (n,), and the mean there with its interval; None without any run.
+        The points, shape (n,), and the mean there with its interval; None without any run, or where
+        one has ended before another has come to its first point.
     """
     table = results.curves
     chosen = (table["environment"] == environment) & (table["agent"] == agent)
@@ -271,7 +282,7 @@ def mean_curve(
         (rows[by].to_numpy(dtype=np.float64), rows["value"].to_numpy(dtype=np.float64))
         for _, rows in table[chosen & (table["kind"] == kind)].groupby("seed")
     ]
-    if not runs:
+    if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
         return None
     grid = shared_grid([points for points, _ in runs])
     values = np.array([on_grid(points, returns, grid) for points, returns in runs])

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from pipeline.study.execution import RunFailure, available_cores, execute
-from pipeline.study.planning import PlannedRun, plan
+from pipeline.study.planning import PlannedRun, check_settings
 from pipeline.study.progress import StudyProgress
 from pipeline.study.results import StudyResults, read_results
 from pipeline.study.spec import StudySpec
@@ -17,14 +17,20 @@ from pipeline.study.spec import StudySpec
 WIDTH_WITHOUT_TERMINAL = 120
 
 
-def run_study(study: StudySpec, args: argparse.Namespace, command: str) -> int:
-    """Do a study; the exit code is 1 where a run failed."""
+def run_study(
+    study: StudySpec, planned: Sequence[PlannedRun], args: argparse.Namespace, command: str
+) -> int:
+    """Do a study as planned; the exit code is 1 where a run failed.
+
+    Raises:
+        UserError: if an agent cannot be made with its settings.
+    """
+    check_settings(study, planned)
     console = Console()
     if not console.is_terminal:
         console = Console(width=WIDTH_WITHOUT_TERMINAL)
     root = Path(args.log_folder) / study.name
-    planned = plan(study, root)
-    console.print(f"[bold]{study.title}[/]", highlight=False)
+    console.print(study.title, style="bold", markup=False, highlight=False)
     failures = _do_missing(console, planned, root, args, command)
     results = read_results(study, planned, root)
     if len(results.summary):
@@ -35,6 +41,7 @@ def run_study(study: StudySpec, args: argparse.Namespace, command: str) -> int:
             f"seed {failure.planned.seed}: {failure.reason}; see {failure.log}",
             markup=False,
             highlight=False,
+            soft_wrap=True,
         )
     return 1 if failures else 0
 
@@ -51,6 +58,7 @@ def _do_missing(
     n_workers = args.jobs if args.jobs > 0 else available_cores()
     console.print(
         f"{len(planned)} runs, {len(done)} of them there already; {n_workers} at once, in {root}",
+        markup=False,
         highlight=False,
     )
     with StudyProgress(console, planned, done) as progress:
@@ -73,6 +81,13 @@ def _judge(console: Console, results: StudyResults, args: argparse.Namespace, co
     if blocks is not None:
         print_episodes_table(console, blocks, width)
     files = write_tables(results)
+    if results.study.render_every:
+        from pipeline.study.films import write_films
+
+        films, refused = write_films(results)
+        files += films
+        for reason in refused:
+            console.print(f"no film: {reason}", markup=False, highlight=False)
     if not args.no_report:
         from pipeline.report import write_report
         from pipeline.study.figures import write_figures
@@ -82,6 +97,6 @@ def _judge(console: Console, results: StudyResults, args: argparse.Namespace, co
         write_report(analysis, page, command)
         files.append(page)
     console.print()
-    console.print(f"files: {results.root}", highlight=False)
+    console.print(f"files: {results.root}", markup=False, highlight=False)
     for path in files:
-        console.print(f"  {path.relative_to(results.root)}", highlight=False)
+        console.print(f"  {path.relative_to(results.root)}", markup=False, highlight=False)

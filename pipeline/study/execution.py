@@ -13,7 +13,7 @@ from pipeline.files import write_text
 from pipeline.study.launchers import StoppedError, WorkFailedError, local_executor, supervise
 from pipeline.study.planning import PlannedRun
 from pipeline.study.spec import file_name
-from pipeline.study.work import do_run, draft_path, remove_dead_drafts, remove_draft
+from pipeline.study.work import do_run, draft_path, make_folder, remove_dead_drafts, remove_draft
 
 
 @dataclass(frozen=True)
@@ -32,6 +32,11 @@ class RunFailure:
 
 
 Listener = Callable[[PlannedRun, RunFailure | None], None]
+
+
+def failure_log(root: Path, planned: PlannedRun) -> Path:
+    """Where the details of a run's failure are written; there until it is done after all."""
+    return root / "failures" / f"{file_name(planned.agent)}@{planned.path.name}.txt"
 
 
 def available_cores() -> int:
@@ -76,14 +81,14 @@ def execute_on(
 
 
 def _supervised_run(planned: PlannedRun, root: Path, command: str) -> RunFailure | None:
-    log = root / "failures" / f"{file_name(planned.agent)}_{planned.path.name}.txt"
+    log = failure_log(root, planned)
     draft = draft_path(root, planned)
     try:
         supervise(do_run, planned, draft, command, clean_up=partial(remove_draft, draft))
     except StoppedError:
         return None
     except WorkFailedError as error:
-        log.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(log.parent)
         write_text(log, error.details)
         return RunFailure(planned, str(error), log)
     log.unlink(missing_ok=True)

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from pipeline.files import replacing
+from pipeline.statistics import Estimate
 from pipeline.study.analysis import (
     AgentAnalysis,
     EnvironmentAnalysis,
@@ -21,27 +18,14 @@ from pipeline.study.analysis import (
     mean_curve,
     values_over_seeds,
 )
+from pipeline.study.bandit_figures import MOST_LINES, write_bandit_figures
+from pipeline.study.drawing import COLOURS, agent_style, figure
 from pipeline.study.spec import METRIC_WORDS, StudySpec, file_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; the line styles go on where the
-# colours begin again.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-STYLES = ("-", "--", "-.", ":")
-
 _AXES = {"step": "environment steps", "episode": "episodes", "seconds": "wall time"}
-_FONTS: Any = {"font.size": 10, "axes.titlesize": 11, "legend.fontsize": 9, "svg.fonttype": "none"}
-
-
-def agent_style(study: StudySpec, agent: str) -> dict[str, Any]:
-    """Colour and line style of an agent, the same in every figure of a study."""
-    place = [spec.label for spec in study.agents].index(agent)
-    return {
-        "color": COLOURS[place % len(COLOURS)],
-        "linestyle": STYLES[place // len(COLOURS) % len(STYLES)],
-    }
 
 
 def write_figures(analysis: StudyAnalysis, episodes_table: pd.DataFrame | None) -> list[Path]:
@@ -57,8 +41,12 @@ def write_figures(analysis: StudyAnalysis, episodes_table: pd.DataFrame | None) 
     folder = analysis.results.root / "figures"
     folder.mkdir(exist_ok=True)
     paths: list[Path] = []
+    paths += write_bandit_figures(analysis.results, folder)
     for environment in analysis.environments:
         name = file_name(environment.environment)
+        paths += _sweeps(analysis, environment, folder / f"{name}_sweep")
+        if len(environment.agents) > MOST_LINES or _has_pulls(analysis, environment):
+            continue
         paths += _learning_curves(analysis, environment, folder / f"{name}_learning_curves")
         paths += _intervals(analysis, environment, folder / f"{name}_intervals")
         if episodes_table is not None:
@@ -69,28 +57,43 @@ def write_figures(analysis: StudyAnalysis, episodes_table: pd.DataFrame | None) 
     return paths
 
 
-@contextmanager
-def _figure(path: Path, written: list[Path], n_columns: int = 1) -> Iterator[Sequence[Axes]]:
-    """A row of axes, written to ``path`` as .png and .svg in the end."""
-    with mpl.rc_context(_FONTS):
-        figure = Figure(figsize=(6.4 * n_columns, 4.2), layout="constrained")
-        axes = figure.subplots(1, n_columns, squeeze=False)[0]
-        yield axes
-        for place in axes:
-            place.grid(alpha=0.3)
-            place.spines[["top", "right"]].set_visible(False)
-        for suffix, options in ((".png", {"dpi": 150}), (".svg", {"metadata": {"Date": None}})):
-            target = path.with_name(path.name + suffix)
-            with replacing(target) as draft:
-                figure.savefig(draft, format=suffix[1:], **options)
-            written.append(target)
+def _has_pulls(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> bool:
+    return any(label == environment.environment for _, label in analysis.results.pulls)
+
+
+def _sweeps(analysis: StudyAnalysis, environment: EnvironmentAnalysis, path: Path) -> list[Path]:
+    """What the verdicts are about against the one parameter that an agent was swept over."""
+    by_label = {agent.agent: agent for agent in environment.agents}
+    groups: dict[str, list[tuple[float, Estimate]]] = {}
+    for spec in analysis.study.agents:
+        values = list(spec.swept.values())
+        if spec.label in by_label and len(values) == 1 and isinstance(values[0], int | float):
+            mean = by_label[spec.label].metric.mean
+            (parameter,) = spec.swept
+            groups.setdefault(f"{spec.group}: {parameter}", []).append((float(values[0]), mean))
+    groups = {name: sorted(rows, key=lambda row: row[0]) for name, rows in groups.items()}
+    groups = {name: rows for name, rows in groups.items() if len(rows) > 2}
+    written: list[Path] = []
+    if not groups:
+        return written
+    with figure(path, written) as (axes,):
+        for colour, (name, rows) in zip(cycle(COLOURS), groups.items(), strict=False):
+            x = [value for value, _ in rows]
+            axes.plot(x, [e.point for _, e in rows], "o-", color=colour, label=name, markersize=4)
+            low, high = [e.low for _, e in rows], [e.high for _, e in rows]
+            axes.fill_between(x, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes.set(xscale="log", xlabel="value of the parameter")
+        axes.set_ylabel(METRIC_WORDS[analysis.study.metric])
+        axes.set_title(environment.environment, loc="left")
+        axes.legend(frameon=False)
+    return written
 
 
 def _learning_curves(
     analysis: StudyAnalysis, environment: EnvironmentAnalysis, path: Path
 ) -> list[Path]:
     written: list[Path] = []
-    with _figure(path, written, n_columns=2) as axes:
+    with figure(path, written, n_columns=2) as axes:
         for place, kind, by in zip(
             axes, ("evaluation", "training"), ("step", "episode"), strict=True
         ):
@@ -153,7 +156,7 @@ def _intervals(analysis: StudyAnalysis, environment: EnvironmentAnalysis, path: 
     """Each run as a dot, the mean with its interval."""
     study, written = analysis.study, list[Path]()
     values = values_over_seeds(analysis.results, environment.environment, study.metric)
-    with _figure(path, written) as (axes,):
+    with figure(path, written) as (axes,):
         for row, agent in enumerate(reversed(environment.agents)):
             colour = agent_style(study, agent.agent)["color"]
             runs = values[agent.agent][np.isfinite(values[agent.agent])]
@@ -180,7 +183,7 @@ def _episode_blocks(study: StudySpec, rows: pd.DataFrame, path: Path) -> list[Pa
     written: list[Path] = []
     if not agents:
         return written
-    with _figure(path, written, n_columns=len(agents)) as axes:
+    with figure(path, written, n_columns=len(agents)) as axes:
         for place, agent in zip(axes, agents, strict=True):
             table = rows[rows["agent"] == agent]
             for column, style in (("average", "-"), ("minimum", ":"), ("maximum", "--")):
@@ -203,7 +206,7 @@ def _profiles(analysis: StudyAnalysis, path: Path) -> list[Path]:
     written: list[Path] = []
     overall = analysis.overall
     assert overall is not None
-    with _figure(path, written) as (axes,):
+    with figure(path, written) as (axes,):
         for agent, band in overall.profiles.items():
             style = agent_style(analysis.study, agent)
             axes.plot(overall.thresholds, band.point, label=agent, linewidth=1.5, **style)

@@ -15,6 +15,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -114,7 +115,7 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
-    _context.set_forkserver_preload(PRELOADED)
+    _start_server()
     _stopping.clear()
     executor = ThreadPoolExecutor(n_workers)
     try:
@@ -124,6 +125,16 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
         raise
     finally:
         executor.shutdown(cancel_futures=True)
+
+
+def _start_server() -> None:
+    """Start the process that children are forked from, deaf to Ctrl-C while it imports."""
+    _context.set_forkserver_preload(PRELOADED)
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def stop_all() -> None:

@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from agents import ALGORITHMS
+from envs.model import time_limit
 from pipeline import hyperparams
-from pipeline.environments import check_env_id
+from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
 from pipeline.requests import check_algorithm, check_fit
 from pipeline.run import FINISHED, Run, environment_name
 from pipeline.specs import TrainSpec
-from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec, file_name
+from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 
-_MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 # What a run of the same settings may differ in: where it is written, and what is shown meanwhile.
 _NO_PART_OF_IDENTITY = (
     "log_folder",
     "tensorboard_log",
+    "save_every_n_episodes",
     "verbose",
     "progress",
     "log_interval",
     "pictures",
 )
+
+# What a batch takes heed of, beside the agent's own arguments.
+_UNDERSTOOD = ("n_timesteps", "env_kwargs", "algorithm")
 
 
 @dataclass(frozen=True)
@@ -38,6 +44,8 @@ class PlannedRun:
         seed: its seed.
         spec: what to train.
         path: its folder, there once it has finished.
+        is_batch: whether it stands for all seeds of a bandit agent, of which ``seed`` is the first.
+        n_runs: how many runs it stands for.
     """
 
     agent: str
@@ -45,6 +53,8 @@ class PlannedRun:
     seed: int
     spec: TrainSpec
     path: Path
+    is_batch: bool = False
+    n_runs: int = 1
 
     @property
     def run(self) -> Run:
@@ -55,8 +65,13 @@ class PlannedRun:
     def is_finished(self) -> bool:
         """Whether the folder holds this very run, to its end."""
         info = self.run.read_info()
-        return info.get("state") == FINISHED and _identity(info["spec"]) == _identity(
-            self.spec.as_data()
+        recorded = info.get("spec", {})
+        wanted = self.spec.save_every_n_episodes
+        return (
+            info.get("state") == FINISHED
+            and info.get("n_runs", 1) == self.n_runs
+            and _identity(recorded) == _identity(self.spec.as_data())
+            and (wanted < 1 or self.is_batch or recorded.get("save_every_n_episodes") == wanted)
         )
 
 
@@ -75,25 +90,105 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
     Raises:
         UserError: if an agent cannot be trained so, or does not fit an environment.
     """
+    for what, labels in (
+        ("agents", [agent.label for agent in study.agents]),
+        ("environments", [environment.label for environment in study.environments]),
+    ):
+        _check_folders(what, labels)
     specs = {}
     for environment in study.environments:
         check_env_id(environment.env_id)
         for agent in study.agents:
-            spec = _train_spec(study, agent, environment)
-            check_fit(spec)
+            with _told_where(agent):
+                spec = _train_spec(study, agent, environment)
+                check_fit(spec)
             specs[agent.label, environment.label] = spec
+    batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
     return [
-        PlannedRun(
-            agent,
-            environment,
-            seed,
-            replace(spec, seed=seed),
-            # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
-            root / "runs" / file_name(agent) / f"{file_name(environment)}_{seed + 1}",
-        )
+        _planned_run(study, root, agent, environment, seed, spec, (agent, environment) in batches)
         for seed in range(study.n_seeds)
         for (agent, environment), spec in specs.items()
+        if seed == 0 or (agent, environment) not in batches
     ]
+
+
+def _planned_run(
+    study: StudySpec,
+    root: Path,
+    agent: str,
+    environment: str,
+    seed: int,
+    spec: TrainSpec,
+    is_batch: bool,
+) -> PlannedRun:
+    # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
+    place = Path(file_name(agent), f"{file_name(environment)}_{seed + 1}")
+    spec = replace(
+        spec,
+        seed=seed,
+        tensorboard_log=root / "tensorboard" / place if study.tensorboard else None,
+        save_every_n_episodes=study.render_every if seed == 0 else -1,
+    )
+    path, n_runs = root / "runs" / place, study.n_seeds if is_batch else 1
+    return PlannedRun(agent, environment, seed, spec, path, is_batch, n_runs)
+
+
+def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
+    """Make sure that the agents can be made with their settings, which takes the libraries.
+
+    Raises:
+        UserError: if one cannot.
+    """
+    from pipeline import components
+    from pipeline.preparation import algorithm_kwargs
+
+    agents = {agent.label: agent for agent in study.agents}
+    for run in planned:
+        if run.seed == 0:
+            with _told_where(agents[run.agent]):
+                algorithm_kwargs(run.spec)
+                callbacks = run.spec.hyperparams.callback
+                components.callbacks(callbacks, run.spec.gym_packages, run.path)
+
+
+@contextmanager
+def _told_where(agent: AgentSpec) -> Iterator[None]:
+    """Say in mistakes where the study asks for the agent."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{agent.where}: {error}" if agent.where else str(error)) from error
+
+
+def _check_folders(what: str, labels: Sequence[str]) -> None:
+    """Refuse labels that are the same, or would have the same folder."""
+    places: dict[str, int] = {}
+    for index, label in enumerate(labels):
+        # Some file systems do not tell upper from lower case.
+        first = places.setdefault(file_name(label).lower(), index)
+        if first != index:
+            raise UserError(
+                f"{what}: {labels[first]!r} and {label!r} would share the folder "
+                f"{file_name(label)}: give them labels that differ in letters or digits"
+            )
+
+
+def _is_batch(spec: TrainSpec) -> bool:
+    """Whether the runs of a spec go as one batch: bandit agents as they are, for one episode."""
+    entry, special = ALGORITHMS[spec.algo], spec.hyperparams
+    untouched = hyperparams.Hyperparams()
+    if not (entry.for_bandits and entry.package is None) or special.n_timesteps is None:
+        return False
+    env = make_single_env(spec)
+    episode = time_limit(env) or 0
+    env.close()
+    if special.n_timesteps > episode:
+        return False
+    return all(
+        getattr(special, name) == getattr(untouched, name)
+        for name in vars(untouched)
+        if name not in _UNDERSTOOD
+    )
 
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
@@ -110,6 +205,7 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
         seed=0,
         eval_freq=study.eval_freq,
         eval_episodes=study.eval_episodes,
+        gym_packages=study.gym_packages,
         verbose=0,
         pictures=False,
     )
@@ -128,12 +224,7 @@ def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str
             if not (agent.settings or environment.settings):
                 raise
     for settings in (environment.settings, agent.settings):
-        merged = {
-            key: {**(raw.get(key) or {}), **settings[key]}
-            for key in _MERGED
-            if isinstance(settings.get(key), dict)
-        }
-        raw = hyperparams.override(raw, {**settings, **merged})
+        raw = layered(raw, settings)
     return raw
 
 

@@ -9,6 +9,7 @@ from types import TracebackType
 
 from rich.console import Console
 from rich.live import Live
+from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
@@ -99,7 +100,7 @@ class StudyProgress:
         for key, total in self.total.items():
             done, failed = self.done[key], self.failed[key]
             table.add_row(
-                *key,
+                *map(escape, key),
                 f"{done}/{total}",
                 ProgressBar(total=total, completed=done, width=24),
                 f"[red]{failed}[/]" if failed else "",

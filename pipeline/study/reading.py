@@ -10,10 +10,17 @@ from typing import Any
 
 from agents import ALGORITHMS
 from pipeline.coercion import coerce
+from pipeline.environments import check_env_id
 from pipeline.errors import UserError, shown, unknown
-from pipeline.hyperparams import override
 from pipeline.strict_yaml import key_lines, read_yaml
-from pipeline.study.spec import AgentSpec, EnvironmentSpec, Metric, QuickSpec, StudySpec
+from pipeline.study.spec import (
+    AgentSpec,
+    EnvironmentSpec,
+    Metric,
+    QuickSpec,
+    StudySpec,
+    layered,
+)
 
 BUDGETS = ("n_timesteps", "n_episodes")
 
@@ -35,6 +42,7 @@ _STUDY_VALUES: dict[str, Any] = {
 _STUDY_KEYS = (*_STUDY_VALUES, "agents", "environments", "settings", "sweep", "quick")
 _AGENT_KEYS = ("algo", "tuned", "summary", "sweep")
 _QUICK_VALUES: dict[str, Any] = {"seeds": int, "budget": float}
+_NOT_NEGATIVE = ("margin", "episodes_table")
 _AT_LEAST_ONE = ("seeds", "n_timesteps", "n_episodes", "eval_freq", "eval_episodes")
 
 Keys = tuple[str | int, ...]
@@ -52,7 +60,9 @@ class _Document:
         return f"{self.path}:{self.lines.get(keys, 1)}"
 
     def mapping(self, value: Any, *keys: str | int) -> dict[str, Any]:
-        """The value, if it maps names to values."""
+        """The value, if it maps names to values or, inside the document, is left empty."""
+        if value is None and keys:
+            return {}
         if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
             what = str(keys[-1]) if keys else "a study"
             raise UserError(f"{self.at(*keys)}: {what} must map names to values")
@@ -77,7 +87,17 @@ class _Document:
             result[key] = coerce(data[key], kind, place)
             if key in _AT_LEAST_ONE and result[key] < 1:
                 raise UserError(f"{place} must be at least 1, not {result[key]}")
+            if key in _NOT_NEGATIVE and result[key] < 0:
+                raise UserError(f"{place} must be at least 0, not {result[key]}")
+            if key == "budget" and not 0 < result[key] <= 1:
+                raise UserError(f"{place} must be a share above 0 and up to 1, not {result[key]}")
         return result
+
+    def check_budget(self, data: Mapping[str, Any], *keys: str | int) -> None:
+        """Refuse two budgets in one place."""
+        if all(data.get(key) is not None for key in BUDGETS):
+            place = self.at(*keys, BUDGETS[1])
+            raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
 
 
 def read_study(path: Path) -> StudySpec:
@@ -91,15 +111,17 @@ def read_study(path: Path) -> StudySpec:
     data = document.mapping(data)
     document.check_names(data, _STUDY_KEYS)
     values = {"title": path.stem, **document.values(data, _STUDY_VALUES)}
-    shared = document.mapping(data.get("settings") or {}, "settings")
+    document.check_budget(data)
+    shared = document.mapping(data.get("settings"), "settings")
+    document.check_budget(shared, "settings")
     budget = {key: values.pop(key) for key in BUDGETS if key in values}
     tuned = values.pop("tuned", True)
-    quick = document.mapping(data.get("quick") or {}, "quick")
+    quick = document.mapping(data.get("quick"), "quick")
     document.check_names(quick, _QUICK_VALUES, "quick")
     return StudySpec(
         name=path.stem,
         agents=_agents(document, data, tuned),
-        environments=_environments(document, data, {**shared, **budget}),
+        environments=_environments(document, data, layered(shared, budget)),
         n_seeds=values.pop("seeds", StudySpec.n_seeds),
         quick=QuickSpec(**document.values(quick, _QUICK_VALUES, "quick")),
         source=path,
@@ -118,13 +140,18 @@ def _entries(
         }
         if len(entries) < len(value):
             raise UserError(f"{document.at(key)}: {key} names one of them twice")
-        return entries
-    if not value:
+    elif isinstance(value, list):
+        raise UserError(f"{document.at(key)}: {key} must list names, or map them to settings")
+    else:
+        entries = {
+            label: ((key, label), document.mapping(entry, key, label))
+            for label, entry in document.mapping(value, key).items()
+        }
+    if not entries:
         raise UserError(f"{document.at(key)}: {key} must list at least one name")
-    return {
-        label: ((key, label), document.mapping(entry or {}, key, label))
-        for label, entry in document.mapping(value, key).items()
-    }
+    for keys, entry in entries.values():
+        document.check_budget(entry, *keys)
+    return entries
 
 
 def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[AgentSpec, ...]:
@@ -132,18 +159,19 @@ def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[
     agents: list[AgentSpec] = []
     for label, (keys, entry) in _entries(document, data, "agents").items():
         algo = entry.get("algo", label)
-        if algo not in ALGORITHMS:
+        if not (isinstance(algo, str) and algo in ALGORITHMS):
             place = document.at(*keys, "algo") if "algo" in entry else document.at(*keys)
             raise unknown(f"{place}: unknown agent", str(algo), ALGORITHMS)
         values = document.values(entry, {"tuned": bool, "summary": str}, *keys)
         settings = {key: entry[key] for key in entry if key not in _AGENT_KEYS}
-        agent = AgentSpec(label, algo, settings, **{"tuned": tuned, **values})
+        values = {"tuned": tuned, "where": document.at(*keys), **values}
+        agent = AgentSpec(label, algo, settings, **values)
         agents += swept(agent, {**shared_sweep, **_sweep(document, entry, *keys)})
     return tuple(agents)
 
 
 def _sweep(document: _Document, data: Mapping[str, Any], *keys: str | int) -> dict[str, list[Any]]:
-    sweep = document.mapping(data.get("sweep") or {}, *keys, "sweep")
+    sweep = document.mapping(data.get("sweep"), *keys, "sweep")
     for name, values in sweep.items():
         if not (isinstance(values, list) and values):
             place = document.at(*keys, "sweep", name)
@@ -158,7 +186,10 @@ def swept(agent: AgentSpec, sweep: Mapping[str, Sequence[Any]]) -> list[AgentSpe
         chosen = dict(zip(sweep, values, strict=True))
         suffix = ", ".join(f"{name}={value}" for name, value in chosen.items())
         label = f"{agent.label} {suffix}" if suffix else agent.label
-        agents.append(replace(agent, label=label, settings={**agent.settings, **chosen}))
+        settings = layered(agent.settings, chosen)
+        agents.append(
+            replace(agent, label=label, settings=settings, group=agent.label, swept=chosen)
+        )
     return agents
 
 
@@ -170,6 +201,11 @@ def _environments(
         env_id = entry.get("id", label)
         if not isinstance(env_id, str):
             raise UserError(f"{document.at(*keys, 'id')}: id must be a text, not {shown(env_id)}")
+        try:
+            check_env_id(env_id)
+        except UserError as error:
+            place = document.at(*keys, "id") if "id" in entry else document.at(*keys)
+            raise UserError(f"{place}: {error}") from error
         own = {key: value for key, value in entry.items() if key != "id"}
-        environments.append(EnvironmentSpec(label, env_id, override(shared, own)))
+        environments.append(EnvironmentSpec(label, env_id, layered(shared, own)))
     return tuple(environments)

@@ -3,16 +3,33 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
+from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError, unknown
-from pipeline.hyperparams import override
 from pipeline.literals import parse_assignments
 from pipeline.study.reading import read_study
-from pipeline.study.spec import METRICS, AgentSpec, EnvironmentSpec, StudySpec, file_name
+from pipeline.study.spec import (
+    METRICS,
+    AgentSpec,
+    EnvironmentSpec,
+    StudySpec,
+    file_name,
+    layered,
+)
+
+_LEAST = {
+    "seeds": 1,
+    "n_timesteps": 1,
+    "n_episodes": 1,
+    "episodes_table": 1,
+    "render_every": 0,
+    "jobs": 0,
+}
 
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
@@ -21,8 +38,13 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     Raises:
         UserError: if it is not clear what to compare, or on what.
     """
+    _check_output(args)
+    import_gym_packages(tuple(args.gym_packages))
     study = _study_of_file(args) if args.study else _study_of_flags(args)
     changes: dict[str, Any] = {
+        "gym_packages": tuple(args.gym_packages),
+        "tensorboard": args.tensorboard,
+        "render_every": args.render_every,
         "n_seeds": args.seeds,
         "metric": args.metric,
         "margin": args.margin,
@@ -30,13 +52,21 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         "name": args.name,
     }
     changes = {key: value for key, value in changes.items() if value is not None}
-    for key in ("n_seeds", "episodes_table"):
-        if changes.get(key, 1) < 1:
-            raise UserError(f"--{key.removeprefix('n_').replace('_', '-')} must be at least 1")
-    if args.metric is not None and args.metric not in METRICS:
-        raise unknown("--metric: unknown metric", args.metric, METRICS)
     study = replace(_with_settings(study, args), **changes)
     return study.quickened() if args.quick else study
+
+
+def _check_output(args: argparse.Namespace) -> None:
+    for key, least in _LEAST.items():
+        value = getattr(args, key)
+        if value is not None and value < least:
+            raise UserError(f"--{key.replace('_', '-')} must be at least {least}, not {value}")
+    if args.margin is not None and not args.margin >= 0:
+        raise UserError(f"--margin must be at least 0, not {args.margin}")
+    if args.metric is not None and args.metric not in METRICS:
+        raise unknown("--metric: unknown metric", args.metric, METRICS)
+    if args.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        raise UserError("-tb needs: pip install 'rl-yardstick[tensorboard]'")
 
 
 def _study_of_file(args: argparse.Namespace) -> StudySpec:
@@ -51,6 +81,8 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
     for algo in args.algos:
         if algo not in ALGORITHMS:
             raise unknown("unknown agent", algo, ALGORITHMS)
+    for env_id in args.env:
+        check_env_id(env_id)
     for flag, names in (("--env", args.env), ("--algos", args.algos)):
         if len(set(names)) < len(names):
             raise UserError(f"{flag} names one of them twice")
@@ -72,6 +104,6 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
         if getattr(args, key) is not None:
             changes[key] = getattr(args, key)
     agents = tuple(
-        replace(agent, settings=override(agent.settings, changes)) for agent in study.agents
+        replace(agent, settings=layered(agent.settings, changes)) for agent in study.agents
     )
     return replace(study, agents=agents)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from pipeline.run import Run
 from pipeline.statistics import area_under_curve, steps_to_threshold
+from pipeline.study.bandit_results import batch_rows, read_pulls, run_regret
 from pipeline.study.planning import PlannedRun
+from pipeline.study.pulls import PullStatistics
 from pipeline.study.spec import StudySpec
 
 LAST_EPISODES = 100
@@ -32,6 +34,7 @@ class StudyResults:
         summary: one row for each finished run, see `RUN_COLUMNS`.
         curves: learning curves of all runs, see `CURVE_COLUMNS`.
         planned: all runs of the study, also those that failed.
+        pulls: on bandits, figures by pull, by labels of agent and environment.
     """
 
     study: StudySpec
@@ -39,6 +42,7 @@ class StudyResults:
     summary: pd.DataFrame
     curves: pd.DataFrame
     planned: tuple[PlannedRun, ...]
+    pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
 
 
 # Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.
@@ -62,6 +66,7 @@ RUN_COLUMNS = (
     "area",  # mean return over the learning curve
     "training",  # mean return of the training episodes
     "last_episodes",  # of the last 100
+    "regret",  # on bandits, best expected rewards less those of the arms pulled, summed up
     "threshold",
     "steps_to_threshold",  # infinite where it was never reached
     "episodes_to_threshold",
@@ -117,8 +122,11 @@ def read_episodes(run: Run) -> Episodes:
 def read_results(study: StudySpec, planned: Sequence[PlannedRun], root: Path) -> StudyResults:
     """Read all runs that have finished."""
     rows, curves = [], []
+    pulls = read_pulls([run for run in planned if run.is_finished])
     for run in planned:
-        if run.is_finished:
+        if run.is_finished and run.is_batch:
+            rows += batch_rows(run, pulls[run.agent, run.environment])
+        elif run.is_finished:
             episodes = read_episodes(run.run)
             evaluations = _evaluation_curve(run, episodes)
             rows.append(_summary_row(study, run, episodes, evaluations))
@@ -129,6 +137,7 @@ def read_results(study: StudySpec, planned: Sequence[PlannedRun], root: Path) ->
         pd.DataFrame(rows, columns=list(RUN_COLUMNS)),
         pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=CURVE_COLUMNS),
         tuple(planned),
+        pulls,
     )
 
 
@@ -222,6 +231,7 @@ def _summary_row(
         "area": area_under_curve(steps, values) if len(steps) else None,
         "training": _mean(episodes.returns),
         "last_episodes": _mean(episodes.returns[-LAST_EPISODES:]),
+        "regret": run_regret(planned.path),
         "threshold": threshold,
         "steps_to_threshold": reached,
         "episodes_to_threshold": _episodes_by(episodes, reached),

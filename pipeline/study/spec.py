@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-Metric = Literal["final", "best", "area", "training", "last_episodes"]
+from pipeline.hyperparams import override
+
+Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
 
 METRIC_WORDS: dict[str, str] = {
@@ -16,7 +19,25 @@ METRIC_WORDS: dict[str, str] = {
     "area": "mean return over the learning curve",
     "training": "mean return of all training episodes",
     "last_episodes": "mean return of the last 100 training episodes",
+    "regret": "regret of a run",
 }
+
+# Of these the lower is the better.
+COSTS = ("regret",)
+
+
+# Settings that map names to values: such a mapping is put over another name by name.
+MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
+
+
+def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with ``changes`` put over them."""
+    merged = {
+        key: {**settings[key], **changes[key]}
+        for key in MERGED
+        if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
+    }
+    return override(settings, {**changes, **merged})
 
 
 def file_name(label: str) -> str:
@@ -35,6 +56,9 @@ class AgentSpec:
         tuned: whether to begin with the entry of ``hyperparams/<algo>.yml``; otherwise with the
             defaults of its constructor.
         summary: a few words on it, for the report.
+        where: the place in a study file that asks for it, for error messages.
+        group: for one of a sweep, the label that its members share.
+        swept: its values of what is swept.
     """
 
     label: str
@@ -42,6 +66,9 @@ class AgentSpec:
     settings: dict[str, Any] = field(default_factory=dict)
     tuned: bool = True
     summary: str = ""
+    where: str = field(default="", compare=False)
+    group: str = ""
+    swept: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -94,6 +121,9 @@ class StudySpec:
         episodes_table: episodes in each row of the table of training returns; 0 for no table.
         quick: how it is cut down for a first look.
         is_quick: whether it has been.
+        gym_packages: modules to import for the environments that they register.
+        tensorboard: whether each run writes a TensorBoard log.
+        render_every: episodes between two that are filmed; 0 for no films.
         source: the file that it was read from, or None.
     """
 
@@ -111,6 +141,9 @@ class StudySpec:
     episodes_table: int = 0
     quick: QuickSpec = field(default_factory=QuickSpec)
     is_quick: bool = False
+    gym_packages: tuple[str, ...] = ()
+    tensorboard: bool = False
+    render_every: int = 0
     source: Path | None = None
 
     def quickened(self) -> StudySpec:

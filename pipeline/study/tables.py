@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.files import replacing
 from pipeline.study.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from pipeline.study.pulls import QUANTILES, PullStatistics
 from pipeline.study.results import StudyResults, read_episodes
 from pipeline.study.spec import METRIC_WORDS, StudySpec
 from pipeline.study.words import environment_sentences, interval, number
@@ -19,7 +23,12 @@ def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
     """Print a table for each environment, and what it says in words."""
     for environment in analysis.environments:
         console.print()
-        console.print(_ranking(analysis, environment))
+        pulls = _pulls_on(analysis.results, environment)
+        console.print(
+            _bandit_ranking(analysis, environment, pulls)
+            if pulls
+            else _ranking(analysis, environment)
+        )
         for sentence in environment_sentences(analysis.study, environment):
             console.print(f"  {sentence}", highlight=False, markup=False)
 
@@ -38,7 +47,51 @@ def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table
     for heading in headings:
         table.add_column(heading, justify="right")
     for agent in environment.agents:
-        table.add_row(agent.agent, *_cells(agent, has_score))
+        table.add_row(escape(agent.agent), *_cells(agent, has_score))
+    return table
+
+
+def _pulls_on(results: StudyResults, environment: EnvironmentAnalysis) -> dict[str, PullStatistics]:
+    """On a bandit, figures by pull of each agent."""
+    return {
+        agent: statistics
+        for (agent, label), statistics in results.pulls.items()
+        if label == environment.environment
+    }
+
+
+def _bandit_ranking(
+    analysis: StudyAnalysis, environment: EnvironmentAnalysis, pulls: dict[str, PullStatistics]
+) -> Table:
+    caption = (
+        f"regret: sum over the pulls of a run, with 95 % intervals over {analysis.study.n_seeds} "
+        "runs; simple regret: of recommending the arm pulled most; reward, best arm: at the last "
+        "pulls"
+    )
+    quantiles = f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs"
+    table = Table(
+        title=environment.environment,
+        caption=caption,
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("agent", overflow="fold", min_width=12)
+    for heading in ("mean regret", quantiles, "simple regret", "reward", "best arm", "time"):
+        table.add_column(heading, justify="right")
+    for agent in environment.agents:
+        if agent.agent not in pulls:
+            continue
+        statistics = pulls[agent.agent]
+        low, *_, high = np.quantile(statistics.total_regret, QUANTILES)
+        table.add_row(
+            agent.agent,
+            interval(agent.regret),
+            f"{number(low)} to {number(high)}",
+            number(statistics.simple_regret[-1]),
+            number(statistics.reward[-1]),
+            f"{statistics.optimal[-1]:.1%}",
+            f"{number(agent.seconds.point)} s",
+        )
     return table
 
 
@@ -53,7 +106,7 @@ def _caption(study: StudySpec, environment: EnvironmentAnalysis) -> str:
 
 
 def _title(environment: EnvironmentAnalysis) -> str:
-    title = environment.environment
+    title = escape(environment.environment)
     if environment.optimum is not None:
         title += f": optimum {number(environment.optimum)}"
         title += f", best blind policy {number(environment.best_blind)}"
@@ -66,7 +119,7 @@ def _cells(agent: AgentAnalysis, has_score: bool) -> list[str]:
         cells.append("-" if agent.score is None else interval(agent.score.mean))
     cells.append(interval(agent.last_episodes))
     threshold = agent.steps_to_threshold
-    if threshold is None:
+    if threshold is None or math.isnan(threshold.share_reached.point):
         cells += ["-", "-"]
     else:
         cells += [number(threshold.median.point), f"{threshold.share_reached.point:.0%}"]
@@ -118,11 +171,11 @@ def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> N
     """Print the table of `episodes_table`, agents side by side."""
     for environment, rows in table.groupby("environment", sort=False):
         title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
-        printed = Table(title=title, title_justify="left")
+        printed = Table(title=escape(title), title_justify="left")
         printed.add_column("episode", justify="right")
         agents = list(dict.fromkeys(rows["agent"]))
         for agent in agents:
-            printed.add_column(str(agent), justify="right")
+            printed.add_column(escape(str(agent)), justify="right")
         by_episode = rows.set_index(["episode", "agent"])
         for episode in sorted(set(rows["episode"])):
             cells = []

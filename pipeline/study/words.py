@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from pipeline.statistics import Estimate, PairComparison
 from pipeline.study.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from pipeline.study.spec import METRIC_WORDS, StudySpec
+from pipeline.study.spec import COSTS, METRIC_WORDS, StudySpec
 
 SIGNIFICANT = 4
 
@@ -21,7 +21,8 @@ def number(value: float | None) -> str:
     if value == 0 or abs(value) >= 10 ** (SIGNIFICANT - 1):
         return f"{value:,.0f}"
     digits = SIGNIFICANT - 1 - math.floor(math.log10(abs(value)))
-    return f"{value:.{min(max(digits, 0), SIGNIFICANT)}f}".rstrip("0").rstrip(".")
+    text = f"{value:.{min(max(digits, 0), SIGNIFICANT)}f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
 
 
 def interval(estimate: Estimate) -> str:
@@ -41,7 +42,9 @@ def sentences(analysis: StudyAnalysis) -> list[str]:
     result = []
     for environment in analysis.environments:
         result += environment_sentences(analysis.study, environment)
-    return result
+    there = {environment.environment for environment in analysis.environments}
+    absent = [e.label for e in analysis.study.environments if e.label not in there]
+    return [*result, *(f"On {label}, no run has finished." for label in absent)]
 
 
 def environment_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
@@ -50,19 +53,23 @@ def environment_sentences(study: StudySpec, environment: EnvironmentAnalysis) ->
         _on_the_best(study, environment),
         *_on_the_pairs(study, environment),
         *_on_the_speed(environment),
-        *_on_failures(environment),
+        *_on_failures(study.n_seeds, environment),
     ]
 
 
 def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     top = environment.agents[0]
     value = top.metric.mean.point
+    if math.isnan(value):
+        words = METRIC_WORDS[study.metric]
+        return f"On {environment.environment}, no run has a figure for the {words}."
     best = [a for a in environment.agents if math.isclose(a.metric.mean.point, value)]
     names = enumeration([agent.agent for agent in best])
     verb = "has" if len(best) == 1 else "have"
+    extreme = "lowest" if study.metric in COSTS else "highest"
     seeds = f"{study.n_seeds} seed{'s' if study.n_seeds > 1 else ''}"
     text = (
-        f"On {environment.environment}, over {seeds}, {names} {verb} the highest "
+        f"On {environment.environment}, over {seeds}, {names} {verb} the {extreme} "
         f"{METRIC_WORDS[study.metric]}: {interval(top.metric.mean)}"
     )
     if environment.optimum is None or study.metric not in ("final", "best"):
@@ -147,12 +154,15 @@ def _goal(environment: EnvironmentAnalysis) -> str:
     return f"a return of {number(threshold)}"
 
 
-def _on_failures(environment: EnvironmentAnalysis) -> Iterable[str]:
-    for agent in environment.agents:
-        if agent.n_missing:
+def _on_failures(n_seeds: int, environment: EnvironmentAnalysis) -> Iterable[str]:
+    for agent, n_missing in environment.missing.items():
+        if n_missing == n_seeds:
+            yield f"On {environment.environment}, no run of {agent} has finished."
+        elif n_missing:
+            verb = "is" if n_missing == 1 else "are"
             yield (
-                f"On {environment.environment}, {agent.n_missing} of "
-                f"{agent.n_missing + agent.n_runs} runs of {agent.agent} are missing."
+                f"On {environment.environment}, {n_missing} of {n_seeds} runs of {agent} "
+                f"{verb} missing."
             )
 
 

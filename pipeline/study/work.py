@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import contextlib
 import os
+import platform
 import shutil
 from pathlib import Path
 
 from rich.console import Console
 
+from pipeline.environments import import_gym_packages
 from pipeline.run import Run
+from pipeline.study.batches import do_batch
 from pipeline.study.planning import PlannedRun
 from pipeline.training import train
 
 
 def draft_path(root: Path, planned: PlannedRun) -> Path:
     """Where a run of this process is written until it is whole."""
-    name = f"{planned.path.parent.name}_{planned.path.name}"
-    return root / ".drafts" / f"{os.getpid()}_{name}"
+    name = f"{planned.path.parent.name}@{planned.path.name}"
+    return root / ".drafts" / f"{os.getpid()}@{platform.node()}@{name}"
 
 
 def remove_draft(draft: Path) -> None:
@@ -32,11 +35,20 @@ def remove_draft(draft: Path) -> None:
 
 
 def remove_dead_drafts(root: Path) -> None:
-    """Remove what processes that are gone have left."""
-    for draft in list((root / ".drafts").glob("*")):
-        pid = draft.name.partition("_")[0]
+    """Remove what processes of this machine that are gone have left."""
+    for draft in list((root / ".drafts").glob(f"*@{platform.node()}@*")):
+        pid = draft.name.partition("@")[0]
         if not (pid.isdigit() and _is_alive(int(pid))):
             remove_draft(draft)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it, also while another run removes those that are empty."""
+    for _ in range(1000):
+        with contextlib.suppress(FileNotFoundError):
+            path.mkdir(parents=True, exist_ok=True)
+            return
+    path.mkdir(parents=True)
 
 
 def _is_alive(pid: int) -> bool:
@@ -51,10 +63,16 @@ def _is_alive(pid: int) -> bool:
 
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     """Train in ``draft``, and rename it into place; another's result that is there stays."""
+    import_gym_packages(planned.spec.gym_packages)
     run = Run(draft, planned.run.env_name)
-    run.params_path.mkdir(parents=True)
-    args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
-    train(planned.spec, Console(quiet=True), args, command, run)
+    make_folder(run.params_path)
+    if planned.spec.tensorboard_log is not None:
+        shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)  # of an earlier try
+    if planned.is_batch:
+        do_batch(planned.spec, planned.n_runs, run, command)
+    else:
+        args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
+        train(planned.spec, Console(quiet=True), args, command, run)
     if planned.path.exists() and not planned.is_finished:
         shutil.rmtree(planned.path)  # of other settings, or cut off
     planned.path.parent.mkdir(parents=True, exist_ok=True)
