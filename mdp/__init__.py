@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         policy_return,
         state_visitation,
     )
+    from mdp.valuation import optimal_choices, state_values
 
 __all__ = [
     "FiniteHorizonPlan",
@@ -30,8 +31,10 @@ __all__ = [
     "best_blind_return",
     "blind_policies",
     "finite_horizon_optimum",
+    "optimal_choices",
     "policy_iteration",
     "policy_return",
+    "state_values",
     "state_visitation",
     "value_iteration",
 ]
@@ -47,6 +50,8 @@ _HOMES = {
     "blind_policies": "mdp.policy_evaluation",
     "policy_return": "mdp.policy_evaluation",
     "state_visitation": "mdp.policy_evaluation",
+    "optimal_choices": "mdp.valuation",
+    "state_values": "mdp.valuation",
 }
 
 

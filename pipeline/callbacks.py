@@ -21,6 +21,7 @@ from agents.blocks import BlockCallback, Horizon, calls_until_multiple
 from pipeline.evaluation import Evaluation
 from pipeline.files import replacing
 from pipeline.run import Run
+from pipeline.value_maps import ValueMapRecorder
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
@@ -49,7 +50,9 @@ class EvaluationCallback(EvalCallback):
         evaluator: evaluates an agent.
         eval_freq: calls of `VecEnv.step` between two evaluations; 0 for none but those asked for
             by `evaluate_now`.
+        eval_episode_freq: episodes between two evaluations, instead; 0 for none.
         callback_after_eval: told after every evaluation.
+        value_maps: keeps the agent's policy at every evaluation, where that can be drawn.
     """
 
     def __init__(
@@ -58,31 +61,50 @@ class EvaluationCallback(EvalCallback):
         eval_env: VecEnv,
         evaluator: Callable[[BaseAlgorithm], Evaluation],
         eval_freq: int,
+        eval_episode_freq: int = 0,
         callback_after_eval: BaseCallback | None = None,
+        value_maps: ValueMapRecorder | None = None,
     ) -> None:
         super().__init__(
             eval_env, callback_after_eval=callback_after_eval, eval_freq=eval_freq, verbose=0
         )
         self.run = run
         self.evaluator = evaluator
+        self.eval_episode_freq = eval_episode_freq
+        self.value_maps = value_maps
+        self.episodes_seen = 0
         self.last_evaluation: Evaluation | None = None
         self.best_timesteps = 0
 
     def horizon(self) -> Horizon:
         """When the next evaluation is due."""
-        return Horizon(calls=calls_until_multiple(self.n_calls, self.eval_freq))
+        return Horizon(
+            calls_until_multiple(self.n_calls, self.eval_freq),
+            calls_until_multiple(self.episodes_seen, self.eval_episode_freq),
+        )
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
         """Take note of calls that were left out."""
         self.n_calls += n_calls
+        self.episodes_seen += n_episodes
+
+    @property
+    def is_asked_for(self) -> bool:
+        """Whether there are to be evaluations during training."""
+        return self.eval_freq > 0 or self.eval_episode_freq > 0
 
     def _init_callback(self) -> None:
         """Training and evaluation environments may be of different kinds here."""
 
     def _on_step(self) -> bool:
-        if self.eval_freq > 0 and self.n_calls % self.eval_freq == 0:
-            return self.evaluate_now()
-        return True
+        before = self.episodes_seen
+        self.episodes_seen += int(np.sum(self.locals["dones"]))
+        is_due = self.eval_freq > 0 and self.n_calls % self.eval_freq == 0
+        if self.eval_episode_freq > 0:
+            is_due |= (
+                self.episodes_seen // self.eval_episode_freq > before // self.eval_episode_freq
+            )
+        return self.evaluate_now() if is_due else True
 
     def evaluate_now(self) -> bool:
         """Evaluate the agent as it is; False where a callback asks to stop the training."""
@@ -92,6 +114,8 @@ class EvaluationCallback(EvalCallback):
         self.last_evaluation = evaluation
         self.last_mean_reward = evaluation.mean_return
         self._append_to_file(evaluation)
+        if self.value_maps is not None:
+            self.value_maps.record(self.model, self.num_timesteps)
         self._log(evaluation)
         if evaluation.mean_return > self.best_mean_reward:
             self.best_mean_reward = evaluation.mean_return

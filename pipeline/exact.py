@@ -7,6 +7,7 @@ and its return under the time limit follows by arithmetic, without evaluation no
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,15 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.base import TabularAlgorithm
+from envs.layout import GridLayout, grid_layout
 from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
-from mdp import TransitionModel, best_blind_return, finite_horizon_optimum, policy_return
+from mdp import (
+    TransitionModel,
+    best_blind_return,
+    finite_horizon_optimum,
+    optimal_choices,
+    policy_return,
+)
 from pipeline.environments import make_single_env
 from pipeline.evaluation import Evaluation, Yardstick
 from pipeline.specs import TrainSpec
@@ -38,6 +46,7 @@ class ExactEvaluator:
         horizon: the time limit.
         success: the outcomes that count as success, shape (S, A, K), or None.
         yardstick: the best possible and the best blind return.
+        layout: where the states lie on a map, for grid worlds.
     """
 
     model: TransitionModel
@@ -45,10 +54,11 @@ class ExactEvaluator:
     horizon: int
     success: NDArray[np.bool_] | None
     yardstick: Yardstick
+    layout: GridLayout | None = None
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """The exact worth of the agent's policy as it is."""
-        policy = self._policy(agent, deterministic)
+        policy = self.policy(agent, deterministic)
         result = policy_return(self.model, policy, self.horizon, success=self.success)
         rate = result.success_rate
         return Evaluation(
@@ -59,7 +69,12 @@ class ExactEvaluator:
             yardstick=self.yardstick,
         )
 
-    def _policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
+    @cached_property
+    def optimum(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """What each state is worth at best, shape (S,), and its optimal actions, shape (S, A)."""
+        return optimal_choices(self.model, self.horizon)
+
+    def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
         """The agent's policy: of shape (S, A), or (horizon, S) where it depends on the time."""
         if isinstance(agent, PlanningAgent):
             steps = np.arange(self.horizon)[:, None]
@@ -80,14 +95,14 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
             return None
         if model.n_states > MAX_STATES:
             return None
-        success = success_outcomes(env)
+        success, layout = success_outcomes(env), grid_layout(env)
     finally:
         env.close()
     yardstick = Yardstick(
         optimum=float(finite_horizon_optimum(model, horizon).start_value),
         blind=float(best_blind_return(model, horizon)),
     )
-    return ExactEvaluator(model, observations, horizon, success, yardstick)
+    return ExactEvaluator(model, observations, horizon, success, yardstick, layout)
 
 
 def policy_matrix(

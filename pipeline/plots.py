@@ -126,6 +126,7 @@ def draw_learning_curve(
     axes.grid(alpha=0.3)
     axes.spines[["top", "right"]].set_visible(False)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(framealpha=0.9, edgecolor="none", loc="center right")
+        # Outside, where it covers no episode.
+        figure.legend(loc="outside lower left", ncols=4, frameon=False, fontsize=9)
     with replacing(run.curve_path) as draft:
         figure.savefig(draft, format="png")

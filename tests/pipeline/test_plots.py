@@ -14,6 +14,7 @@ from stable_baselines3.common.monitor import load_results
 
 from agents import load_algorithm
 from pipeline import plots
+from pipeline.evaluation import Yardstick
 from pipeline.plots import draw_learning_curve, moving_average, read_monitors
 from pipeline.run import Run
 
@@ -174,6 +175,27 @@ def test_a_run_with_little_to_show_is_drawn_without_warnings(run, rows):
     size, pixels = picture(run)
     assert size == (960, 540)
     assert not has_colour(pixels, plots.BLUE)
+
+
+def test_the_legend_covers_nothing(run, monkeypatch):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, draft, **_: drawn.append(figure))
+    write_monitor(run.path, 0, [(float(i), 10, i) for i in range(50)])
+    write_evaluations(run, [[1.0], [2.0]])
+    with pytest.raises(FileNotFoundError):
+        # The picture was not written.
+        draw_learning_curve(run, "title", yardstick=Yardstick(optimum=50, blind=0))
+    (figure,) = drawn
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[2:] == ["optimum", "best blind policy"]
+    box, (axes,) = legend.get_window_extent(), figure.axes
+    assert not box.overlaps(axes.get_tightbbox())
+    assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
+    assert figure.bbox.y0 <= box.y0
 
 
 def scale_of(returns):

@@ -1,0 +1,140 @@
+"""Where the states of a grid world lie on its map, and what stands there: all that a drawing needs.
+
+Letters of every layout, whatever the environment's own map writes: ``.`` free, ``S`` start, ``#``
+wall, ``G`` goal, ``X`` trap, ``P`` prize.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+from numpy.typing import NDArray
+
+from envs.grid import GridWorld
+from envs.grid_dynamics import MOVES, Tile
+
+FREE, START, WALL, GOAL, TRAP, PRIZE = ".S#GXP"
+
+UP, DOWN, LEFT, RIGHT = MOVES
+WORDS = {"#": "shelf", "M": "mine", "P": "power"}
+
+Indices = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class GridLayout:
+    """The map of a grid world, and how its states are numbered.
+
+    State ``cell + n_cells * layer`` is the robot on a cell, cells counted row by row from the top
+    left, where bit i of the layer says that the i-th prize has been collected. Without prizes
+    there is one layer, 0, and states are cells.
+
+    Attributes:
+        rows: the map in the letters above.
+        moves: the step (rows down, columns to the right) that each action tries.
+        names: what this environment calls its walls, traps and prizes.
+        prizes: the cells of the prizes.
+    """
+
+    rows: tuple[str, ...]
+    moves: tuple[tuple[int, int], ...]
+    names: Mapping[str, str]
+    prizes: tuple[int, ...] = ()
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns."""
+        return len(self.rows[0])
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return self.n_rows * self.n_columns
+
+    @property
+    def n_layers(self) -> int:
+        """In how many ways prizes may have been collected."""
+        return 1 << len(self.prizes)
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return self.n_cells * self.n_layers
+
+    @property
+    def cells(self) -> Indices:
+        """The cell of each state, shape (S,)."""
+        return np.arange(self.n_states) % self.n_cells
+
+    @property
+    def layers(self) -> Indices:
+        """The layer of each state, shape (S,)."""
+        return np.arange(self.n_states) // self.n_cells
+
+    def rows_in(self, layer: int) -> tuple[str, ...]:
+        """The map without the prizes that are collected in a layer."""
+        collected = self.collected_in(layer)
+        return tuple(
+            "".join(
+                FREE if row * self.n_columns + column in collected else letter
+                for column, letter in enumerate(letters)
+            )
+            for row, letters in enumerate(self.rows)
+        )
+
+    def collected_in(self, layer: int) -> tuple[int, ...]:
+        """The cells of the prizes that are collected in a layer."""
+        return tuple(cell for bit, cell in enumerate(self.prizes) if layer >> bit & 1)
+
+
+def grid_layout(env: gym.Env[Any, Any]) -> GridLayout | None:
+    """The layout of an environment, for the states of its ``envs.model.transition_model``.
+
+    Returns:
+        The layout of this project's grid worlds, FrozenLake and CliffWalking; None for all others.
+    """
+    base = env.unwrapped
+    if isinstance(base, GridWorld):
+        return _of_grid_world(base)
+    if isinstance(base, FrozenLakeEnv):
+        letters = str.maketrans("FH", FREE + TRAP)
+        rows = tuple("".join(row).translate(letters) for row in np.array(base.desc).astype(str))
+        return GridLayout(rows, (LEFT, DOWN, RIGHT, UP), {TRAP: "hole"})
+    if isinstance(base, CliffWalkingEnv):
+        cells = np.where(base._cliff, TRAP, FREE)
+        cells.flat[base.start_state_index], cells.flat[-1] = START, GOAL
+        rows = tuple("".join(row) for row in cells)
+        return GridLayout(rows, (UP, RIGHT, DOWN, LEFT), {TRAP: "cliff"})
+    return None
+
+
+def _of_grid_world(base: GridWorld) -> GridLayout:
+    tiles = {chr(code): tile for code, tile in base.dynamics.tiles.items()}
+    letters = {letter: _letter(letter, tile) for letter, tile in tiles.items()}
+    return GridLayout(
+        rows=tuple("".join(letters[letter] for letter in row) for row in base.map.rows),
+        moves=MOVES,
+        names={letters[letter]: word for letter, word in WORDS.items() if letter in letters},
+        prizes=tuple(base.dynamics.collectable_bits),
+    )
+
+
+def _letter(own: str, tile: Tile) -> str:
+    if own in {START, GOAL}:
+        return own
+    if tile.blocked:
+        return WALL
+    if tile.terminated:
+        return TRAP
+    return FREE if tile.bonus is None else PRIZE
