@@ -59,7 +59,7 @@ def _add_log_flags(parser: argparse.ArgumentParser) -> None:
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("judgement and output").add_argument
-    add("--metric", help="what verdicts are about: final, best, area, training, last_episodes")
+    add("--metric", help="what verdicts are about: final, best, area, regret, ...")
     add("--margin", type=float, help="difference within which agents count as equivalent")
     add("--episodes-table", type=int, metavar="N", help="average, min, max of every N episodes")
     add("--render-every", type=int, default=0, metavar="N", help="film an episode every N of them")
@@ -83,6 +83,10 @@ def main() -> int:
     from pipeline.study.planning import plan
 
     planned = plan(study, Path(args.log_folder) / study.name)
+    from pipeline.study.launchers import start_server
+
+    if not all(run.is_finished for run in planned):
+        start_server()  # it imports the libraries while this process does
     from pipeline.study.command import run_study
 
     return run_study(study, planned, args, command_line())

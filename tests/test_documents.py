@@ -34,6 +34,8 @@ def arguments(command):
 def checkout(tmp_path, monkeypatch):
     """A folder that holds what the commands take for granted."""
     (tmp_path / "map.txt").write_text("S..\n.#.\n..G\n")
+    log = "segment,arm,reward,propensity\ncore,0,1,0.5\ncasual,1,0,0.5\n"
+    (tmp_path / "train.csv").write_text(log)
     monkeypatch.chdir(tmp_path)
 
 

@@ -169,7 +169,8 @@ def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -
     """
     assert isinstance(env.action_space, spaces.Discrete)
     n_arms = int(env.action_space.n)
-    arms = np.random.default_rng(seed).integers(n_arms, size=n).tolist()
+    # A stream of its own: the environment draws from that of the seed itself.
+    arms = np.random.default_rng([seed, 1]).integers(n_arms, size=n).tolist()
     space = env.observation_space
     if isinstance(space, spaces.Discrete):
         names = ["context"] if space.n > 1 else []

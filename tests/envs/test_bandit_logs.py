@@ -211,7 +211,7 @@ def test_a_uniform_log_holds_what_the_environment_gave(tmp_path: Path) -> None:
     assert set(data.propensities.tolist()) == {1 / 3}
     env = gym.make("SegmentBandit-v0", pulls=30)
     context, _ = env.reset(seed=3)
-    for i, arm in enumerate(np.random.default_rng(3).integers(3, size=100).tolist()):
+    for i, arm in enumerate(np.random.default_rng([3, 1]).integers(3, size=100).tolist()):
         assert (data.contexts[i, 0], data.arms[i]) == (context, arm)
         context, reward, _, truncated, _ = env.step(arm)
         assert data.rewards[i] == reward
