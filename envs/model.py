@@ -12,6 +12,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+from gymnasium.envs.toy_text.taxi import TaxiEnv
 from numpy.typing import NDArray
 
 from envs.bandits.clicks import ClickBandit
@@ -43,6 +46,7 @@ TRANSPARENT_WRAPPERS = frozenset(
         "stable_baselines3.common.monitor.Monitor",
     }
 )
+KNOWN_ENVIRONMENTS = (GridWorld, ClickBandit, FrozenLakeEnv, CliffWalkingEnv, TaxiEnv)
 OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
 
 
@@ -147,6 +151,8 @@ def _folds(wrapper: Wrapper) -> bool:
 
 
 def _base_model(base: Env) -> TransitionModel | None:
+    if _steps_otherwise(base):
+        return None
     if isinstance(base, GridWorld | ClickBandit):
         return base.transition_model()
     if not _holds_model(base):
@@ -157,6 +163,12 @@ def _base_model(base: Env) -> TransitionModel | None:
     except ValueError as error:
         gym.logger.warn(f"{base}: what its P says is no model and is not used: {error}")
         return None
+
+
+def _steps_otherwise(base: Env) -> bool:
+    """Whether it is a subclass of an environment that is known, with a step or reset of its own."""
+    known = next((one for one in KNOWN_ENVIRONMENTS if isinstance(base, one)), type(base))
+    return type(base).step is not known.step or type(base).reset is not known.reset
 
 
 def _holds_model(base: Env) -> bool:

@@ -143,12 +143,12 @@ def play(chosen: ChosenModel, args: argparse.Namespace) -> None:
     th.set_num_threads(args.num_threads)
     console = Console(highlight=False)
     mode = "rgb_array" if args.record else _render_mode(args.render)
-    env = _playing_env(chosen, mode)
+    env = playing_env(chosen, mode)
     model = load_model(chosen.spec.algo, chosen.path, env, device=args.device)
     env.seed(args.seed)
     watcher = Watcher(env, mode, console)
     returns, lengths = [], []
-    for total_return, length in _episodes(model, env, args, watcher.show):
+    for total_return, length in play_episodes(model, env, args, watcher.show):
         returns.append(total_return)
         lengths.append(length)
         console.print(f"episode {len(returns)}: return {total_return:.2f}, {length} steps")
@@ -197,9 +197,13 @@ def _render_mode(render: str | None) -> str | None:
     return "human" if has_display else None
 
 
-def _playing_env(chosen: ChosenModel, mode: str | None) -> Any:
+def playing_env(chosen: ChosenModel, mode: str | None) -> Any:
+    """The VecEnv that a model is played on, drawn in that render mode."""
     from stable_baselines3.common.vec_env import VecNormalize
 
+    if mode == "rgb_array":
+        # Drawing into memory needs no display, and SDL complains where it finds none.
+        os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     extra = {} if mode is None else {"render_mode": mode}
     # A VecEnv resets a finished environment at once: frames are kept before that happens.
     keep_frames = mode in ("ansi", "rgb_array")
@@ -226,7 +230,7 @@ def collect_frames(env: Any) -> Any:
     return RenderCollection(env, pop_frames=True, reset_clean=False)
 
 
-def _episodes(
+def play_episodes(
     model: Any, env: Any, args: argparse.Namespace, show: Callable[[bool], None]
 ) -> Iterator[tuple[float, int]]:
     """Return and length of each episode as it ends."""
@@ -278,17 +282,14 @@ class Watcher:
 
 
 def write_film(path: Path, frames: list[Any]) -> None:
-    """Write pictures, uint8 of shape (height, width, 3), as a film."""
-    if path.suffix == ".gif":
+    """Write pictures, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
+    if path.suffix != ".mp4":
         from PIL import Image
 
         pictures = [Image.fromarray(frame) for frame in frames]
+        duration = 1000 // FRAMES_PER_SECOND
         pictures[0].save(
-            path,
-            save_all=True,
-            append_images=pictures[1:],
-            duration=1000 // FRAMES_PER_SECOND,
-            loop=0,
+            path, "GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0
         )
         return
     import imageio.v2 as imageio

@@ -24,6 +24,7 @@ class TrainSpec:
         eval_episodes: episodes of each evaluation during training.
         n_eval_envs: environments that an evaluation plays on at once.
         save_freq: environment steps between two checkpoints; below 1 for none.
+        save_every_n_episodes: episodes between two checkpoints; below 1 for none.
         log_folder: the folder above all runs.
         tensorboard_log: folder for TensorBoard, or None.
         trained_agent: a zip to go on training, or None.
@@ -47,6 +48,7 @@ class TrainSpec:
     eval_episodes: int = 20
     n_eval_envs: int = 10
     save_freq: int = -1
+    save_every_n_episodes: int = -1
     log_folder: Path = Path("logs")
     tensorboard_log: Path | None = None
     trained_agent: Path | None = None

@@ -29,6 +29,7 @@ from pipeline.study.results import StudyResults
 from pipeline.study.spec import COSTS, StudySpec
 
 SEED = 0  # of all resampling: the same runs give the same figures
+CURVE_POINTS = 200
 MARGIN = 0.02  # of the way from the best blind policy to the optimum
 
 Floats = NDArray[np.float64]
@@ -210,17 +211,18 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         return estimate(values(column), "mean", seed=SEED)
 
     has_threshold = bool(table["threshold"].notna().any())
+    metric = summarise(values(study.metric), seed=SEED)
     return AgentAnalysis(
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
         n_runs=len(table),
         n_missing=study.n_seeds - len(table),
-        metric=summarise(values(study.metric), seed=SEED),
+        metric=metric,
         score=summarise(values("score"), seed=SEED) if table["score"].notna().any() else None,
         final=mean("final"),
         area=mean("area"),
         last_episodes=mean("last_episodes"),
-        regret=mean("regret"),
+        regret=metric.mean if study.metric == "regret" else mean("regret"),
         steps_to_threshold=summarise_steps(values("steps_to_threshold")) if has_threshold else None,
         episodes_to_threshold=summarise_steps(values("episodes_to_threshold"))
         if has_threshold
@@ -284,6 +286,6 @@ def mean_curve(
     ]
     if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
         return None
-    grid = shared_grid([points for points, _ in runs])
+    grid = shared_grid([points for points, _ in runs], CURVE_POINTS)
     values = np.array([on_grid(points, returns, grid) for points, returns in runs])
     return grid, curve_band(values, seed=SEED)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.ticker import PercentFormatter
-from scipy import stats
 
 from pipeline.environments import make_single_env
 from pipeline.study.bounds import auer_bound, best_expected_reward, lai_robbins_slope
 from pipeline.study.drawing import COLOURS, agent_style, figure
+from pipeline.study.posteriors import density, grid, is_normal, truth
 from pipeline.study.pulls import QUANTILES, PullStatistics
 from pipeline.study.results import StudyResults
 from pipeline.study.spec import file_name
@@ -46,7 +46,7 @@ def write_bandit_figures(results: StudyResults, folder: Path) -> list[Path]:
         for agent, statistics in known.items():
             if len(statistics.moments):
                 path = folder / f"{name}_{file_name(agent)}_posteriors"
-                paths += _posteriors(agent, statistics, path)
+                paths += _posteriors(results, agent, statistics, path)
     return paths
 
 
@@ -81,7 +81,8 @@ def _testbed(results: StudyResults, environment: str, pulls: Pulls, path: Path) 
 def _regret(results: StudyResults, environment: str, pulls: Pulls, path: Path) -> list[Path]:
     """Cumulative regret on a logarithmic axis of pulls, with what theory says of it."""
     written: list[Path] = []
-    with figure(path, written, n_columns=2) as (left, right):
+    has_simple = any(np.isfinite(p.simple_regret).any() for p in pulls.values())
+    with figure(path, written, n_columns=1 + has_simple) as (left, *others):
         for agent, statistics in pulls.items():
             style = agent_style(results.study, agent)
             x, mean = statistics.pulls, statistics.cumulative_regret
@@ -92,13 +93,15 @@ def _regret(results: StudyResults, environment: str, pulls: Pulls, path: Path) -
                 x, mean - reach, mean + reach, color=style["color"], alpha=0.3, linewidth=0
             )
             left.fill_between(x, low, high, color=style["color"], alpha=0.08, linewidth=0)
-            right.plot(x, statistics.simple_regret, linewidth=1.5, **style)
+            for right in others:
+                right.plot(x, statistics.simple_regret, linewidth=1.5, **style)
         _draw_bounds(left, results, environment, next(iter(pulls.values())))
         left.set(xscale="log", xlabel="pulls", ylabel="cumulative regret")
-        right.set(xscale="log", xlabel="pulls", ylabel="simple regret")
         width = f"{QUANTILES[-1] - QUANTILES[0]:.0%}"
         left.set_title(f"{environment}: mean, 95 % interval, {width} of runs", loc="left")
-        right.set_title("of recommending the arm pulled most", loc="left")
+        for right in others:
+            right.set(xscale="log", xlabel="pulls", ylabel="simple regret")
+            right.set_title("of recommending the arm pulled most", loc="left")
         _shared_legend(left)
     return written
 
@@ -166,34 +169,29 @@ def _arms(results: StudyResults, pulls: Pulls, path: Path) -> list[Path]:
     return written
 
 
-def _posteriors(agent: str, statistics: PullStatistics, path: Path) -> list[Path]:
+def _posteriors(results: StudyResults, agent: str, known: PullStatistics, path: Path) -> list[Path]:
     """What Thompson sampling believed of each arm in its first run, at a few moments."""
     written: list[Path] = []
-    moments = statistics.moments
-    with figure(path, written, n_columns=len(moments), height=3.2) as panels:
-        for index, axes in enumerate(panels):
-            for arm, parameters in enumerate(statistics.posteriors[index, 0]):
-                x, density = _density(parameters, statistics.true_means)
+    normal = is_normal(results, agent)
+    x = grid(known.true_means, is_normal=normal)
+    n_contexts = known.posteriors.shape[1]
+    with figure(
+        path, written, n_columns=len(known.moments), n_rows=n_contexts, height=3.2 * n_contexts
+    ) as panels:
+        for panel, axes in enumerate(panels):
+            context, moment = divmod(panel, len(known.moments))
+            for arm, parameters in enumerate(known.posteriors[moment, context]):
                 colour = COLOURS[arm % len(COLOURS)]
-                axes.plot(x, density, linewidth=1.5, label=f"arm {arm}", color=colour)
-                truth = statistics.true_means[0, arm]
-                axes.axvline(truth, color=colour, linestyle=":", linewidth=1)
+                y = density(parameters, x, is_normal=normal)
+                axes.plot(x, y, linewidth=1.5, label=f"arm {arm}", color=colour)
+                mean = truth(known, context, arm)
+                if mean is not None:
+                    axes.axvline(mean, color=colour, linestyle=":", linewidth=1)
             axes.set(xlabel="mean reward", ylabel="density")
-            axes.set_title(f"{agent}, after {moments[index]:,} pulls", loc="left")
+            place = f", context {context}" if n_contexts > 1 else ""
+            axes.set_title(f"{agent}{place}, after {known.moments[moment]:,} pulls", loc="left")
         panels[0].legend(frameon=False)
     return written
-
-
-def _density(
-    parameters: np.ndarray[Any, Any], true_means: np.ndarray[Any, Any]
-) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """A posterior: a Beta distribution where all means lie between 0 and 1, else a normal one."""
-    first, second = parameters
-    if true_means.min() >= 0 and true_means.max() <= 1:
-        x = np.linspace(0, min(2 * true_means.max(), 1.0), 501)
-        return x, np.asarray(stats.beta.pdf(x, first, second))
-    x = np.linspace(true_means.min() - 2, true_means.max() + 2, 501)
-    return x, np.asarray(stats.norm.pdf(x, first, second))
 
 
 def _shared_legend(axes: Axes) -> None:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from pipeline.pulls import PULLS_FILE
-from pipeline.study.batches import STATISTICS_FILE, stacked_statistics
+from pipeline.study.batches import STATISTICS_FILE, read_run, stacked_statistics
 from pipeline.study.planning import PlannedRun
 from pipeline.study.pulls import PullStatistics
 
@@ -58,10 +55,9 @@ def batch_rows(planned: PlannedRun, pulls: PullStatistics) -> list[dict[str, Any
     ]
 
 
-def run_regret(folder: Path) -> float | None:
+def run_regret(planned: PlannedRun) -> float | None:
     """The regret of a run of its own, or None where it was on no bandit."""
-    path = folder / PULLS_FILE
-    if not path.exists():
+    if not (planned.path / PULLS_FILE).exists():
         return None
-    with np.load(path) as arrays:
-        return float(arrays["regrets"].sum())
+    pulls = read_run(planned.path, planned.spec.hyperparams.n_timesteps)
+    return float(pulls["regrets"].sum())

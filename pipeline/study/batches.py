@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
         env_name=run.env_name,
         spec=spec.as_data(),
         n_runs=n_runs,
+        n_timesteps=len(result.arms[0]),
         versions=recorded_versions(),
         seconds=round(time.monotonic() - started, 3),
         engine=engine,
@@ -67,7 +69,7 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
 
 def _statistics(env: gym.Env[Any, Any], result: BatchResult) -> PullStatistics:
     bandit: Any = env.unwrapped
-    return pull_statistics(
+    statistics = pull_statistics(
         result.arms,
         result.rewards,
         result.regrets,
@@ -79,6 +81,16 @@ def _statistics(env: gym.Env[Any, Any], result: BatchResult) -> PullStatistics:
         result.moments,
         result.posteriors,
     )
+    return statistics if _has_best_arms(bandit) else _without_simple_regret(statistics)
+
+
+def _has_best_arms(bandit: Any) -> bool:
+    """Whether an arm could be recommended: not where its worth moves, or goes by a vector."""
+    return bandit.n_contexts > 0 and not getattr(bandit, "drift_std", 0.0) > 0
+
+
+def _without_simple_regret(statistics: PullStatistics) -> PullStatistics:
+    return replace(statistics, simple_regret=np.full_like(statistics.simple_regret, np.nan))
 
 
 def true_means(env: gym.Env[Any, Any]) -> NDArray[np.float64] | None:
@@ -89,19 +101,25 @@ def true_means(env: gym.Env[Any, Any]) -> NDArray[np.float64] | None:
     return None if moves or means is None else np.array(means, dtype=np.float64)
 
 
+def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
+    """The pulls of a run of its own in the order of time, each of shape (n_pulls,).
+
+    Agents that collect whole rollouts go on beyond ``n_timesteps``; that is left out.
+    """
+    with np.load(folder / PULLS_FILE) as arrays:
+        return {name: array.T.ravel()[:n_timesteps] for name, array in arrays.items()}
+
+
 def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
     """The same for runs that were done one by one, from the pulls in their folders."""
-    runs = []
-    for folder in folders:
-        with np.load(folder / PULLS_FILE) as arrays:
-            runs.append({name: array[0] for name, array in arrays.items()})
+    runs = [read_run(folder, spec.hyperparams.n_timesteps) for folder in folders]
     n_pulls = min(len(run["arms"]) for run in runs)
     env = make_single_env(spec)
     try:
         bandit: Any = env.unwrapped
         n_contexts = max(bandit.n_contexts, 1)
         stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
-        return pull_statistics(
+        statistics = pull_statistics(
             stacked["arms"],
             stacked["rewards"],
             stacked["regrets"],
@@ -110,5 +128,6 @@ def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
             n_contexts,
             true_means=true_means(env),
         )
+        return statistics if _has_best_arms(bandit) else _without_simple_regret(statistics)
     finally:
         env.close()

@@ -35,12 +35,12 @@ def agent_style(study: StudySpec, agent: str) -> dict[str, Any]:
 
 @contextmanager
 def figure(
-    path: Path, written: list[Path], n_columns: int = 1, height: float = 4.2
+    path: Path, written: list[Path], n_columns: int = 1, height: float = 4.2, n_rows: int = 1
 ) -> Iterator[Sequence[Axes]]:
-    """A row of axes, written to ``path`` as .png and .svg in the end."""
+    """Axes row by row, written to ``path`` as .png and .svg in the end."""
     with mpl.rc_context(_FONTS):
         canvas = Figure(figsize=(6.4 * n_columns, height), layout="constrained")
-        axes = canvas.subplots(1, n_columns, squeeze=False)[0]
+        axes = canvas.subplots(n_rows, n_columns, squeeze=False).ravel()
         yield axes
         for place in axes:
             place.grid(alpha=0.3)

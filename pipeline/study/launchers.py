@@ -15,7 +15,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing import forkserver
+from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -113,9 +113,7 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
     Args:
         n_workers: processes that work at once.
     """
-    for name in THREAD_VARIABLES:
-        os.environ.setdefault(name, "1")
-    _start_server()
+    start_server()
     _stopping.clear()
     executor = ThreadPoolExecutor(n_workers)
     try:
@@ -127,9 +125,16 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
         executor.shutdown(cancel_futures=True)
 
 
-def _start_server() -> None:
-    """Start the process that children are forked from, deaf to Ctrl-C while it imports."""
+def start_server() -> None:
+    """Start the process that children are forked from, deaf to Ctrl-C while it imports.
+
+    It goes on by itself: who starts it early has it sooner.
+    """
+    for name in THREAD_VARIABLES:
+        os.environ.setdefault(name, "1")
     _context.set_forkserver_preload(PRELOADED)
+    # It lets SIGINT through again after its own start, so that has to come first.
+    resource_tracker.ensure_running()
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     try:
         forkserver.ensure_running()

@@ -126,6 +126,7 @@ def pull_statistics(
         context_regret = sums.reshape(n_contexts, n_arms) / counts
         shares = counts / counts.sum(axis=1, keepdims=True)
     n_runs = len(arms)
+    mean, std = _mean_and_std(empty[None] if estimates is None else estimates)
     return PullStatistics(
         pulls=points,
         reward=_mean_since_last(rewards.mean(axis=0, dtype=np.float64), points),
@@ -139,12 +140,22 @@ def pull_statistics(
         total_regret=cumulative[:, -1],
         shares=shares,
         context_regret=context_regret,
-        estimates=empty if estimates is None else np.nanmean(estimates, axis=0),
-        estimates_std=empty if estimates is None else np.nanstd(estimates, axis=0),
+        estimates=mean,
+        estimates_std=std,
         true_means=empty if true_means is None else true_means,
         moments=np.array(moments, dtype=np.int64),
         posteriors=np.empty((0, 0, 0, 2)) if posteriors is None else posteriors[0],
     )
+
+
+def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
+    """Over runs, leaving out nan; nan where no run has a figure."""
+    is_known = ~np.isnan(estimates)
+    with np.errstate(invalid="ignore"):
+        n_known = is_known.sum(axis=0)
+        mean = np.where(is_known, estimates, 0.0).sum(axis=0) / n_known
+        squares = np.where(is_known, estimates - mean, 0.0) ** 2
+        return mean, np.sqrt(squares.sum(axis=0) / n_known)
 
 
 def _mean_since_last(by_pull: Floats, points: NDArray[np.int64]) -> Floats:

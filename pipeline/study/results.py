@@ -231,7 +231,7 @@ def _summary_row(
         "area": area_under_curve(steps, values) if len(steps) else None,
         "training": _mean(episodes.returns),
         "last_episodes": _mean(episodes.returns[-LAST_EPISODES:]),
-        "regret": run_regret(planned.path),
+        "regret": run_regret(planned),
         "threshold": threshold,
         "steps_to_threshold": reached,
         "episodes_to_threshold": _episodes_by(episodes, reached),

@@ -70,7 +70,7 @@ def _bandit_ranking(
     )
     quantiles = f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs"
     table = Table(
-        title=environment.environment,
+        title=escape(environment.environment),
         caption=caption,
         title_justify="left",
         caption_justify="left",
@@ -84,7 +84,7 @@ def _bandit_ranking(
         statistics = pulls[agent.agent]
         low, *_, high = np.quantile(statistics.total_regret, QUANTILES)
         table.add_row(
-            agent.agent,
+            escape(agent.agent),
             interval(agent.regret),
             f"{number(low)} to {number(high)}",
             number(statistics.simple_regret[-1]),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from pipeline.statistics import Estimate, PairComparison
-from pipeline.study.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from pipeline.study.analysis import EnvironmentAnalysis, StudyAnalysis
 from pipeline.study.spec import COSTS, METRIC_WORDS, StudySpec
 
 SIGNIFICANT = 4
@@ -57,6 +57,10 @@ def environment_sentences(study: StudySpec, environment: EnvironmentAnalysis) ->
     ]
 
 
+def _seeds(n: int) -> str:
+    return f"{n:,} seed{'s' if n > 1 else ''}"
+
+
 def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     top = environment.agents[0]
     value = top.metric.mean.point
@@ -67,9 +71,8 @@ def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     names = enumeration([agent.agent for agent in best])
     verb = "has" if len(best) == 1 else "have"
     extreme = "lowest" if study.metric in COSTS else "highest"
-    seeds = f"{study.n_seeds} seed{'s' if study.n_seeds > 1 else ''}"
     text = (
-        f"On {environment.environment}, over {seeds}, {names} {verb} the {extreme} "
+        f"On {environment.environment}, over {_seeds(study.n_seeds)}, {names} {verb} the {extreme} "
         f"{METRIC_WORDS[study.metric]}: {interval(top.metric.mean)}"
     )
     if environment.optimum is None or study.metric not in ("final", "best"):
@@ -111,8 +114,8 @@ def _by_how_much(pairs: Sequence[PairComparison]) -> str:
 
 def _on_undecided(study: StudySpec, place: str, pair: PairComparison) -> str:
     text = (
-        f"{place}, {pair.first} and {pair.second} are not distinguishable with {study.n_seeds} "
-        f"seeds (difference {interval(pair.difference)})"
+        f"{place}, {pair.first} and {pair.second} are not distinguishable with "
+        f"{_seeds(study.n_seeds)} (difference {interval(pair.difference)})"
     )
     if pair.seeds_needed is not None:
         text += f"; {pair.seeds_needed:,} seeds would probably tell"
@@ -164,8 +167,3 @@ def _on_failures(n_seeds: int, environment: EnvironmentAnalysis) -> Iterable[str
                 f"On {environment.environment}, {n_missing} of {n_seeds} runs of {agent} "
                 f"{verb} missing."
             )
-
-
-def verdict_word(pair: PairComparison, agent: AgentAnalysis) -> str:
-    """The verdict of a pair as seen from ``agent``."""
-    return (pair if pair.first == agent.agent else pair.swapped()).verdict

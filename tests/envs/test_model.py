@@ -6,6 +6,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.wrappers import (
     RecordEpisodeStatistics,
     TimeAwareObservation,
@@ -16,6 +17,7 @@ from stable_baselines3.common.monitor import Monitor
 
 import envs  # noqa: F401 (registers the environments)
 from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
+from envs.warehouse import WarehouseEnv
 from envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
@@ -203,3 +205,14 @@ def test_success_in_grid_worlds_is_the_goal(mine_reward: float) -> None:
 def test_success_does_not_depend_on_wrapped_rewards() -> None:
     env = gym.make("FrozenLake-v1", is_slippery=False)
     assert successes(TerminationReward(ScaleReward(env, -1), 0)) == [(14, 2)]
+
+
+@pytest.mark.parametrize("known", [FrozenLakeEnv, WarehouseEnv])
+@pytest.mark.parametrize("method", ["step", "reset"])
+def test_a_subclass_that_steps_or_resets_in_its_own_way_has_no_model(known, method):
+    def other(self, *args, **kwargs):
+        return getattr(known, method)(self, *args, **kwargs)
+
+    assert transition_model(known()) is not None
+    assert transition_model(type("Same", (known,), {})()) is not None
+    assert transition_model(type("Other", (known,), {method: other})()) is None

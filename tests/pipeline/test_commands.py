@@ -78,7 +78,7 @@ def test_a_run_folder_is_whole(type_command, tmp_path):
     assert config["n_timesteps"] == 500
     assert "--seed 0" in (run / "FrozenLake-v1" / "command.txt").read_text()
     with np.load(run / "evaluations.npz") as evaluations:
-        assert evaluations["results"].shape == (20, 1)
+        assert evaluations["results"].shape == (20, 2)
         assert evaluations["timesteps"][-1] == 500
 
 

@@ -1,0 +1,29 @@
+report.section("comparison", (root, data) => {
+  const chosen = () => data.environments[report.environment];
+
+  report.figure(root.querySelector("#intervals"), () => {
+    const { intervals: rows, linearUpTo: linear } = chosen();
+    const values = rows.flatMap((row) => [row.low, row.high, ...row.runs]).filter((v) => v !== null);
+    const symlog = linear === null ? null : report.symlog(linear);
+    const height = symlog?.height ?? ((value) => value);
+    const middle = (height(Math.min(...values)) + height(Math.max(...values))) / 2;
+    const { traces, yaxis, height: pixels } = report.intervals(rows, { height });
+    return {
+      traces,
+      layout: {
+        height: pixels,
+        hovermode: "closest",
+        shapes: report.references(report.page.environments[report.environment], height, middle),
+        xaxis: { title: { text: data.metric }, ...symlog?.ticks(Math.min(...values), Math.max(...values, linear)) },
+        yaxis,
+      },
+    };
+  });
+
+  const matrix = root.querySelector("#matrix");
+  report.figure(matrix.querySelector(".plot"), () => {
+    const { agents, improvement } = chosen();
+    matrix.hidden = agents.length < 2;
+    return report.matrix(agents, improvement);
+  });
+});

@@ -1,0 +1,49 @@
+report.section("curves", (root, data) => {
+  const TITLES = { step: "environment steps", episode: "episodes", seconds: "wall time (s)" };
+  const chosen = (name) => root.querySelector(`input[name="${name}"]:checked`).value;
+  const figure = root.querySelector(".plot");
+  const detail = root.querySelector(".detail");
+  const scale = root.querySelector('[data-switch="scale"]');
+  const legend = root.querySelector(".legend");
+  let redraw = () => {};
+  const isShown = report.legend(legend, () => redraw());
+
+  const extent = (curves) => {
+    const environment = report.page.environments[report.environment];
+    const values = curves.flatMap((curve) => [...curve.y, ...curve.low, ...curve.high]);
+    const known = [...values, environment.optimum, environment.blind].filter((v) => v !== null);
+    return known.length ? [Math.min(...known), Math.max(...known)] : [0, 1];
+  };
+
+  const build = () => {
+    const isBandit = data[report.environment] === null;
+    [root.querySelector(".controls"), root.querySelector("figure")].forEach((element) => {
+      element.hidden = isBandit;
+    });
+    if (isBandit) return { traces: [], layout: {} };
+    const [kind, by, across] = ["kind", "by", "across"].map(chosen);
+    const linear = data[report.environment][kind].linearUpTo;
+    scale.hidden = linear === null;
+    const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
+    const height = symlog?.height ?? ((value) => value);
+    const curves = Object.entries(data[report.environment][kind][by]).filter(([label]) => isShown(label));
+    detail.textContent = symlog
+      ? `The vertical axis is linear up to ±${report.number(linear)} and logarithmic beyond.`
+      : "";
+    return {
+      traces: curves.flatMap(([label, curve]) => report.band(label, curve, height)),
+      layout: {
+        hovermode: "x unified",
+        uirevision: [report.environment, kind, by, across, chosen("scale")].join(),
+        shapes: report.references(report.page.environments[report.environment], height),
+        xaxis: { title: { text: TITLES[by] }, type: across, hoverformat: ",.4~r", exponentformat: "SI", rangemode: "tozero" },
+        yaxis: {
+          title: { text: kind === "evaluation" ? "return of evaluations" : "return of training episodes" },
+          ...symlog?.ticks(...extent(curves.map(([, curve]) => curve))),
+        },
+      },
+    };
+  };
+  redraw = report.figure(figure, build);
+  root.querySelectorAll(".controls input").forEach((input) => input.addEventListener("change", redraw));
+});

@@ -1,0 +1,268 @@
+// Drawing with Plotly in the colours of the page.
+(() => {
+  const CONFIG = {
+    responsive: true,
+    displaylogo: false,
+    displayModeBar: "hover",
+    modeBarButtonsToRemove: [
+      "select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d",
+      "sendChartToCloud", // a page that needs no network offers none
+    ],
+  };
+  const narrow = matchMedia("(max-width: 40rem)");
+  narrow.addEventListener("change", () => report.changed());
+
+  const axis = () => ({
+    gridcolor: report.css("--soft"),
+    linecolor: report.css("--line"),
+    zeroline: false,
+    showline: true,
+    ticks: "outside",
+    tickcolor: report.css("--line"),
+    automargin: true,
+    separatethousands: true,
+    spikecolor: report.css("--muted"),
+    spikethickness: 1,
+  });
+
+  // Draws what `build` returns, traces and layout, into the element, now and after each change.
+  report.figure = (element, build) => {
+    const draw = () => {
+      const { traces, layout } = build();
+      const { xaxis, yaxis, ...rest } = layout;
+      Plotly.react(
+        element,
+        traces,
+        {
+          paper_bgcolor: "rgba(0,0,0,0)",
+          plot_bgcolor: "rgba(0,0,0,0)",
+          font: { family: getComputedStyle(document.body).fontFamily, size: 13, color: report.css("--ink") },
+          margin: { l: 50, r: 14, t: 38, b: 46 },
+          showlegend: false,
+          modebar: { bgcolor: "rgba(0,0,0,0)", color: report.css("--muted"), activecolor: report.css("--accent") },
+          hoverlabel: { bgcolor: report.css("--card"), bordercolor: report.css("--line"), font: { color: report.css("--ink") } },
+          ...rest,
+          xaxis: { ...axis(), ...xaxis },
+          yaxis: { ...axis(), ...yaxis },
+        },
+        CONFIG,
+      );
+    };
+    report.onChange(draw);
+    draw();
+    return draw;
+  };
+
+  // Plotly reads tags and entities in its texts.
+  report.text = (label) =>
+    label.replaceAll("&", "&amp;").replaceAll("<", "&lt;").replaceAll(">", "&gt;");
+
+  // A label for an axis, on several lines where it is long.
+  report.tick = (label) => {
+    const width = narrow.matches ? 12 : 28;
+    const lines = [];
+    const words = label.split(/(?<=[ _,=-])/).flatMap((word) => word.match(new RegExp(`.{1,${width}}`, "gu")) ?? []);
+    for (const word of words) {
+      const last = lines.length - 1;
+      if (last >= 0 && lines[last].length + word.length <= width) lines[last] += word;
+      else lines.push(word);
+    }
+    return lines.map(report.text).join("<br>");
+  };
+
+  report.fade = (colour, alpha) => {
+    const parts = [1, 3, 5].map((at) => parseInt(colour.slice(at, at + 2), 16));
+    return `rgba(${parts.join(",")},${alpha})`;
+  };
+
+  // The interval of a curve as a surface, and the curve itself.
+  report.band = (label, curve, height, line = {}) => {
+    const colour = report.colour(label);
+    const seen = curve.x.map((_, i) => i).filter((i) => curve.low[i] !== null);
+    const traces = [];
+    if (seen.length > 1) {
+      const back = seen.toReversed();
+      traces.push({
+        x: [...seen, ...back].map((i) => curve.x[i]),
+        y: [...seen.map((i) => height(curve.high[i])), ...back.map((i) => height(curve.low[i]))],
+        fill: "toself",
+        fillcolor: report.fade(colour, 0.18),
+        line: { width: 0 },
+        mode: "lines",
+        hoverinfo: "skip",
+      });
+    }
+    traces.push({
+      x: curve.x,
+      y: curve.y.map(height),
+      name: report.text(label),
+      text: curve.y.map((point, i) => report.interval({ point, low: curve.low[i], high: curve.high[i] })),
+      hovertemplate: "%{text}",
+      mode: curve.x.length > 1 ? "lines" : "markers",
+      line: { color: colour, width: 2.2, dash: report.mark(label).dash, ...line },
+      marker: { color: colour, size: 9 },
+    });
+    return traces;
+  };
+
+  // The optimum and the best blind policy as lines: across, or upright where the middle of the
+  // horizontal axis is given, so that their names fall inside the figure and on no other name.
+  report.references = (environment, height, middle = null) =>
+    [
+      { name: "optimum", value: environment.optimum, dash: "solid", isUpper: true },
+      { name: "best blind", value: environment.blind, dash: "dot", isUpper: false },
+    ]
+      .filter(({ value }) => value !== null)
+      .map(({ name, value, dash, isUpper }) => {
+        const at = height(value);
+        const place =
+          middle === null
+            ? { xref: "paper", x0: 0, x1: 1, y0: at, y1: at }
+            : { yref: "paper", y0: 0, y1: 1, x0: at, x1: at };
+        const side =
+          middle === null
+            ? { textposition: "end", xanchor: "right", yanchor: isUpper ? "bottom" : "top" }
+            : { textposition: isUpper ? "end" : "start", xanchor: at > middle ? "right" : "left", yanchor: "bottom" };
+        return {
+          type: "line",
+          ...place,
+          line: { color: report.css("--muted"), width: 1.4, dash },
+          label: { text: `${name} ${report.number(value)}`, textangle: 0, font: { size: 11, color: report.css("--muted") }, ...side },
+        };
+      });
+
+  // An axis that is linear up to a magnitude and logarithmic beyond.
+  report.symlog = (linear) => {
+    const height = (value) => {
+      if (value === null) return null;
+      const size = Math.abs(value) / linear;
+      return Math.sign(value) * (size <= 1 ? size : 1 + Math.log10(size));
+    };
+    const ticks = (low, high) => {
+      const step = 10 ** Math.floor(Math.log10(linear));
+      const values = [0];
+      const inner = step * (linear / step >= 5 ? 5 : linear / step >= 2 ? 2 : 1);
+      values.push(inner, -inner);
+      for (let size = step * 10; size <= Math.max(Math.abs(low), Math.abs(high)); size *= 10) {
+        values.push(size, -size);
+      }
+      const shown = values.filter((value) => value >= low && value <= high);
+      return { tickvals: shown.map(height), ticktext: shown.map(report.number) };
+    };
+    return { height, ticks };
+  };
+
+  // Buttons that hide and show agents; returns whether one is shown.
+  report.legend = (root, redraw) => {
+    const hidden = new Set();
+    const fill = () => {
+      root.replaceChildren(
+        ...report.page.environments[report.environment].agents.map((label) => {
+          const button = document.createElement("button");
+          button.type = "button";
+          const dash = { solid: "", dash: "6 3", dashdot: "6 3 1 3", dot: "2 3" }[report.mark(label).dash];
+          const line = document.createElementNS("http://www.w3.org/2000/svg", "svg");
+          line.setAttribute("aria-hidden", "true");
+          line.innerHTML = `<line x1="0" x2="100%" y1="50%" y2="50%" stroke="var(--agent)" stroke-width="3" stroke-dasharray="${dash}"/>`;
+          line.dataset.colour = report.mark(label).colour;
+          button.append(line, label);
+          button.setAttribute("aria-pressed", String(!hidden.has(label)));
+          button.addEventListener("click", () => {
+            if (!hidden.delete(label)) hidden.add(label);
+            button.setAttribute("aria-pressed", String(!hidden.has(label)));
+            redraw();
+          });
+          return button;
+        }),
+      );
+    };
+    report.onChange(fill);
+    fill();
+    return (label) => !hidden.has(label);
+  };
+
+  // Dots with intervals, an agent on each line.
+  report.intervals = (rows, { height: heightOf = (value) => value, spread = 0.22, least = -Infinity } = {}) => {
+    const height = (value) => heightOf(Math.max(value, least));
+    const traces = [];
+    rows.forEach((row, i) => {
+      const place = rows.length - 1 - i;
+      const colour = report.colour(row.agent);
+      if (row.low !== null) {
+        traces.push({
+          x: [height(row.low), height(row.high)],
+          y: [place, place],
+          mode: "lines",
+          line: { color: report.fade(colour, 0.35), width: 12 },
+          hoverinfo: "skip",
+        });
+      }
+      const runs = row.runs ?? [];
+      if (runs.length) {
+        traces.push({
+          x: runs.map(height),
+          y: runs.map((_, k) => place + (runs.length > 1 ? spread * ((2 * k) / (runs.length - 1) - 1) : 0)),
+          mode: "markers",
+          marker: { color: colour, size: 6, opacity: 0.75 },
+          text: runs.map((value, k) => `seed ${row.seeds[k]}: ${report.number(value)}`),
+          hovertemplate: "%{text}<extra></extra>",
+        });
+      }
+      traces.push({
+        x: [height(row.point)],
+        y: [place],
+        mode: "markers",
+        marker: { symbol: row.point < least ? "triangle-left" : "line-ns", size: row.point < least ? 9 : 18, color: colour, line: { color: colour, width: 3.5 } },
+        text: [report.interval(row)],
+        name: report.text(row.agent),
+        hovertemplate: "mean %{text}",
+      });
+    });
+    return {
+      traces,
+      height: 98 + 46 * rows.length,
+      yaxis: {
+        tickvals: rows.map((_, i) => rows.length - 1 - i),
+        ticktext: rows.map((row) => report.tick(row.agent)),
+        range: [-0.6, rows.length - 0.4],
+        fixedrange: true,
+        showgrid: false,
+        ticks: "",
+      },
+    };
+  };
+
+  // Who beats whom with which probability, as a heat map.
+  report.matrix = (agents, chances) => {
+    const low = report.css("--agent-1");
+    const high = report.css("--agent-0");
+    return {
+      traces: [
+        {
+          type: "heatmap",
+          z: chances,
+          x: agents.map((_, i) => i),
+          y: agents.map((_, i) => i),
+          zmin: 0,
+          zmax: 1,
+          colorscale: [[0, low], [0.5, report.css("--card")], [1, high]],
+          text: chances.map((row) => row.map((chance) => (chance === null ? "" : chance.toFixed(2)))),
+          texttemplate: "%{text}",
+          customdata: agents.map((row) => agents.map((column) => [report.text(row), report.text(column)])),
+          hovertemplate: "%{customdata[0]} beats %{customdata[1]}: %{z:.2f}<extra></extra>",
+          hoverongaps: false,
+          xgap: 2,
+          ygap: 2,
+          showscale: !narrow.matches,
+          colorbar: { thickness: 10, outlinewidth: 0, tickformat: ".1f" },
+        },
+      ],
+      layout: {
+        height: 130 + 46 * agents.length,
+        margin: { l: 50, r: 14, t: 30, b: 20 },
+        xaxis: { side: "top", tickvals: agents.map((_, i) => i), ticktext: agents.map(report.tick), fixedrange: true, showgrid: false, showline: false, ticks: "" },
+        yaxis: { autorange: "reversed", tickvals: agents.map((_, i) => i), ticktext: agents.map(report.tick), fixedrange: true, showgrid: false, showline: false, ticks: "" },
+      },
+    };
+  };
+})();

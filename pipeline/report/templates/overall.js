@@ -1,0 +1,22 @@
+report.section("overall", (root, data) => {
+  report.figure(root.querySelector("#aggregate"), () => {
+    // A score far below the best blind policy would leave no room for the others.
+    const { traces, yaxis, height } = report.intervals(data.iqm, { least: -0.5 });
+    return {
+      traces,
+      layout: { height: Math.max(height, 320), hovermode: "closest", xaxis: { title: { text: "interquartile mean score" } }, yaxis },
+    };
+  });
+  report.figure(root.querySelector("#profiles"), () => ({
+    traces: data.agents.flatMap((label) =>
+      report.band(label, { x: data.thresholds, ...data.profiles[label] }, (value) => value),
+    ),
+    layout: {
+      height: Math.max(74 + 46 * data.agents.length, 320),
+      hovermode: "x unified",
+      xaxis: { title: { text: "score" }, hoverformat: ".2f" },
+      yaxis: { title: { text: "share of runs with a higher score" }, range: [0, 1.02], tickformat: ".0%" },
+    },
+  }));
+  report.figure(root.querySelector("#overall-matrix"), () => report.matrix(data.agents, data.improvement));
+});

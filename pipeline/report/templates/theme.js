@@ -1,0 +1,40 @@
+"use strict";
+
+// The theme, chosen before anything is drawn: the system's until the reader chooses.
+const theme = (() => {
+  const order = ["auto", "light", "dark"];
+  const system = matchMedia("(prefers-color-scheme: dark)");
+  let choice = "auto";
+  let listener = () => {};
+  try {
+    choice = localStorage.getItem("theme") ?? "auto";
+  } catch {
+    // A browser may keep nothing for pages from files.
+  }
+
+  const apply = () => {
+    const dark = choice === "auto" ? system.matches : choice === "dark";
+    document.documentElement.dataset.theme = dark ? "dark" : "light";
+    listener();
+  };
+  system.addEventListener("change", apply);
+  apply();
+
+  return {
+    get choice() {
+      return choice;
+    },
+    next() {
+      choice = order[(order.indexOf(choice) + 1) % order.length];
+      try {
+        localStorage.setItem("theme", choice);
+      } catch {
+        // As above.
+      }
+      apply();
+    },
+    onChange(call) {
+      listener = call;
+    },
+  };
+})();
