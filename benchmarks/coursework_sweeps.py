@@ -1,0 +1,95 @@
+"""Times a coursework's three sweeps: 9 settings x 30 seeds x 1000 episodes on the warehouse.
+
+    python benchmarks/coursework_sweeps.py                 # three rounds: about a minute
+    python benchmarks/coursework_sweeps.py --rounds 5 --report
+
+Each round is ``compare.py`` as a whole process, from its start to the tables on disk, in a fresh
+folder. The settings are those of the three studies of learning rate, discount and epsilon, as
+printed: shelf reward -1, ties on the first index.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from pipeline.study.execution import available_cores
+from pipeline.study.reading import read_study
+
+ROOT = Path(__file__).resolve().parent.parent
+STUDIES = ("warehouse-learning-rate", "warehouse-discount", "warehouse-epsilon")
+N_SEEDS = 30
+N_EPISODES = 1000
+TARGET_SECONDS = 20.0
+
+
+def sweeps() -> dict[str, Any]:
+    """The three sweeps as one study, in the form of a study file."""
+    agents = {
+        f"{name} {agent.label}": {"algo": agent.algo, **agent.settings}
+        for name in STUDIES
+        for agent in read_study(ROOT / "studies" / f"{name}.yml").agents
+        if agent.settings.get("tie_breaking") == "first"
+    }
+    return {
+        "title": "The coursework's three sweeps",
+        "seeds": N_SEEDS,
+        "n_episodes": N_EPISODES,
+        "tuned": False,
+        "agents": agents,
+        "environments": {"Warehouse-v0": {"env_kwargs": {"shelf_reward": -1}}},
+    }
+
+
+def time_round(study: Path, folder: Path, *, report: bool) -> float:
+    """Wall time of one round, in seconds."""
+    command = [sys.executable, str(ROOT / "compare.py"), str(study), "-f", str(folder)]
+    if not report:
+        command.append("--no-report")
+    started = time.perf_counter()
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    return time.perf_counter() - started
+
+
+def training_seconds(folder: Path) -> float:
+    """What all runs of a round spent on training and evaluations, one after the other."""
+    with (folder / "summary.csv").open(newline="") as file:
+        return sum(float(row["seconds"]) for row in csv.DictReader(file))
+
+
+def main() -> None:
+    """Time the rounds."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--rounds", type=int, default=3, help="rounds to time")
+    parser.add_argument("--report", action="store_true", help="draw figures and page as well")
+    args = parser.parse_args()
+    walls = []
+    with tempfile.TemporaryDirectory() as scratch:
+        study = Path(scratch) / "sweeps.yml"
+        study.write_text(json.dumps(sweeps()))
+        n_agents = len(sweeps()["agents"])
+        print(f"{n_agents} settings x {N_SEEDS} seeds x {N_EPISODES} episodes, on", end=" ")
+        print(f"{available_cores()} cores; load before: {os.getloadavg()[0]:.1f}")
+        for number in range(args.rounds):
+            folder = Path(scratch) / str(number)
+            walls.append(time_round(study, folder, report=args.report))
+            training = training_seconds(folder / study.stem)
+            print(
+                f"round {number + 1}: {walls[-1]:.1f} s; sum over runs {training:.1f} s", flush=True
+            )
+    median = statistics.median(walls)
+    verdict = "within" if median <= TARGET_SECONDS else "over"
+    print(f"median {median:.1f} s: {verdict} the target of {TARGET_SECONDS:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

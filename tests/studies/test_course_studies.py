@@ -1,0 +1,225 @@
+"""The study files: each can be run, and those on tables show what they should, on fewer seeds.
+
+Figures of the course material were measured with programs written after the course's own code, over
+the number of seeds named beside them. A mean over our seeds must lie within four standard errors of
+theirs, both samples counted, unless said otherwise. Five rows of the warehouse are compared in
+``tests/agents/test_known_results.py`` already.
+"""
+
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import compare
+from agents import load_algorithm
+from envs.warehouse import WarehouseEnv
+from mdp import value_iteration
+from pipeline.loading import load_model
+from pipeline.preparation import algorithm_kwargs
+from pipeline.study.planning import plan
+from pipeline.study.reading import read_study
+from pipeline.study.results import read_episodes, read_results
+from pipeline.study.spec import QuickSpec
+from pipeline.study.work import do_run
+
+ROOT = Path(compare.__file__).parent
+# Bandits have a guide of their own.
+STUDIES = [
+    path for path in sorted((ROOT / "studies").glob("*.yml")) if not path.name.startswith("bandit-")
+]
+GUIDE = (ROOT / "docs" / "course.md").read_text()
+QUICK = QuickSpec(seeds=1, budget=0.01)
+
+
+def study(name):
+    return read_study(ROOT / "studies" / f"{name}.yml")
+
+
+def shrunk(whole, agents=None, environments=None, **changes):
+    """A part of a study, by the beginnings of labels."""
+
+    def chosen(entries, beginnings):
+        return tuple(e for e in entries if beginnings is None or e.label.startswith(beginnings))
+
+    return replace(
+        whole,
+        agents=chosen(whole.agents, agents),
+        environments=chosen(whole.environments, environments),
+        **changes,
+    )
+
+
+def run(spec, folder):
+    """Do all runs of a study in this process; its results."""
+    planned = plan(spec, folder)
+    for one in planned:
+        do_run(one, folder / "draft", "a test")
+    return read_results(spec, planned, folder)
+
+
+def training_returns(results, agent):
+    """Returns of the training episodes, shape (n_seeds, n_episodes)."""
+    runs = [one.run for one in results.planned if one.agent == agent]
+    assert len(runs) == results.study.n_seeds
+    return np.array([read_episodes(one).returns for one in runs])
+
+
+def assert_mean(values, expected, spread, n_expected):
+    """Four standard errors; ``spread`` is the standard deviation over seeds."""
+    error = spread * math.sqrt(1 / n_expected + 1 / len(values))
+    assert np.mean(values) == pytest.approx(expected, abs=4 * error)
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_a_study_reads_plans_and_fits(path, tmp_path):
+    whole = read_study(path)
+    assert whole.title != path.stem
+    assert len(whole.description) > 100
+    assert whole.n_seeds >= 5
+    planned = plan(whole, tmp_path)
+    assert len(planned) == len(whole.agents) * len(whole.environments) * whole.n_seeds
+    assert len({one.path for one in planned}) == len(planned)
+    for one in planned:
+        if one.seed == 0:
+            assert algorithm_kwargs(one.spec).keys() >= one.spec.hyperparams.algorithm.keys()
+    short = plan(whole.quickened(), tmp_path)
+    assert len(short) < len(planned)
+
+
+@pytest.mark.parametrize("path", STUDIES, ids=lambda path: path.stem)
+def test_the_guide_gives_the_command_of_each_study(path):
+    assert f"python compare.py studies/{path.name}\n" in GUIDE
+
+
+def test_the_guide_names_no_study_that_is_not_there():
+    named = set(re.findall(r"studies/([\w-]+\.yml)", GUIDE))
+    assert named == {path.name for path in STUDIES}
+
+
+@pytest.fixture(scope="module")
+def cart_pole(tmp_path_factory):
+    """Training returns by agent; the final evaluation is the slow part."""
+    part = shrunk(
+        study("cartpole-qlearning-vs-sarsa"),
+        ("Q-learning as printed", "SARSA as printed"),
+        n_seeds=6,
+        eval_freq=-1,
+    )
+    results = run(part, tmp_path_factory.mktemp("cart_pole"))
+    return {agent.label: training_returns(results, agent.label) for agent in part.agents}
+
+
+# Mean and standard deviation over 100 seeds of the mean return of 500 episodes, by the last one.
+@pytest.mark.parametrize(
+    ("agent", "rows"),
+    [
+        (
+            "Q-learning as printed",
+            {500: (20.9, 3.0), 1500: (39.5, 19), 2500: (117, 47), 3500: (215, 63), 4500: (300, 86)},
+        ),
+        (
+            "SARSA as printed",
+            {500: (20.5, 2.6), 1500: (27.5, 11), 2500: (64, 34), 3500: (136, 58), 4500: (222, 67)},
+        ),
+    ],
+)
+def test_the_table_of_the_slides(cart_pole, agent, rows):
+    returns = cart_pole[agent]
+    assert returns.shape == (6, 5000)
+    for end, (expected, spread) in rows.items():
+        assert_mean(returns[:, end - 500 : end].mean(axis=1), expected, spread, 100)
+
+
+def test_one_seed_cannot_tell_the_slides_agents_apart(cart_pole):
+    """The agents differ by less than the seeds of one agent do."""
+    last = {agent: returns[:, 4000:4500].mean(axis=1) for agent, returns in cart_pole.items()}
+    spread = [values.max() - values.min() for values in last.values()]
+    difference = np.mean(last["Q-learning as printed"]) - np.mean(last["SARSA as printed"])
+    assert abs(difference) < min(spread)
+
+
+def test_the_warehouse_with_the_rewards_of_the_text(tmp_path):
+    part = shrunk(study("warehouse-qlearning"), "as printed", "shelf -100", n_seeds=10)
+    results = run(part, tmp_path)
+    returns = training_returns(results, "as printed")
+    # Over 30 seeds; the figures after +- are standard deviations of a seed's mean.
+    for part_of, expected, spread in (
+        (returns[:, :1], -7885, 1408),
+        (returns[:, :100], -431, 22),
+        (returns[:, 200:300], -9, 9),
+        (returns[:, -100:], -7, 11),
+    ):
+        assert_mean(part_of.mean(axis=1), expected, spread, 30)
+    assert set(results.summary["final"]) == {79.0}
+
+
+def test_with_discount_a_tenth_the_tie_rule_decides(tmp_path):
+    part = shrunk(study("warehouse-discount"), environments="shelf -1 ", n_seeds=5)
+    part = shrunk(part, ("first-index ties gamma=0.1", "random ties gamma=0.1"))
+    results = run(part, tmp_path)
+    first = training_returns(results, "first-index ties gamma=0.1")[:, 200:300].mean()
+    at_random = training_returns(results, "random ties gamma=0.1")[:, 200:300].mean()
+    assert first == pytest.approx(-985, abs=40)  # the mean of 30 seeds
+    assert at_random == pytest.approx(-11.7, abs=15)
+
+
+def test_with_discount_a_tenth_the_best_actions_are_no_better_than_others():
+    """The exact values of actions at the start differ by less than a float can hold."""
+    model = WarehouseEnv(shelf_reward=-1).transition_model()
+    start = int(np.argmax(model.initial))
+    ties = {}
+    for discount, value in ((0.1, -1.1111), (0.5, -1.99995), (0.9, 2.0361)):
+        values = value_iteration(model, discount).values
+        assert values[start] == pytest.approx(value, abs=6e-5)
+        expected = model.reward[start] + discount * values[model.next_state[start]]
+        of_actions = np.sum(model.prob[start] * expected, axis=-1)
+        ties[discount] = np.count_nonzero(of_actions == of_actions.max())
+    assert ties[0.1] == 4
+    assert ties[0.9] < 4
+
+
+def test_the_8x8_lake_with_decaying_noise(tmp_path):
+    part = shrunk(study("frozenlake8x8-qlearning"), "as printed", "at most 99", n_seeds=20)
+    results = run(part, tmp_path)
+    returns = training_returns(results, "as printed")
+    assert_mean(returns.mean(axis=1), 0.106, 0.070, 200)
+    assert_mean(returns[:, -1000:].mean(axis=1), 0.203, 0.120, 200)
+    assert results.summary["optimum"].iloc[0] == pytest.approx(0.6353, abs=5e-5)
+    assert (results.summary["final"] < 0.6353).all()
+
+
+def test_values_of_the_small_grid(tmp_path):
+    part = shrunk(study("small-grid"), ("qlearning", "sarsa"), n_seeds=5)
+    results = run(part, tmp_path)
+    corner = {agent.label: [] for agent in part.agents}
+    for one in results.planned:
+        model = load_model(one.agent, one.run.model_path)
+        corner[one.agent].append(model.policy.q_table[0].max())
+    assert corner["qlearning"] == pytest.approx([0.95**5] * 5, abs=1e-9)
+    assert np.mean(corner["sarsa"]) < 0.95**5 - 0.02
+    assert set(results.summary["optimum"]) == {1.0}
+
+
+def test_epsilon_falls_by_half_a_per_cent_after_each_episode():
+    planned = plan(shrunk(study("cartpole-dqn"), "as printed"), Path("unused"))
+    hyperparams = planned[0].spec.hyperparams
+    decay = hyperparams.callback[0].kwargs["decay"]
+    updates = hyperparams.algorithm["gradient_steps"]
+    assert decay**updates == pytest.approx(0.995, abs=1e-6)
+
+
+def test_a_deep_study_runs(tmp_path):
+    part = shrunk(study("frozenlake-replay"), n_seeds=1, quick=QUICK).quickened()
+    results = run(part, tmp_path)
+    assert list(results.summary["agent"]) == [agent.label for agent in part.agents]
+    assert (results.summary["n_episodes"] == 10).all()
+    assert results.summary["optimum"].eq(1).all()
+    without = next(one for one in results.planned if one.agent == "no replay")
+    model = load_algorithm("dqn").load(without.run.model_path)
+    assert model.buffer_size == model.batch_size == 1
+    # One update a step; the last step ends the run before it is learnt from.
+    assert model._n_updates == model.num_timesteps - 1
