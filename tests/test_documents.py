@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 
+import compare
 import enjoy
 import train
 from pipeline.requests import train_spec
+from pipeline.study.requests import study_spec
 
 ROOT = Path(train.__file__).parent
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
-COMMAND = re.compile(r"python ((?:train|enjoy)\.py [^`\n)]*)")
+COMMAND = re.compile(r"python ((?:train|enjoy|compare)\.py [^`\n)#]*)")
 
 
 def commands(script):
@@ -23,7 +25,7 @@ def commands(script):
             document.read_text().replace("--env\nWarehouse", "--env Warehouse")
         )
     ]
-    return [item for item in found if item[1].startswith(script)]
+    return [item for item in dict.fromkeys(found) if item[1].startswith(script)]
 
 
 def arguments(command):
@@ -56,7 +58,17 @@ def test_enjoy_commands_are_accepted(document, command):
     assert args.env == "Warehouse-v0"
 
 
+@pytest.mark.parametrize(("document", "command"), commands("compare.py"))
+def test_compare_commands_are_accepted(monkeypatch, document, command):
+    monkeypatch.chdir(ROOT)
+    args = compare.build_parser().parse_args(arguments(command))
+    assert bool(args.logged) == bool(args.policy)
+    if not args.logged:
+        assert study_spec(args).agents
+
+
 def test_there_are_commands_to_check():
+    assert len(commands("compare.py")) >= 20
     assert len(commands("train.py")) >= 6
     assert len(commands("enjoy.py")) >= 2
 
