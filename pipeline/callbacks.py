@@ -126,15 +126,18 @@ class EvaluationCallback(EvalCallback):
 
     def _append_to_file(self, evaluation: Evaluation) -> None:
         self.evaluations_timesteps.append(self.num_timesteps)
-        self.evaluations_results.append(evaluation.returns.tolist())
-        self.evaluations_length.append(evaluation.lengths.tolist())
+        # A single figure, as of an exact evaluation, stands twice: the plot commands of rl_zoo3
+        # take rows of one for runs that are too short.
+        times = 2 if len(evaluation.returns) == 1 else 1
+        self.evaluations_results.append(evaluation.returns.tolist() * times)
+        self.evaluations_length.append(evaluation.lengths.tolist() * times)
         arrays: dict[str, Any] = {
             "timesteps": self.evaluations_timesteps,
             "results": self.evaluations_results,
             "ep_lengths": self.evaluations_length,
         }
         if evaluation.successes is not None:
-            self.evaluations_successes.append(evaluation.successes.tolist())
+            self.evaluations_successes.append(evaluation.successes.tolist() * times)
             arrays["successes"] = self.evaluations_successes
         with replacing(self.run.evaluations_path) as draft, draft.open("wb") as file:
             np.savez(file, **arrays)

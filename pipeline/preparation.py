@@ -18,18 +18,24 @@ from agents import load_algorithm
 from agents.blocks import EpisodeBudget
 from pipeline import components
 from pipeline.algorithm_kwargs import build_algorithm_kwargs
-from pipeline.callbacks import EvaluationCallback, ExponentialExploration, StepCheckpoint
+from pipeline.callbacks import (
+    EpisodeCheckpoint,
+    EvaluationCallback,
+    ExponentialExploration,
+    StepCheckpoint,
+)
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation import evaluate, evaluation_seed
 from pipeline.exact import exact_evaluator
 from pipeline.loading import load_model
 from pipeline.progress import ProgressDisplay
+from pipeline.pulls import PullRecorder, are_bandits
 from pipeline.run import Run
 from pipeline.specs import TrainSpec
+from pipeline.value_maps import ValueMapRecorder
 
 EVALUATIONS_PER_RUN = 20
-STEPS_BETWEEN_EVALUATIONS = 10_000  # where the number of steps is not known beforehand
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,7 @@ class Training:
         eval_env: environments to evaluate on.
         evaluation: the evaluation callback, also part of ``callback``.
         callback: all callbacks.
+        pulls: keeps every pull, on bandits; else None, and where a compiled loop was asked for.
     """
 
     spec: TrainSpec
@@ -52,6 +59,7 @@ class Training:
     evaluation: EvaluationCallback
     display: ProgressDisplay
     callback: BaseCallback
+    pulls: PullRecorder | None = None
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
@@ -76,7 +84,7 @@ def set_up(
         model.set_logger(Logger(folder=None, output_formats=[]))
     eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
     undo.callback(eval_env.close)
-    exact = exact_evaluator(spec)
+    exact, is_bandit = exact_evaluator(spec), are_bandits(env)
     evaluation = EvaluationCallback(
         run,
         eval_env,
@@ -87,7 +95,8 @@ def set_up(
             n_episodes=spec.eval_episodes,
             seed=evaluation_seed(spec.seed, 1),
         ),
-        _evaluation_interval(spec, env.num_envs),
+        *_evaluation_intervals(spec, env.num_envs, is_judged_by_regret=exact is None and is_bandit),
+        value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
     )
     display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
     callbacks: list[BaseCallback] = components.callbacks(
@@ -96,12 +105,25 @@ def set_up(
     _check_callbacks(spec, model, callbacks)
     if spec.save_freq > 0:
         callbacks.append(StepCheckpoint(spec.save_freq, run.path))
+    if spec.save_every_n_episodes > 0:
+        callbacks.append(EpisodeCheckpoint(spec.save_every_n_episodes, run.path))
+    pulls = _pull_recorder(model, run, console) if is_bandit else None
+    if pulls is not None:
+        callbacks.append(pulls)
     callbacks.append(evaluation)
     if spec.hyperparams.n_episodes is not None:
         callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
     if spec.verbose > 0:
         callbacks.append(display)
-    return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks))
+    return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls)
+
+
+def _pull_recorder(model: BaseAlgorithm, run: Run, console: Console) -> PullRecorder | None:
+    """What keeps every pull, unless a compiled loop was asked for, which does not stop at each."""
+    if getattr(model, "engine", None) == "compiled":
+        console.print("[dim]engine: compiled keeps no pulls, so that regret is not known[/]")
+        return None
+    return PullRecorder(run.path)
 
 
 def is_unread(spec: TrainSpec) -> bool:
@@ -142,11 +164,15 @@ def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlg
     return load_model(spec.algo, spec.trained_agent, env, device=spec.device, **common, **kwargs)
 
 
-def _evaluation_interval(spec: TrainSpec, n_envs: int) -> int:
-    """Calls of `VecEnv.step` between two evaluations; 0 for none."""
+def _evaluation_intervals(
+    spec: TrainSpec, n_envs: int, is_judged_by_regret: bool
+) -> tuple[int, int]:
+    """Calls of `VecEnv.step`, and episodes, between two evaluations; 0 for none."""
     if spec.eval_freq is not None:
-        return max(spec.eval_freq // n_envs, 1) if spec.eval_freq > 0 else 0
-    n_timesteps = spec.hyperparams.n_timesteps
-    if n_timesteps is None:
-        return max(STEPS_BETWEEN_EVALUATIONS // n_envs, 1)
-    return max(n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1)
+        return (max(spec.eval_freq // n_envs, 1), 0) if spec.eval_freq > 0 else (0, 0)
+    if is_judged_by_regret:
+        # An episode to evaluate on may have other arms, and says less than the pulls of training.
+        return 0, 0
+    if spec.hyperparams.n_timesteps is not None:
+        return max(spec.hyperparams.n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1), 0
+    return 0, -(-(spec.hyperparams.n_episodes or 1) // EVALUATIONS_PER_RUN)

@@ -139,6 +139,21 @@ class Run:
         """The picture of the learning curve."""
         return self.path / "learning_curve.png"
 
+    @property
+    def pulls_picture_path(self) -> Path:
+        """The picture of the pulls, on bandits."""
+        return self.path / "pulls.png"
+
+    @property
+    def value_maps_path(self) -> Path:
+        """The policy and its values during training, on grid worlds."""
+        return self.path / "value_maps.npz"
+
+    @property
+    def value_map_path(self) -> Path:
+        """The picture of the policy at the end of training, on grid worlds."""
+        return self.path / "value_map.png"
+
     def read_info(self) -> dict[str, Any]:
         """The contents of ``run.json``; empty where there is none.
 

@@ -7,11 +7,13 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from pipeline.pulls import LAST_PULLS
 from pipeline.run import FINISHED
 from pipeline.specs import TrainSpec
 
 if TYPE_CHECKING:
     from pipeline.evaluation import Evaluation
+    from pipeline.pulls import PullSummary
     from pipeline.training import Outcome
 
 
@@ -31,6 +33,22 @@ def describe(evaluation: Evaluation) -> str:
             f"score {yardstick.score(evaluation.mean_return):.2f}"
         )
     return text
+
+
+def describe_pulls(pulls: PullSummary) -> str:
+    """The pulls of a training in a few words."""
+    if pulls.regret is not None:
+        last = min(LAST_PULLS, pulls.n_pulls)
+        return (
+            f"{pulls.regret:,.2f} over {pulls.n_pulls:,} pulls; "
+            f"a best arm in {pulls.optimal:.0%} of the last {last}"
+        )
+    if pulls.reward is None:
+        return f"not known: none of {pulls.n_pulls:,} pulls is in the log"
+    return (
+        f"not known; reward {pulls.reward:.4f} a pull over the {pulls.n_matched:,} "
+        f"of {pulls.n_pulls:,} that are in the log"
+    )
 
 
 def print_header(console: Console, spec: TrainSpec) -> None:
@@ -54,6 +72,8 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     )
     if outcome.engine:
         table.add_row("engine", outcome.engine)
+    if outcome.pulls is not None:
+        table.add_row("regret", describe_pulls(outcome.pulls))
     if outcome.final is not None:
         table.add_row("final", describe(outcome.final))
     if outcome.best_return is not None:

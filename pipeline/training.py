@@ -22,9 +22,13 @@ from pipeline.exact import ExactEvaluator
 from pipeline.files import write_text
 from pipeline.plots import draw_learning_curve
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
+from pipeline.pull_plots import draw_pulls
+from pipeline.pulls import PullSummary, summarise_pulls
 from pipeline.run import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.specs import TrainSpec
 from pipeline.summary import print_header
+from pipeline.value_map_plots import draw_value_map
+from pipeline.value_maps import value_map
 
 FINAL_EVALUATION_EPISODES = 100
 # A budget in episodes has no number of steps; this one is never reached.
@@ -47,6 +51,7 @@ class Outcome:
         best_return: mean return of the best evaluation during training, if there was one.
         best_timesteps: when that was.
         engine: for tabular agents, whether training was compiled, and if not, why.
+        pulls: on bandits, what the pulls of training came to; else None.
     """
 
     run: Run
@@ -57,6 +62,7 @@ class Outcome:
     best_return: float | None
     best_timesteps: int
     engine: str | None
+    pulls: PullSummary | None = None
 
 
 def train(
@@ -111,9 +117,14 @@ def _write_settings(training: Training, args: dict[str, Any], command: str) -> N
         state=RUNNING,
         env_name=run.env_name,
         spec=spec.as_data(),
-        versions={"python": platform.python_version()}
-        | {package: version(package) for package in RECORDED_PACKAGES},
+        versions=recorded_versions(),
     )
+
+
+def recorded_versions() -> dict[str, str]:
+    """The versions that a run's results may depend on."""
+    packages = {package: version(package) for package in RECORDED_PACKAGES}
+    return {"python": platform.python_version(), **packages}
 
 
 def _execute(training: Training) -> Outcome:
@@ -133,6 +144,8 @@ def _execute(training: Training) -> Outcome:
         raise
     finally:
         training.eval_env.close()
+        if hasattr(model, "_logger"):
+            model.logger.close()
         if model.env is not None:
             model.env.close()
 
@@ -171,14 +184,16 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     run, model, evaluation = training.run, training.model, training.evaluation
     save_model(model, run.model_path)
     save_normalization(model, run)
-    if evaluation.eval_freq > 0 and not evaluation.evaluations_timesteps:
+    if evaluation.is_asked_for and not evaluation.evaluations_timesteps:
         # The run was shorter than the time to its first evaluation.
         evaluation.evaluate_now()
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
     yardstick = None if final is None else final.yardstick
-    if training.spec.pictures:
+    pulls = _keep_pulls(training, state, title)
+    if training.spec.pictures and (pulls is None or evaluation.evaluations_timesteps):
         draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
+    _keep_value_map(training, title)
     best = evaluation.best_mean_reward if evaluation.best_timesteps else None
     engine = getattr(model, "engine_in_use", None)
     run.update_info(
@@ -189,16 +204,49 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
         best_mean_return=best,
         best_timesteps=evaluation.best_timesteps,
         engine=engine,
+        **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
     )
     return Outcome(
-        run, state, model.num_timesteps, seconds, final, best, evaluation.best_timesteps, engine
+        run,
+        state,
+        model.num_timesteps,
+        seconds,
+        final,
+        best,
+        evaluation.best_timesteps,
+        engine,
+        pulls,
     )
+
+
+def _keep_pulls(training: Training, state: str, title: str) -> PullSummary | None:
+    """Sum up and draw the pulls, on bandits."""
+    recorder = training.pulls
+    if recorder is None or not recorder.n_calls:
+        return None
+    if state == INTERRUPTED:
+        recorder.write()  # which the end of a training does by itself
+    arrays = recorder.arrays()
+    if training.spec.pictures:
+        draw_pulls(training.run.pulls_picture_path, title, arrays)
+    return summarise_pulls(arrays)
+
+
+def _keep_value_map(training: Training, title: str) -> None:
+    """Record and draw the policy that has come out, where evaluation is on and knows a map."""
+    model, maps = training.model, training.evaluation.value_maps
+    if maps is None or not training.evaluation.is_asked_for:
+        return
+    maps.finish(model, model.num_timesteps)
+    found = value_map(maps.evaluator, model) if training.spec.pictures else None
+    if found is not None:
+        draw_value_map(training.run.value_map_path, title, found)
 
 
 def _final_evaluation(training: Training) -> Evaluation | None:
     """Exact, or by episodes that have served nothing else; none where evaluation is off."""
     evaluator = training.evaluation.evaluator
-    if training.evaluation.eval_freq == 0:
+    if not training.evaluation.is_asked_for:
         return None
     if isinstance(evaluator, ExactEvaluator):
         return evaluator(training.model)

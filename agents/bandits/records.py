@@ -57,8 +57,11 @@ class PullLog(BaseCallback):
             (n_envs, pulls).
         """
         n_envs = self.training_env.num_envs
+        # Ctrl-C may come when some columns have the newest pull and others not yet.
+        n_pulls = min(map(len, self._columns.values())) // n_envs
         arrays: dict[str, NDArray[Any]] = {
-            name: np.array(column).reshape(-1, n_envs).T for name, column in self._columns.items()
+            name: np.array(column[: n_pulls * n_envs]).reshape(n_pulls, n_envs).T
+            for name, column in self._columns.items()
         }
         arrays["matched"] = arrays["matched"].astype(np.bool_)
         arrays["optimal"] = arrays["regrets"] == 0.0

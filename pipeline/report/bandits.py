@@ -145,7 +145,7 @@ def _curves(statistics: PullStatistics) -> dict[str, Any]:
     }
 
 
-def _bounds(env: gym.Env[Any, Any], statistics: PullStatistics) -> dict[str, Floats] | None:
+def _bounds(env: gym.Env[Any, Any], statistics: PullStatistics) -> dict[str, Any] | None:
     """What theory says of a single row of Bernoulli arms that stay as they are."""
     bandit: Any = env.unwrapped
     means = statistics.true_means

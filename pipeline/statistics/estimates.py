@@ -144,6 +144,8 @@ def _resample(scores: ArrayLike, seed: int, confidence: float, n_resamples: int)
         return _Resampled(values, np.empty((0, 0)), tail, n_missing)
     rng = np.random.default_rng(seed)
     n_resamples = enough_resamples(n_resamples, max(map(len, strata)))
+    if values.min() == values.max():
+        n_resamples = 1  # all are alike
     counts = [
         np.vstack([np.ones(n, dtype=np.int64), resample_counts(n, n_resamples, rng)])
         * (len(values) / (len(strata) * n))

@@ -17,7 +17,7 @@ from pipeline.statistics.bootstrap import (
     resample_counts,
 )
 from pipeline.statistics.estimates import Estimate
-from pipeline.statistics.paired import differences, same_shape
+from pipeline.statistics.paired import SAME, differences, same_shape
 
 # From here on the bootstrap and the normal interval are the same to the eye.
 MANY_SEEDS = 200
@@ -57,24 +57,27 @@ def probability_of_improvement(
     check_confidence(confidence)
     x, y = as_columns(first), as_columns(second)
     same_shape(x, y)
-    tables = [_wins(*pair) for pair in zip(x.T, y.T, strict=True)]
-    sizes = [len(wins) for wins in tables]
+    pairs = [_both_known(*pair) for pair in zip(x.T, y.T, strict=True)]
+    sizes = [len(first_scores) for first_scores, _ in pairs]
     n, n_missing = sum(sizes), x.size - sum(sizes)
     if min(sizes) == 0:
         return Estimate(np.nan, np.nan, np.nan, n, n_missing)
-    point = float(np.mean([wins.mean() for wins in tables]))
+    # How often each seed wins, through its run of the first agent and through the other's.
+    wins = [(_wins_of(one, other), len(one) - _wins_of(other, one)) for one, other in pairs]
+    point = float(np.mean([ahead.sum() / len(ahead) ** 2 for ahead, _ in wins]))
     if point in {0, 1} and min(sizes) > 1:
         sure = ((1 - confidence) / 2) ** (1 / (min(sizes) * len(sizes)))
         low, high = (sure, 1.0) if point else (0.0, 1 - sure)
         return Estimate(point, low, high, n, n_missing)
     # What each seed adds, through both of its runs, decides how far the statistic varies.
-    influences = [wins.mean(axis=0) + wins.mean(axis=1) for wins in tables]
+    influences = [(ahead + behind) / len(ahead) for ahead, behind in wins]
     if min(sizes) > MANY_SEEDS:
         low, high = _normal_interval(point, influences, confidence)
         return Estimate(point, low, high, n, n_missing)
     tail = interval_tail(influences, confidence)
     rng = np.random.default_rng(seed)
-    resampled = [_resampled(wins, resample_counts(len(wins), n_resamples, rng)) for wins in tables]
+    tables = [_table(*pair) for pair in pairs]
+    resampled = [_resampled(each, resample_counts(len(each), n_resamples, rng)) for each in tables]
     ends = percentile_interval(np.mean(resampled, axis=0), tail)
     return Estimate(point, float(ends[0]), float(ends[1]), n, n_missing)
 
@@ -92,10 +95,24 @@ def _normal_interval(
     return max(point - float(reach), 0.0), min(point + float(reach), 1.0)
 
 
-def _wins(first: Floats, second: Floats) -> Floats:
-    """1 where a run of the first (rows) beats one of the second (columns), 0.5 where equal."""
+def _both_known(first: Floats, second: Floats) -> tuple[Floats, Floats]:
+    """The scores of the seeds where neither is NaN."""
     both = ~np.isnan(first) & ~np.isnan(second)
-    return (1 + np.sign(differences(first[both][:, None], second[both][None, :]))) / 2
+    return first[both], second[both]
+
+
+def _wins_of(values: Floats, others: Floats) -> Floats:
+    """How many of the others each value beats, equal ones counting half."""
+    slack = np.where(np.isfinite(values), SAME * np.abs(values), 0.0)
+    ordered = np.sort(others)
+    below = np.searchsorted(ordered, values - slack, side="left")
+    up_to = np.searchsorted(ordered, values + slack, side="right")
+    return np.asarray((below + up_to) / 2)
+
+
+def _table(first: Floats, second: Floats) -> Floats:
+    """1 where a run of the first (rows) beats one of the second (columns), 0.5 where equal."""
+    return (1 + np.sign(differences(first[:, None], second[None, :]))) / 2
 
 
 def _resampled(wins: Floats, counts: Counts) -> Floats:

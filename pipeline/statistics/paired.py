@@ -10,14 +10,14 @@ from pipeline.statistics.bootstrap import Floats, check_confidence
 from pipeline.statistics.estimates import Estimate
 
 # Exact returns of two policies that are equally good can differ in their last bits.
-_SAME = 1e-12
+SAME = 1e-12
 
 
 def differences(first: Floats, second: Floats) -> Floats:
     """``first`` - ``second``, exactly 0 where they agree to twelve digits."""
     with np.errstate(invalid="ignore"):  # two infinite scores are equal
         apart = first - second
-        same = np.abs(apart) <= _SAME * np.maximum(np.abs(first), np.abs(second))
+        same = np.abs(apart) <= SAME * np.maximum(np.abs(first), np.abs(second))
     return np.where(same | (first == second), 0.0, apart)
 
 

@@ -126,6 +126,8 @@ def _draw_bounds(
     axes.plot(
         x, slope * np.log(x), color="0.35", linestyle=":", linewidth=1, label="Lai-Robbins slope"
     )
+    # An agent that never learns would leave no height for the others.
+    axes.set_ylim(0, min(ceiling, 1.1 * bound[-1]))
 
 
 def _arms(results: StudyResults, pulls: Pulls, path: Path) -> list[Path]:

@@ -40,7 +40,7 @@ def figure(
     """Axes row by row, written to ``path`` as .png and .svg in the end."""
     with mpl.rc_context(_FONTS):
         canvas = Figure(figsize=(6.4 * n_columns, height), layout="constrained")
-        axes = canvas.subplots(n_rows, n_columns, squeeze=False).ravel()
+        axes = list(canvas.subplots(n_rows, n_columns, squeeze=False).flat)
         yield axes
         for place in axes:
             place.grid(alpha=0.3)

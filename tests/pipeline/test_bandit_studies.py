@@ -1,12 +1,10 @@
-"""Studies on bandits: figures by pull on paper, bounds, batches against runs, known results."""
+"""Studies on bandits: batches where they may be, equal to their runs; verdicts on regret."""
 
 import dataclasses
 import io
-import math
 from dataclasses import replace
 from pathlib import Path
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
@@ -16,15 +14,9 @@ from pipeline.pulls import PULLS_FILE
 from pipeline.run import Run
 from pipeline.study.analysis import analyse
 from pipeline.study.bandit_results import run_regret
-from pipeline.study.batches import STATISTICS_FILE, read_run, stacked_statistics, true_means
-from pipeline.study.bounds import (
-    auer_bound,
-    best_expected_reward,
-    best_of_normals,
-    lai_robbins_slope,
-)
+from pipeline.study.batches import STATISTICS_FILE, read_run, stacked_statistics
 from pipeline.study.planning import plan
-from pipeline.study.pulls import MAX_POINTS, PullStatistics, points_of, pull_statistics
+from pipeline.study.pulls import PullStatistics
 from pipeline.study.reading import read_study
 from pipeline.study.results import read_results
 from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec
@@ -54,162 +46,6 @@ def do(study, root):
         if not run.is_finished:
             do_run(run, draft_path(root, run), "compare.py s.yml")
     return read_results(study, planned, root)
-
-
-# --- figures by pull, on paper -------------------------------------------------------------------
-
-# Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
-ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
-REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
-REGRETS = np.where(ARMS == 0, 0.3, 0.0)
-
-
-def test_two_runs_of_four_pulls_on_paper():
-    found = pull_statistics(ARMS, REWARDS, REGRETS, None, 2)
-    assert found.pulls.tolist() == [1, 2, 3, 4]
-    assert found.reward == pytest.approx([0.5, 0.5, 1, 0.5])
-    assert found.optimal == pytest.approx([0.5, 1, 0.5, 0.5])
-    assert found.regret == pytest.approx([0.15, 0, 0.15, 0.15])
-    # The sums are .3 .3 .3 .6 and 0 0 .3 .3.
-    assert found.cumulative_regret == pytest.approx([0.15, 0.15, 0.3, 0.45])
-    assert found.cumulative_regret_sem == pytest.approx([0.15, 0.15, 0, 0.15])
-    low, lower, median, upper, high = found.cumulative_regret_quantiles
-    assert [low[0], lower[0], median[0], upper[0], high[0]] == pytest.approx(
-        [0.015, 0.075, 0.15, 0.225, 0.285]
-    )
-    assert median == pytest.approx([0.15, 0.15, 0.3, 0.45])
-    # The first run has pulled arm 0 most after pulls 1, 2 and 4, where ties go to the first arm.
-    assert found.simple_regret == pytest.approx([0.15, 0.15, 0, 0.15])
-    assert found.total_reward.tolist() == [3, 2]
-    assert found.total_regret == pytest.approx([0.6, 0.3])
-    assert found.shares == pytest.approx(np.array([[3 / 8, 5 / 8]]))
-    assert found.context_regret == pytest.approx(np.array([[0.3, 0]]))
-    for name in ("estimates", "estimates_std", "true_means", "moments", "posteriors"):
-        assert getattr(found, name).size == 0, name
-
-
-def test_contexts_on_paper():
-    """Arm 1 alone, which costs .4 in context 0 and nothing in context 1; there are three."""
-    contexts = np.array([[0, 1, 0, 1]])
-    regrets = np.where(contexts == 0, 0.4, 0.0)
-    arms, rewards = np.ones((1, 4), dtype=np.int16), np.zeros((1, 4), dtype=np.float32)
-    found = pull_statistics(arms, rewards, regrets, contexts, 2, 3)
-    # Each context weighs as often as it was seen.
-    assert found.simple_regret == pytest.approx([0.4, 0.4 / 2, 0.4 * 2 / 3, 0.4 / 2])
-    assert np.array_equal(found.shares, [[0, 1], [0, 1], [math.nan] * 2], equal_nan=True)
-    expected = [[math.nan, 0.4], [math.nan, 0], [math.nan] * 2]
-    assert found.context_regret == pytest.approx(np.array(expected), nan_ok=True)
-    assert found.cumulative_regret_sem.tolist() == [0, 0, 0, 0]  # of a single run
-
-
-def test_estimates_leave_out_arms_that_were_never_tried():
-    estimates = np.array([[[1.0, math.nan]], [[3.0, math.nan]], [[math.nan, math.nan]]])
-    arms, rewards = np.zeros((3, 2), dtype=np.int16), np.zeros((3, 2), dtype=np.float32)
-    found = pull_statistics(arms, rewards, np.zeros((3, 2)), None, 2, estimates=estimates)
-    assert np.array_equal(found.estimates, [[2, math.nan]], equal_nan=True)
-    assert np.array_equal(found.estimates_std, [[1, math.nan]], equal_nan=True)
-
-
-@pytest.mark.parametrize("n", [1, 2, MAX_POINTS, MAX_POINTS + 1, 1000, 100_000])
-def test_points(n):
-    points = points_of(n)
-    assert points[0] == 1
-    assert points[-1] == n
-    assert (np.diff(points) > 0).all()
-    assert len(points) <= MAX_POINTS
-    assert points[:100].tolist() == list(range(1, min(n, 100) + 1))
-
-
-def test_between_points_nothing_is_lost():
-    rng = np.random.default_rng(0)
-    arms = rng.integers(3, size=(4, 1000)).astype(np.int16)
-    rewards = rng.normal(size=(4, 1000)).astype(np.float32)
-    regrets = np.array([0.0, 0.1, 0.7])[arms]
-    found = pull_statistics(arms, rewards, regrets, None, 3)
-    widths = np.diff(found.pulls, prepend=0)
-    assert len(found.pulls) < 1000
-    assert found.reward @ widths == pytest.approx(found.total_reward.mean())
-    assert found.optimal @ widths == pytest.approx((arms == 0).sum(axis=1).mean())
-    assert found.regret @ widths == pytest.approx(found.total_regret.mean())
-    assert found.cumulative_regret == pytest.approx(np.cumsum(found.regret * widths))
-    index = int(np.searchsorted(found.pulls, 500))
-    upto = found.pulls[index]
-    most = [np.bincount(row[:upto], minlength=3).argmax() for row in arms]
-    assert found.simple_regret[index] == pytest.approx(np.array([0, 0.1, 0.7])[most].mean())
-
-
-def test_saved_and_loaded(tmp_path):
-    found = pull_statistics(ARMS, REWARDS, REGRETS, None, 2, true_means=np.array([[0.2, 0.5]]))
-    found.save(tmp_path / "file.npz")
-    again = PullStatistics.load(tmp_path / "file.npz")
-    for field in dataclasses.fields(PullStatistics):
-        one, other = getattr(found, field.name), getattr(again, field.name)
-        assert one.dtype == other.dtype
-        assert np.array_equal(one, other), field.name
-    assert [path.name for path in tmp_path.iterdir()] == ["file.npz"]
-
-
-# --- what theory says ----------------------------------------------------------------------------
-
-
-def test_auers_bound():
-    """(8 / .55 + 8 / .25) ln n + (1 + pi^2 / 3) (.55 + .25), which is 432.1 at 10,000."""
-    assert float(auer_bound(COINS, 10_000)) == pytest.approx(432.1, abs=0.05)
-    at_once = 0.8 * (1 + math.pi**2 / 3)
-    assert auer_bound(COINS, [1, math.e]) == pytest.approx([at_once, at_once + 8 / 0.55 + 8 / 0.25])
-    assert float(auer_bound((0.5, 0.5), 10)) == 0
-
-
-def test_lai_and_robbins_slope():
-    assert lai_robbins_slope(COINS) == pytest.approx(2.564, abs=0.0005)
-    # By hand for a pair: .25 / (.5 ln(.5 / .75) + .5 ln(.5 / .25)).
-    by_hand = 0.25 / (0.5 * math.log(2 / 3) + 0.5 * math.log(2))
-    assert lai_robbins_slope((0.5, 0.75)) == pytest.approx(by_hand)
-
-
-def test_best_of_normals():
-    """Closed forms for two and three; 1.5388 for the testbed's ten."""
-    assert best_of_normals(1) == pytest.approx(0, abs=1e-9)
-    assert best_of_normals(2) == pytest.approx(1 / math.sqrt(math.pi))
-    assert best_of_normals(3) == pytest.approx(1.5 / math.sqrt(math.pi))
-    assert best_of_normals(10) == pytest.approx(1.5388, abs=5e-5)
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "expected"),
-    [
-        ("BernoulliBandit-v0", {}, 0.75),
-        ("SegmentBandit-v0", {}, 0.3 * 0.25 + 0.7 * 0.12),
-        ("GaussianBandit-v0", {"means": [1.0, 3.0, 2.0]}, 3.0),
-        ("GaussianBandit-v0", {"mean_loc": 4.0, "n_arms": 2}, 4 + 1 / math.sqrt(math.pi)),
-        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
-        ("LinearBandit-v0", {}, None),
-    ],
-)
-def test_best_expected_reward(env_id, kwargs, expected):
-    env = gym.make(env_id, **kwargs)
-    env.reset(seed=0)
-    best = best_expected_reward(env)
-    env.close()
-    assert best == (None if expected is None else pytest.approx(expected))
-
-
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "expected"),
-    [
-        ("BernoulliBandit-v0", {}, [[0.2, 0.5, 0.75]]),
-        ("SegmentBandit-v0", {}, [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]),
-        ("GaussianBandit-v0", {"means": [1.0, 3.0]}, [[1, 3]]),
-        ("GaussianBandit-v0", {}, None),
-        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
-        ("LinearBandit-v0", {}, None),
-    ],
-)
-def test_means_that_all_runs_share(env_id, kwargs, expected):
-    env = gym.make(env_id, **kwargs)
-    found = true_means(env)
-    env.close()
-    assert (None if found is None else found.tolist()) == expected
 
 
 # --- batches where they may be, and runs else -----------------------------------------------------
@@ -286,9 +122,7 @@ def trained(spec, folder):
 @pytest.mark.parametrize("label", AGENTS)
 def test_a_batch_is_its_runs(batches, label, tmp_path):
     planned = next(run for run in batches.planned if run.agent == label)
-    folders = [
-        trained(replace(planned.spec, seed=seed), tmp_path / str(seed)) for seed in range(5)
-    ]
+    folders = [trained(replace(planned.spec, seed=seed), tmp_path / str(seed)) for seed in range(5)]
     rows = batches.summary[batches.summary["agent"] == label]
     assert rows["seed"].tolist() == [0, 1, 2, 3, 4]
     regrets = [np.load(folder / PULLS_FILE)["regrets"][0] for folder in folders]
@@ -409,7 +243,8 @@ def test_less_regret_is_better(tmp_path):
     (environment,) = analysis.environments
     assert [agent.agent for agent in environment.agents] == ["Thompson", "random"]
     best, worst = environment.agents
-    assert best.metric.mean.point < 30 < 100 < worst.metric.mean.point
+    assert best.metric.mean.point < 30
+    assert worst.metric.mean.point > 100
     assert best.regret == best.metric.mean
     (pair,) = environment.pairs
     assert (pair.first, pair.second, pair.verdict) == ("Thompson", "random", "better")
@@ -425,147 +260,3 @@ def test_less_regret_is_better(tmp_path):
     lines = console.export_text().splitlines()
     rows = [line for line in lines if line.startswith("│")]
     assert [row.split("│")[1].strip() for row in rows] == ["Thompson", "random"]
-
-
-# --- the studies as they are shipped, with fewer runs --------------------------------------------
-#
-# What is expected was measured with programs written apart from this project, over 5,000 to 40,000
-# runs, or is exact. How well the agents do by themselves is tested with the agents; here the files
-# are: that the label stands for the agent, on the bandit, for as many pulls.
-
-
-def done(name, root, seeds, agents, environment=0):
-    """Statistics of some agents of a study on one of its environments, with fewer seeds."""
-    (path,) = [path for path in STUDIES if path.stem == f"bandit-{name}"]
-    study = read_study(path)
-    kept = tuple(spec for spec in study.agents if spec.label in agents)
-    assert len(kept) == len(agents)
-    place = study.environments[environment]
-    study = replace(study, agents=kept, environments=(place,), n_seeds=seeds)
-    results = do(study, root)
-    return {agent: results.pulls[agent, place.label] for agent in agents}
-
-
-def mean_regret_from(statistics, pull):
-    """Regret of a pull, after that many."""
-    before = np.interp(pull, statistics.pulls, statistics.cumulative_regret)
-    last = statistics.pulls[-1]
-    return (statistics.cumulative_regret[-1] - before) / (last - pull)
-
-
-def test_the_testbed(tmp_path):
-    found = done("testbed", tmp_path, 200, ["epsilon 0.1", "UCB c=2", "optimistic", "greedy"])
-    # .1705 with a spread of .0067 over 200 runs.
-    assert mean_regret_from(found["epsilon 0.1"], 900) == pytest.approx(0.1705, abs=4 * 0.0067)
-    # The best of ten arms has just been found by all runs, 1.08; before, each arm was tried once.
-    ucb = found["UCB c=2"].reward
-    assert ucb[10] == pytest.approx(1.08, abs=4 * 1.3 / 200**0.5)
-    assert abs(ucb[:10].mean()) < 4 / 200**0.5 / 10**0.5
-    assert ucb[11:15].mean() < ucb[10]
-    optimal = {agent: statistics.optimal[-1] for agent, statistics in found.items()}
-    assert optimal["greedy"] < 0.5 < optimal["epsilon 0.1"] < optimal["UCB c=2"]
-    # Optimism explores at first and pays later (figure 2.3).
-    early, late = ({a: s.optimal[i] for a, s in found.items()} for i in (30, -1))
-    assert early["optimistic"] < early["epsilon 0.1"] + 0.1
-    assert late["optimistic"] > late["greedy"] + 0.3
-    assert found["greedy"].true_means.size == 0
-
-
-def test_gradients_around_four(tmp_path):
-    """Figure 2.5: 5.507 with a baseline and 5.215 without, at the last pulls."""
-    labels = ["gradient 0.1", "gradient 0.1, no baseline"]
-    found = done("testbed", tmp_path, 300, labels, environment=1)
-    # One mean of 2000 runs spreads by .025 to .04, of 300 by three times that.
-    for label, reward in zip(labels, (5.507, 5.215), strict=True):
-        assert found[label].reward[-1] == pytest.approx(reward, abs=4 * 0.04 * (2000 / 300) ** 0.5)
-    assert found[labels[0]].optimal[-1] > found[labels[1]].optimal[-1] + 0.2
-
-
-def within(found, expected, tolerances):
-    for label, value in expected.items():
-        statistics = found[label]
-        assert statistics.total_regret.mean() == pytest.approx(value, abs=tolerances[label]), label
-        assert statistics.pulls[-1] == 10_000
-
-
-def test_bernoulli_arms(tmp_path):
-    expected = {"Thompson": 14.8, "UCB1": 82.0, "epsilon 0.1": 275.5, "random": 2666.7}
-    found = done("bernoulli", tmp_path, 60, list(expected))
-    # Four standard errors, and the half unit of the last digit.
-    tolerances = {
-        agent: 4 * s.total_regret.std() / 60**0.5 + 0.5 for agent, s in found.items()
-    }
-    assert tolerances["Thompson"] < 6
-    assert tolerances["random"] < 20
-    within(found, expected, tolerances)
-    ucb1 = found["UCB1"]
-    assert (ucb1.cumulative_regret <= auer_bound(COINS, ucb1.pulls)).all()
-    assert found["Thompson"].true_means.tolist() == [list(COINS)]
-    assert found["Thompson"].moments.tolist() == [10, 100, 1000, 10_000]
-    assert found["random"].shares == pytest.approx(np.full((1, 3), 1 / 3), abs=0.01)
-
-
-def test_segments(tmp_path):
-    expected = {
-        "random": 653.0,
-        "Thompson, blind": 443.0,
-        "Thompson by segment": 37.0,
-        "LinUCB alpha=1": 31.0,
-    }
-    found = done("segments", tmp_path, 60, [*expected, "LinUCB alpha=0.2"])
-    tolerances = {
-        agent: 4 * s.total_regret.std() / 60**0.5 + 1 for agent, s in found.items()
-    }
-    within(found, expected, tolerances)
-    # 155 with a spread of 228 over runs: the mean is worse than alpha=1, the median is not.
-    timid = found["LinUCB alpha=0.2"].total_regret
-    assert timid.mean() == pytest.approx(155, abs=4 * 228 / 60**0.5)
-    assert np.median(timid) < found["Thompson by segment"].total_regret.mean() + 20
-    assert timid.max() > 3 * 155
-    blind = found["Thompson, blind"]
-    # A blind agent loses .159 - .117 a pull for good [exact].
-    assert mean_regret_from(blind, 8000) == pytest.approx(0.042, abs=0.002)
-    assert blind.shares[0] == pytest.approx(blind.shares[1], abs=0.02)
-    by_segment = found["Thompson by segment"].shares
-    assert by_segment.argmax(axis=1).tolist() == [1, 0]
-
-
-def test_three_arms(tmp_path):
-    """Epsilon-greedy ends at 3 - epsilon, exactly; the spread over seeds is .003 to .006."""
-    labels = [spec.label for spec in read_study(STUDIES[1]).agents]
-    found = done("epsilon", tmp_path, 4, labels)
-    for label, reward in zip(labels, (2.90, 2.95, 2.99), strict=True):
-        last = found[label].reward[-1]
-        width = found[label].pulls[-1] - found[label].pulls[-2]
-        noise = 1.2 / (4 * width) ** 0.5
-        assert last == pytest.approx(reward, abs=4 * noise + 0.002), label
-        assert noise < 0.015
-        # The mean of all pulls has still the first ones in it.
-        assert found[label].total_reward.mean() / 100_000 == pytest.approx(reward, abs=0.01)
-
-
-def test_drifting_arms(tmp_path):
-    """Exercise 2.5: a constant step size loses at first and wins in the end."""
-    found = done("nonstationary", tmp_path, 60, ["sample averages", "step size 0.1"])
-    averages, constant = found["sample averages"], found["step size 0.1"]
-    assert mean_regret_from(constant, 5000) < 0.6 * mean_regret_from(averages, 5000)
-    assert constant.optimal[-20:].mean() > averages.optimal[-20:].mean() + 0.1
-    spread = np.hypot(constant.total_regret.std(), averages.total_regret.std()) / 60**0.5
-    difference = averages.total_regret.mean() - constant.total_regret.mean()
-    assert difference > 4 * spread
-
-
-def test_linear_rewards(tmp_path):
-    """The contextual agents leave a random one far behind, which loses the mean gap of five."""
-    labels = ["LinUCB alpha=1", "linear Thompson", "linear epsilon 0.1", "random"]
-    found = done("linear", tmp_path, 60, labels)
-    # Given the context an arm is worth a normal with mean 0 and about unit variance; the variance
-    # of the context's length takes something off.
-    lost = found["random"].total_regret / 1000
-    rng = np.random.default_rng(0)
-    contexts = rng.uniform(-1, 1, size=(200_000, 5))
-    lengths = np.sqrt((contexts**2).sum(axis=1) * 3 / 5).mean()
-    expected = lengths * best_of_normals(5)
-    assert lost.mean() == pytest.approx(expected, abs=4 * lost.std() / 60**0.5)
-    for label in labels[:3]:
-        assert found[label].total_regret.mean() < 0.35 * found["random"].total_regret.mean()

@@ -39,7 +39,7 @@ report.section("bandits", (root, data) => {
       text: `${label} ${report.number(value)}`,
       textposition: "start",
       font: { size: 11, color: report.css("--muted") },
-      yanchor: "bottom",
+      yanchor: "top",
     },
   });
   const plain = (x, y) => ({ x, y, low: y.map(() => null), high: y.map(() => null) });
@@ -69,12 +69,18 @@ report.section("bandits", (root, data) => {
   figure("pull-regret", () => true, ({ curves, bounds }) => {
     const shown = agents(curves).map(([label, curve]) => [label, { x: curve.x, ...curve.regret[chosen("pull-spread")] }]);
     const highest = Math.max(1, ...shown.flatMap(([, curve]) => curve.high));
+    // An agent that never learns would leave no height for the others.
+    const top = bounds === null ? Infinity : 1.1 * bounds.auer.at(-1);
     return {
       traces: [
         ...shown.flatMap(([label, curve]) => report.band(label, curve, same)),
         ...(bounds === null ? [] : theory(bounds, 1.5 * highest)),
       ],
-      layout: layout({ title: { text: "cumulative regret" }, rangemode: "tozero" }),
+      layout: layout({
+        title: { text: "cumulative regret" },
+        rangemode: "tozero",
+        ...(highest > top && { range: [0, top] }),
+      }),
     };
   });
   figure(
