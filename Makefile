@@ -5,7 +5,8 @@ PYTEST_ARGS ?= -n auto --maxprocesses 8 --dist worksteal
 
 BIN := .venv/bin
 STAMP := .venv/.installed
-BENCHMARKS := $(wildcard benchmarks/[a-z]*.py)
+# MushroomRL needs an old NumPy and brings a PyTorch of its own: that comparison is run by itself.
+BENCHMARKS := $(filter-out benchmarks/against_mushroomrl.py,$(wildcard benchmarks/[a-z]*.py))
 
 # One thread per process: more of them slow networks this small down, and tests run side by side.
 export OMP_NUM_THREADS ?= 1

@@ -32,7 +32,9 @@ Ints = NDArray[np.int64]
 
 def draws_per_choice(strategy: int, n_actions: int) -> int:
     """Number of random numbers that one choice among ``n_actions`` consumes."""
-    return {EPSILON_GREEDY: 2, BOLTZMANN: 1, GAUSSIAN_NOISE: n_actions}[strategy]
+    if strategy == GAUSSIAN_NOISE:
+        return n_actions
+    return 2 if strategy == EPSILON_GREEDY else 1
 
 
 @inlined

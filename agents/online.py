@@ -21,7 +21,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from agents.model_files import JsonAlgorithm
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Transitions:
     """One step of every environment.
 
@@ -130,18 +130,29 @@ class OnlineAlgorithm(JsonAlgorithm):
         new_obs, rewards, dones, infos = self.env.step(actions)
         self.num_timesteps += self.env.num_envs
 
-        callback.update_locals(locals())
+        # Written out, since `locals()` would take longer than all that callbacks do.
+        callback.update_locals(
+            {
+                "obs": obs,
+                "actions": actions,
+                "new_obs": new_obs,
+                "rewards": rewards,
+                "dones": dones,
+                "infos": infos,
+            }
+        )
         keep_going = callback.on_step()
 
         self._update_info_buffer(infos, dones)
         self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
-        next_obs, terminated = true_outcome(new_obs, dones, infos)
+        finished = dones.tolist().count(True)
+        next_obs, terminated = true_outcome(new_obs, dones, infos) if finished else (new_obs, dones)
         self._learn_from(
             Transitions(obs, actions, rewards.astype(np.float64), terminated, dones, next_obs)
         )
         self._last_obs = cast(Any, new_obs)
-        if dones.any():
-            self._count_episodes(int(dones.sum()), log_interval)
+        if finished:
+            self._count_episodes(finished, log_interval)
         callback.on_rollout_end()
         return keep_going
 
@@ -185,8 +196,6 @@ def true_outcome(
     Returns:
         The observations reached, shape (n_envs, ...), and ``terminated``, shape (n_envs,).
     """
-    if not dones.any():
-        return new_obs, dones
     terminated = dones.copy()
     next_obs = deepcopy(new_obs)
     for i in np.flatnonzero(dones):

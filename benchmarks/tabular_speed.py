@@ -18,7 +18,7 @@ import random
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -33,6 +33,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
 from agents.blocks import BlockCallback, Horizon, calls_until_multiple
+from agents.tabular.algorithms import QLearning
 from envs.warehouse import DEFAULT_MAP
 from envs.wrappers import DiscretizeObservation
 
@@ -49,6 +50,7 @@ discretize = partial(
     dims=[2, 3],
 )
 WRAPPERS: dict[str, Any] = {"CartPole-v1": discretize}
+ALONE, LOOP = "DummyVecEnv + Monitor alone", "training loop without an agent"
 ENVS = ("FrozenLake-v1", "envs:Warehouse-v0", "CartPole-v1")
 
 # Steps a second of one timing.
@@ -190,12 +192,29 @@ def bare_loop_with_lists() -> None:
     bare_loop(table, lambda values: values.index(max(values)), max)
 
 
-def environment_alone(env_id: str, folder: str) -> Contender:
-    """DummyVecEnv and Monitor without an agent, going through an agent's episodes once more."""
+class Replay(QLearning):
+    """Takes recorded actions and learns nothing."""
+
+    recorded: Iterator[Any]
+
+    def _choose_actions(self) -> Any:
+        return next(self.recorded)
+
+    def _learn_from(self, transitions: Any) -> None:
+        pass
+
+
+def replays(env_id: str, folder: str) -> dict[str, Contender]:
+    """An agent's episodes once more without the agent: by `step` alone, and by the training loop.
+
+    The loop's share is the order of events that every algorithm of Stable-Baselines3 keeps:
+    callbacks, counters, statistics.
+    """
     agent, recorder = practised("interpreted", "qlearning", env_id, folder), ActionRecorder()
     env = agent.env
     env.seed(0)
     agent.learn(PYTHON_STEPS, callback=recorder)
+    replay = Replay(env=env)
 
     def steps() -> None:
         env.seed(0)
@@ -203,7 +222,12 @@ def environment_alone(env_id: str, folder: str) -> Contender:
         for action in recorder.actions:
             env.step(action)
 
-    return timed(steps, PYTHON_STEPS)
+    def loop() -> None:
+        env.seed(0)
+        replay.recorded = iter(recorder.actions)
+        replay.learn(PYTHON_STEPS, callback=Evaluation(PYTHON_STEPS // 20), log_interval=None)
+
+    return {ALONE: timed(steps, PYTHON_STEPS), LOOP: timed(loop, PYTHON_STEPS)}
 
 
 def contenders(folder: str) -> dict[tuple[str, str], Contender]:
@@ -216,7 +240,7 @@ def contenders(folder: str) -> dict[tuple[str, str], Contender]:
             made[env_id, f"compiled {name}, log of every 100 episodes"] = trained(
                 "compiled", name, env_id, folder, log_interval=100
             )
-        made[env_id, "DummyVecEnv + Monitor alone"] = environment_alone(env_id, folder)
+        made.update({(env_id, work): each for work, each in replays(env_id, folder).items()})
         made[env_id, "plain loop over gym.make"] = timed(partial(plain_loop, env_id), PYTHON_STEPS)
     for work, loop in (("NumPy", bare_loop_with_numpy), ("lists", bare_loop_with_lists)):
         made["envs:Warehouse-v0", f"bare loop on {work}"] = timed(loop, PYTHON_STEPS)
@@ -236,13 +260,13 @@ def report(speeds: dict[tuple[str, str], float]) -> Table:
 
 
 def overheads(speeds: dict[tuple[str, str], float]) -> list[str]:
-    """How much time the interpreted engine adds to that of the environments."""
+    """How much time the training loop and the interpreted agents add to that of environments."""
     lines = []
     for env_id in ENVS:
-        alone = speeds[env_id, "DummyVecEnv + Monitor alone"]
-        for name in ("qlearning", "sarsa"):
-            added = alone / speeds[env_id, f"interpreted {name}"] - 1
-            lines.append(f"{env_id.removeprefix('envs:')}: interpreted {name} adds {added:.0%}")
+        alone = speeds[env_id, ALONE]
+        for work in (LOOP, "interpreted qlearning", "interpreted sarsa"):
+            added = alone / speeds[env_id, work] - 1
+            lines.append(f"{env_id.removeprefix('envs:')}: {work} adds {added:.0%}")
     return lines
 
 

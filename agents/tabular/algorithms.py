@@ -26,10 +26,19 @@ class SARSA(TabularAlgorithm):
 
     rule = rules.SARSA
 
+    def _choose_actions(self) -> NDArray[np.int64]:
+        actions = super()._choose_actions()
+        assert self._next_actions is not None
+        self._next_actions.fill(UNDECIDED)
+        return actions
+
     def _commit_to_next_actions(self, transitions: Transitions) -> NDArray[np.int64]:
-        actions = np.where(transitions.terminated, 0, UNDECIDED)
-        self._decide(transitions.next_obs, actions, self.rng)
-        self._next_actions = np.where(transitions.dones, UNDECIDED, actions)
+        pending = self._next_actions
+        assert pending is not None
+        pending[transitions.terminated] = 0
+        self._decide(transitions.next_obs, pending, self.rng)
+        actions = pending.copy()
+        pending[transitions.dones] = UNDECIDED
         return actions
 
 

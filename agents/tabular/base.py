@@ -29,8 +29,9 @@ from agents.tabular.arguments import (
     check_arguments,
 )
 from agents.tabular.engine_choice import choose_engine
-from agents.tabular.policy import QTablePolicy
-from agents.tabular.steps import UNDECIDED, choose_actions, update_tables
+from agents.tabular.policy import QTablePolicy, Tables
+from agents.tabular.rules import EXPECTED_SARSA
+from agents.tabular.steps import NO_DRAWS, UNDECIDED, choose_actions, update_tables
 
 
 class TabularAlgorithm(OnlineAlgorithm):
@@ -75,7 +76,7 @@ class TabularAlgorithm(OnlineAlgorithm):
     rule: ClassVar[int]
     n_tables: ClassVar[int] = 1
 
-    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule")
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_tables")
 
     def __init__(
         self,
@@ -131,6 +132,7 @@ class TabularAlgorithm(OnlineAlgorithm):
         self.engine_in_use = ""
         self.mean_td_error = 0.0
         self._next_actions: NDArray[np.int64] | None = None
+        self._tables: Tables | None = None
         if _init_setup_model:
             self._setup_model()
 
@@ -168,7 +170,7 @@ class TabularAlgorithm(OnlineAlgorithm):
     @property
     def averages_samples(self) -> bool:
         """Whether the step size is 1/N(s, a)."""
-        return bool(cast(Any, self.learning_rate) == SAMPLE_AVERAGE)
+        return bool(self.learning_rate == SAMPLE_AVERAGE)  # type: ignore[comparison-overlap]
 
     @property
     def exploration_rate(self) -> float:
@@ -183,50 +185,62 @@ class TabularAlgorithm(OnlineAlgorithm):
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
         engine = choose_engine(self, callback, log_interval)
-        if engine is None:
-            super()._run(total_timesteps, callback, log_interval)
-        else:
+        if engine is not None:
             engine.run(total_timesteps)
+            return
+        # Looked up once: finding the policy's tables takes longer than a step's learning.
+        self._tables = self.policy.tables()
+        try:
+            super()._run(total_timesteps, callback, log_interval)
+        finally:
+            self._tables = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy's arrays would no longer be its policy's.
+        return {**self.__dict__, "_tables": None}
 
     def _decide(
         self, obs: NDArray[np.int64], actions: NDArray[np.int64], rng: np.random.Generator
     ) -> None:
         """Fill in the undecided of ``actions``, both of shape (n,), in place."""
+        undecided = actions.tolist().count(UNDECIDED)
+        if undecided == 0:
+            return
+        tables = self._tables or self.policy.tables()
         strategy = STRATEGIES[self.exploration]
-        shape = (
-            np.count_nonzero(actions == UNDECIDED),
-            draws_per_choice(strategy, self.policy.q_tables.shape[2]),
-        )
-        normal = strategy == GAUSSIAN_NOISE
-        draws = rng.standard_normal(shape) if normal else rng.random(shape)
+        shape = undecided, draws_per_choice(strategy, len(tables.scratch))
         choose_actions(
             strategy,
-            self.policy.q_tables.numpy(),
+            tables.values,
             obs,
             self.exploration_rate,
             float(self.tie_breaking == "random"),
-            draws,
+            rng.standard_normal(shape) if strategy == GAUSSIAN_NOISE else rng.random(shape),
             actions,
+            tables.scratch,
         )
 
     def _choose_actions(self) -> NDArray[np.int64]:
         assert self._next_actions is not None
-        actions = self._next_actions
-        self._next_actions = np.full(self.n_envs, UNDECIDED)
+        actions = self._next_actions.copy()
         self._decide(cast(Any, self._last_obs), actions, self.rng)
         return actions
 
     def _commit_to_next_actions(self, transitions: Transitions) -> NDArray[np.int64]:
-        """Actions that the target uses, shape (n_envs,); only SARSA decides on them here."""
-        return np.zeros(self.n_envs, dtype=np.int64)
+        """Actions that the target uses, shape (n_envs,); only SARSA's does, and decides on them."""
+        actions: NDArray[np.int64] = transitions.actions
+        return actions
 
     def _learn_from(self, transitions: Transitions) -> None:
+        tables = self._tables or self.policy.tables()
         next_actions = self._commit_to_next_actions(transitions)
-        uniforms = self.rng.random(self.n_envs) if self.n_tables > 1 else np.zeros(self.n_envs)
+        uniforms = self.rng.random(self.n_envs) if self.n_tables > 1 else NO_DRAWS
+        # The other targets do not look at it, and asking a schedule takes its time.
+        rate = self.exploration_rate if self.rule == EXPECTED_SARSA else 0.0
         self.mean_td_error = update_tables(
             self.rule,
-            self.policy.q_tables.numpy(),
-            self.policy.visit_counts.numpy(),
+            tables.values,
+            tables.visit_counts,
             transitions.obs,
             transitions.actions,
             transitions.rewards,
@@ -238,9 +252,10 @@ class TabularAlgorithm(OnlineAlgorithm):
             self.averages_samples,
             self.skip_terminal_update,
             STRATEGIES[self.exploration],
-            self.exploration_rate,
+            rate,
             float(self.tie_breaking == "random"),
             uniforms,
+            tables.scratch,
         )
         self._n_updates += self.n_envs
 

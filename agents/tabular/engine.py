@@ -22,6 +22,7 @@ from agents.exploration import STRATEGIES, draws_per_choice
 from agents.schedules import schedule_row
 from agents.tabular import rollout
 from agents.tabular.episodes import Episodes, record_in_monitors
+from agents.tabular.interrupts import interrupts_held
 from agents.tabular.records import ENV, EPISODE, PROGRESS, Learner
 from agents.tabular.simulator import CART_POLE, MAX_DRAWS_PER_STEP, World
 from agents.tabular.stepping import add_to_return
@@ -65,9 +66,11 @@ class CompiledEngine:
         self.unfinished: list[list[NDArray[np.float64]]] = [[] for _ in agent.env.envs]
         self.reports_success = ["is_success" in (info or {}) for info in agent.env.reset_infos]
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
+        # A finite model takes one for the step and one for a reset, CartPole four for a reset.
+        self.draws_per_step = MAX_DRAWS_PER_STEP if world.kind == CART_POLE else 2
         self.streams = UniformStreams(
             [env.unwrapped.np_random for env in agent.env.envs],
-            (MAX_DRAWS_PER_STEP if world.kind == CART_POLE else 2) * self.block_steps,
+            self.draws_per_step * self.block_steps,
         )
         self.budget = next((m for m in members(callback) if isinstance(m, EpisodeBudget)), None)
         self.learner = _learner(agent, self.budget)
@@ -88,20 +91,22 @@ class CompiledEngine:
 
     def run(self, total_timesteps: int) -> None:
         """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
-        try:
-            while self.agent.num_timesteps < total_timesteps:
-                if not self._run_block(total_timesteps):
-                    break
-        finally:
-            self._write_state()
+        with interrupts_held() as interrupted:
+            try:
+                while self.agent.num_timesteps < total_timesteps:
+                    if not self._run_block(total_timesteps) or interrupted():
+                        break
+            finally:
+                self._write_state()
 
     def _run_block(self, total_timesteps: int) -> bool:
         agent = self.agent
         self.callback.on_rollout_start()
-        self.streams.refill()
-        self.envs["uniforms_used"] = 0
         ahead = horizon(self.callback)
         steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
+        most_steps = min(ahead.calls, steps_left, self.block_steps)
+        self.streams.refill(self.draws_per_step * most_steps)
+        self.envs["uniforms_used"] = self.streams.used
         episodes_to_log = (
             ahead.episodes
             if self.log_interval is None
@@ -117,7 +122,7 @@ class CompiledEngine:
             *self.room,
             self.log,
             self.rewards,
-            min(ahead.calls, steps_left, self.block_steps),
+            most_steps,
             min(ahead.episodes, episodes_to_log),
             COMPENSATED_SUM,
         )

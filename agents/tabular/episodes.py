@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -39,7 +40,7 @@ class Episodes:
     def infos(self, chosen: slice, times: list[float]) -> list[dict[str, Any]]:
         """What Monitor would have put into ``info["episode"]`` for some of the episodes."""
         return [
-            {"r": round(total, DECIMALS), "l": length, "t": times[env]}
+            {"r": _rounded(total), "l": length, "t": times[env]}
             for env, total, length in zip(
                 self.envs[chosen].tolist(),
                 self.returns[chosen].tolist(),
@@ -77,16 +78,19 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
 def _write_rows(
     file: Any, returns: NDArray[np.float64], lengths: NDArray[np.int64], seconds: float
 ) -> None:
-    """Append rows as csv.DictWriter would, formatting each different one once."""
-    # Equal episodes are common where rewards are whole numbers.
-    pairs = np.stack((returns, lengths.astype(np.float64)), axis=1).view(np.complex128).ravel()
-    different, which = np.unique(pairs, return_inverse=True)
-    texts = np.array(
-        [
-            f"{round(pair.real, DECIMALS)},{int(pair.imag)},{seconds}\r\n"
-            for pair in different.tolist()
-        ],
-        dtype=object,
-    )
-    file.write("".join(texts[which].tolist()))
+    """Append rows as csv.DictWriter would."""
+    end = f"{seconds}\r\n"
+    rows = zip(returns.tolist(), lengths.tolist(), strict=True)
+    file.write("".join([_beginning_of_row(total, length) + end for total, length in rows]))
     file.flush()
+
+
+# Equal episodes are common where rewards are whole numbers.
+@lru_cache(maxsize=10_000)
+def _beginning_of_row(episode_return: float, length: int) -> str:
+    return f"{_rounded(episode_return)},{length},"
+
+
+@lru_cache(maxsize=10_000)
+def _rounded(episode_return: float) -> float:
+    return round(episode_return, DECIMALS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
@@ -10,6 +10,20 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
+
+
+class Tables(NamedTuple):
+    """The tables of a policy as NumPy arrays, in the same memory.
+
+    Attributes:
+        values: action values, float64 of shape (T, S, A).
+        visit_counts: number of updates of each entry, int64 of shape (T, S, A).
+        scratch: room for A values.
+    """
+
+    values: NDArray[np.float64]
+    visit_counts: NDArray[np.int64]
+    scratch: NDArray[np.float64]
 
 
 class QTablePolicy(BasePolicy):
@@ -44,6 +58,11 @@ class QTablePolicy(BasePolicy):
         shape = (n_tables, int(observation_space.n), int(action_space.n))
         self.register_buffer("q_tables", th.zeros(shape, dtype=th.float64))
         self.register_buffer("visit_counts", th.zeros(shape, dtype=th.int64))
+
+    def tables(self) -> Tables:
+        """The tables for compiled functions to work on."""
+        values = self.q_tables.numpy()
+        return Tables(values, self.visit_counts.numpy(), np.empty(values.shape[2]))
 
     @property
     def q_table(self) -> NDArray[np.float64]:

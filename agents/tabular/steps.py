@@ -6,16 +6,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.tabular.rules import behaviour_action, update
-from mdp.compiled import compiled
+from mdp.compiled import kernel
 
 UNDECIDED = -1
+
+# For rules on one table, which take no random numbers.
+NO_DRAWS = np.empty(0)
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 
-@compiled
+@kernel
 def choose_actions(
     strategy: int,
     tables: Floats,
@@ -24,6 +27,7 @@ def choose_actions(
     tie_scale: float,
     draws: Floats,
     actions: Ints,
+    scratch: Floats,
 ) -> None:
     """Fill in the actions that are still `UNDECIDED`, in place.
 
@@ -35,8 +39,8 @@ def choose_actions(
         tie_scale: 1 to break ties at random, 0 to take the first best action.
         draws: one row of random numbers for each undecided action.
         actions: actions, shape (n_envs,).
+        scratch: room for A values.
     """
-    scratch = np.empty(tables.shape[2])
     row = 0
     for i in range(len(actions)):
         if actions[i] == UNDECIDED:
@@ -46,7 +50,7 @@ def choose_actions(
             row += 1
 
 
-@compiled
+@kernel
 def update_tables(
     rule: int,
     tables: Floats,
@@ -65,6 +69,7 @@ def update_tables(
     rate: float,
     tie_scale: float,
     uniforms: Floats,
+    scratch: Floats,
 ) -> float:
     """Update from one transition of each environment, in place.
 
@@ -85,12 +90,12 @@ def update_tables(
         strategy: exploration strategy.
         rate: epsilon, temperature or standard deviation.
         tie_scale: 1 to break ties at random, 0 to take the first best action.
-        uniforms: one number in [0, 1) for each environment, shape (n_envs,).
+        uniforms: one number in [0, 1) for each environment, shape (n_envs,), or `NO_DRAWS`.
+        scratch: room for A values.
 
     Returns:
         The mean absolute TD error.
     """
-    scratch = np.empty(tables.shape[2])
     total = 0.0
     for i in range(len(obs)):
         if terminated[i] and skip_terminal_update:
@@ -111,7 +116,7 @@ def update_tables(
             strategy,
             rate,
             tie_scale,
-            uniforms[i],
+            uniforms[i] if len(tables) > 1 else 0.0,
             scratch,
         )
         total += abs(td_error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import gymnasium as gym
@@ -58,24 +59,28 @@ def compile_world(vec_env: VecEnv) -> World:
     """
     if type(vec_env) is not DummyVecEnv:
         raise NotCompilable(f"{type(vec_env).__name__} is not DummyVecEnv")
-    env = vec_env.envs[0]
-    if any(_description(other) != _description(env) for other in vec_env.envs[1:]):
-        raise NotCompilable("the environments are not known to be alike")
-    for other in vec_env.envs:
-        if other.render_mode == "human":
+    for env in vec_env.envs:
+        if env.render_mode == "human":
             raise NotCompilable("the environment is shown on the screen")
-        _check_monitor(other)
+        _check_monitor(env)
+    first, *others = vec_env.envs
+    world = _world_of(first)
+    for other in others:
+        kinds = [[type(layer) for layer in layers(env)] for env in (first, other)]
+        if kinds[0] != kinds[1] or not _are_equal(world, _world_of(other)):
+            raise NotCompilable("the environments are not alike")
+    return world
+
+
+def _world_of(env: Env) -> World:
     if isinstance(env.unwrapped, CartPoleEnv):
         return _cart_pole_world(env)
     return _model_world(env)
 
 
-def _description(env: Env) -> list[Any]:
-    """What two environments must agree in to be alike."""
-    return [
-        *((type(layer), getattr(layer, "_saved_kwargs", None)) for layer in layers(env)),
-        env.unwrapped.spec or id(env),
-    ]
+def _are_equal(world: World, other: World) -> bool:
+    fields: Iterable[tuple[Any, Any]] = zip(world, other, strict=True)
+    return all(np.array_equal(ours, theirs) for ours, theirs in fields)
 
 
 def _check_monitor(env: Env) -> None:

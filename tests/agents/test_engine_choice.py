@@ -46,13 +46,23 @@ def pole(wrapper=lambda env: env, **kwargs):
     return DiscretizeObservation(wrapper(env), bins=4, low=-1, high=1)
 
 
+def changed(env, **attributes):
+    """The environment after some of its attributes have been set by hand."""
+    vars(env.unwrapped).update(attributes)
+    return env
+
+
 UNSUITED = {
     "SubprocVecEnv is not DummyVecEnv": lambda: lake(vec_env_cls=SubprocVecEnv),
     "VecNormalize is not DummyVecEnv": lambda: VecNormalize(lake(), norm_obs=False),
     "the environment's transition model is not known": lambda: lake(wrapper_class=Foreign),
     "transition model is not known": Blank,
-    "not known to be alike": lambda: DummyVecEnv(
+    "the environments are not alike": lambda: DummyVecEnv(
         [lambda: gym.make("FrozenLake-v1"), lambda: gym.make("FrozenLake-v1", is_slippery=False)]
+    ),
+    "environments are not alike": lambda: DummyVecEnv([pole, lambda: changed(pole(), gravity=1.6)]),
+    "are not alike": lambda: DummyVecEnv(
+        [lambda: gym.make("FrozenLake-v1"), lambda: Monitor(gym.make("FrozenLake-v1"))]
     ),
     "Monitor records further keys": lambda: lake(monitor_kwargs={"info_keywords": ("prob",)}),
     "a time limit lies outside Monitor": lambda: lake(

@@ -11,10 +11,12 @@ from agents.tabular.streams import UniformStreams
 CAPACITY = 7
 N = 3
 
-# What each generator uses up between two refills.
-ROUND = st.lists(st.integers(0, CAPACITY), min_size=N, max_size=N)
+# How many numbers are asked for, and of those how many each generator uses up.
+ROUND = st.integers(0, CAPACITY).flatmap(
+    lambda need: st.tuples(st.just(need), st.lists(st.integers(0, need), min_size=N, max_size=N))
+)
 # Rounds between two times that the generators are given back.
-SESSIONS = st.lists(st.lists(ROUND, max_size=4), max_size=4)
+SESSIONS = st.lists(st.lists(ROUND, max_size=6), max_size=4)
 
 
 def generators(seed=0):
@@ -30,13 +32,14 @@ def test_any_pattern_of_use(sessions, seed):
     ahead, direct = generators(seed), generators(seed)
     streams = UniformStreams(ahead, CAPACITY)
     for session in sessions:
-        for use in session:
-            streams.refill()
-            assert streams.used.tolist() == [0] * N
-            for i, used in enumerate(use):
-                expected = [direct[i].random() for _ in range(used)]
-                assert streams.uniforms[i, :used].tolist() == expected
-            streams.used[:] = use
+        for need, use in session:
+            streams.refill(need)
+            for row, start, used, generator in zip(
+                streams.uniforms, streams.used, use, direct, strict=True
+            ):
+                expected = [generator.random() for _ in range(used)]
+                assert row[start : start + used].tolist() == expected
+            streams.used += use
         streams.give_back()
         assert states(ahead) == states(direct)
         # Whoever has the generators meanwhile may draw from them in any way.
@@ -52,8 +55,8 @@ def test_giving_back_restores_the_generator(used, half_words):
     expected = copy.deepcopy(generator)
     expected.random(used)
     streams = UniformStreams([generator, *others], CAPACITY)
-    streams.refill()
-    streams.used[:] = used
+    streams.refill(CAPACITY)
+    streams.used += used
     streams.give_back()
     assert states([generator]) == states([expected])
     # Once more changes nothing.
