@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.pulls import LAST_PULLS
 from pipeline.run import FINISHED
 from pipeline.specs import TrainSpec
 
@@ -37,6 +36,8 @@ def describe(evaluation: Evaluation) -> str:
 
 def describe_pulls(pulls: PullSummary) -> str:
     """The pulls of a training in a few words."""
+    from pipeline.pulls import LAST_PULLS
+
     if pulls.regret is not None:
         last = min(LAST_PULLS, pulls.n_pulls)
         return (

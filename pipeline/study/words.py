@@ -86,19 +86,18 @@ def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
 
 def _on_the_pairs(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
     """The verdicts, those with the same first agent and the same verdict in one sentence."""
-    texts = []
     place = f"On {environment.environment}"
+    within = f" within {number(environment.margin)}" if environment.margin > 0 else ""
+    texts = [
+        f"{place}, {enumeration(group)} are equivalent{within}."
+        for group in _equivalent_groups(environment)
+    ]
     for agent in environment.agents:
         pairs = [pair for pair in environment.pairs if pair.first == agent.agent]
         better = [p for p in pairs if p.verdict == "better"]
-        equal = [p for p in pairs if p.verdict == "equivalent"]
         open_ = [p for p in pairs if p.verdict == "undecided"]
         if better:
             texts.append(f"{place}, {agent.agent} is better than {_by_how_much(better)}.")
-        if equal:
-            others = enumeration([p.second for p in equal])
-            within = f" within {number(environment.margin)}" if environment.margin > 0 else ""
-            texts.append(f"{place}, {agent.agent} and {others} are equivalent{within}.")
         texts += [_on_undecided(study, place, pair) for pair in open_]
         texts += [
             f"{place}, {pair.first} is worse than {_by_how_much([pair.swapped()])}."
@@ -106,6 +105,24 @@ def _on_the_pairs(study: StudySpec, environment: EnvironmentAnalysis) -> list[st
             if pair.verdict == "worse"
         ]
     return texts
+
+
+def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
+    """Agents of which every two are equivalent, in groups that hold all such pairs."""
+    names = [agent.agent for agent in environment.agents]
+    pairs = [(p.first, p.second) for p in environment.pairs if p.verdict == "equivalent"]
+    groups: list[list[str]] = []
+    for first, second in pairs:
+        if any(first in group and second in group for group in groups):
+            continue
+        group = [first, second]
+        for name in names:
+            if name not in group and all(
+                (name, member) in pairs or (member, name) in pairs for member in group
+            ):
+                group.append(name)
+        groups.append(sorted(group, key=names.index))
+    return groups
 
 
 def _by_how_much(pairs: Sequence[PairComparison]) -> str:

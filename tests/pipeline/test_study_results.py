@@ -218,6 +218,17 @@ def test_more_seeds_are_asked_for_where_they_would_help(tmp_path):
     assert re.search(r"; [\d,]+ seeds would probably tell\.", said(results))
 
 
+def test_agents_of_which_every_two_are_equivalent_make_one_sentence(tmp_path):
+    agents = ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")
+    # The margin is 2: the first and the last lie further apart than that, all others do not.
+    finals = dict(zip(agents, ([90.0] * 4, [91.5] * 4, [91.5] * 4, [93.0] * 4), strict=True))
+    text = said(results_of(study_of(agents=agents), tmp_path, finals))
+    assert "double_qlearning, sarsa and expected_sarsa are equivalent within 2." in text
+    assert "sarsa, expected_sarsa and qlearning are equivalent within 2." in text
+    assert text.count("equivalent") == 2
+    assert "double_qlearning is better than qlearning (by 3)" in text
+
+
 def test_an_environment_without_a_known_optimum(tmp_path):
     study = study_of(environments=[UNKNOWN])
     results = results_of(study, tmp_path, {"qlearning": [480] * 4, "sarsa": [100, 120, 99, 98]})
