@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import cache
 from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
@@ -121,6 +122,7 @@ def _write_settings(training: Training, args: dict[str, Any], command: str) -> N
     )
 
 
+@cache
 def recorded_versions() -> dict[str, str]:
     """The versions that a run's results may depend on."""
     packages = {package: version(package) for package in RECORDED_PACKAGES}
