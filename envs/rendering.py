@@ -5,6 +5,7 @@ pygame is imported when the first picture is drawn.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -171,7 +172,7 @@ class GridPainter:
         return self._sprites[shapes, size]
 
 
-class Renderer:
+class Renderer(ABC):
     """Shows scenes, as pixels or in a window.
 
     Copies, pickled ones included, share no window: they open their own when they need it.
@@ -187,9 +188,9 @@ class Renderer:
         self._window: pygame.Surface | None = None
         self._clock: pygame.time.Clock | None = None
 
+    @abstractmethod
     def paint(self, scene: Any) -> pygame.Surface:
         """Draw a scene."""
-        raise NotImplementedError
 
     def pixels(self, scene: Any) -> NDArray[np.uint8]:
         """The picture of a scene, shape (height, width, 3)."""

@@ -75,8 +75,12 @@ class Bandit(gym.Env[Any, Any]):
         return int(space.n) if isinstance(space, spaces.Discrete) else 0
 
     def expected_rewards(self) -> list[float]:
-        """What each arm gives on average in the present context."""
-        raise NotImplementedError
+        """What each arm gives on average in the present context.
+
+        Raises:
+            NotImplementedError: where nobody knows, as with logged data.
+        """
+        raise NotImplementedError(f"{type(self).__name__} does not know what its arms are worth")
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -157,12 +161,12 @@ class Bandit(gym.Env[Any, Any]):
         return np.array([self.expected_rewards()])
 
     def _begin(self) -> None:
-        """Draw arms and first context."""
-        raise NotImplementedError
+        """Draw arms and first context; every kind of bandit has its own way."""
+        raise NotImplementedError(f"{type(self).__name__} does not say how it begins")
 
     def _pull(self, arm: int) -> float:
-        """Draw the reward of an arm, and the next context."""
-        raise NotImplementedError
+        """Draw the reward of an arm, and the next context; what is logged is not drawn."""
+        raise NotImplementedError(f"{type(self).__name__} draws no rewards")
 
 
 def agreed_size(name: str, asked: int | None, given: int | None, default: int, low: int) -> int:

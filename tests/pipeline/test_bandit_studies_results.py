@@ -13,21 +13,10 @@ from pipeline.study.bounds import (
 from pipeline.study.planning import plan
 from pipeline.study.reading import read_study
 from pipeline.study.results import read_results
-from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.study.work import do_run, draft_path
 
 STUDIES = sorted((Path(__file__).parents[2] / "studies").glob("bandit-*.yml"))
 COINS = (0.2, 0.5, 0.75)
-SEGMENTS = EnvironmentSpec("segments", "SegmentBandit-v0", {"n_timesteps": 200})
-
-
-def study_of(agents, environments=(SEGMENTS,), n_seeds=5):
-    specs = [
-        AgentSpec(label, settings["algo"], {k: v for k, v in settings.items() if k != "algo"})
-        for label, settings in agents.items()
-    ]
-    specs = [replace(spec, tuned=False) for spec in specs]
-    return StudySpec("s", "S", tuple(specs), environments, n_seeds=n_seeds, metric="regret")
 
 
 def do(study, root):
