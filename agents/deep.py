@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from functools import partial
 
+import numpy as np
 import torch as th
 from stable_baselines3 import DQN
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.dqn.policies import QNetwork
+from torch.nn.functional import mse_loss
+from torch.nn.utils import clip_grad_norm_
 
 
 def double_q_values(online: QNetwork, target: QNetwork, next_obs: th.Tensor) -> th.Tensor:
@@ -40,3 +44,40 @@ class DoubleDQN(DQN):
             super().train(gradient_steps, batch_size)
         finally:
             self.q_net_target = target_network
+
+
+class DeepQLearning(DQN):
+    """Deep Q-learning with experience replay as first published (Mnih et al., 2013).
+
+    DQN without what was added to it later: the target comes from the network that learns, as it is
+    at that very update, and the loss is the squared error, where Stable-Baselines3's DQN has a
+    lagging copy and Huber's loss. Arguments are those of `stable_baselines3.DQN`;
+    ``target_update_interval`` is without effect.
+    """
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        losses = []
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            loss = self._loss(batch)
+            self.policy.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+            losses.append(loss.item())
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/loss", np.mean(losses))
+
+    def _loss(self, batch: ReplayBufferSamples) -> th.Tensor:
+        """Half the mean squared error of the taken actions' values, a scalar."""
+        discounts = self.gamma if batch.discounts is None else batch.discounts
+        with th.no_grad():
+            next_values = self.q_net(batch.next_observations).amax(dim=1, keepdim=True)
+            targets = batch.rewards + (1 - batch.dones) * discounts * next_values
+        values = self.q_net(batch.observations).gather(dim=1, index=batch.actions.long())
+        return mse_loss(values, targets) / 2

@@ -116,6 +116,9 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "double_qlearning": _tabular("DoubleQLearning", "double Q-learning on two tables"),
     "dqn": _deep("stable_baselines3:DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
+    "deep_qlearning": _deep(
+        "agents.deep:DeepQLearning", "DQN of 2013: squared loss, no target network"
+    ),
     "ppo": _deep(
         "stable_baselines3:PPO",
         "proximal policy optimisation (Stable-Baselines3)",

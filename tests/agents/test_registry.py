@@ -14,6 +14,7 @@ DISCRETE = spaces.Discrete(4)
 BOX = spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "optimal"]
 TABULAR = ["qlearning", "sarsa", "expected_sarsa", "double_qlearning"]
+DEEP_Q = ["dqn", "double_dqn", "deep_qlearning"]
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -41,15 +42,15 @@ def test_an_unknown_name():
     [
         (
             "CartPole-v1",
-            ["dqn", "double_dqn", "ppo", "a2c", "qrdqn", "random", "angle"],
+            [*DEEP_Q, "ppo", "a2c", "qrdqn", "random", "angle"],
         ),
         (
             "FrozenLake-v1",
-            [*TABULAR, "dqn", "double_dqn", "ppo", "a2c", "qrdqn", *PLANNING, "random"],
+            [*TABULAR, *DEEP_Q, "ppo", "a2c", "qrdqn", *PLANNING, "random"],
         ),
         ("MountainCarContinuous-v0", ["ppo", "a2c", "random"]),
         # Four numbers are observed in CartPole, two here.
-        ("MountainCar-v0", ["dqn", "double_dqn", "ppo", "a2c", "qrdqn", "random"]),
+        ("MountainCar-v0", [*DEEP_Q, "ppo", "a2c", "qrdqn", "random"]),
         ("Blackjack-v1", []),
     ],
 )
