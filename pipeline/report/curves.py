@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from pipeline.study.analysis import EnvironmentAnalysis, StudyAnalysis, mean_cur
 KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
 MAX_POINTS = 200  # more than a screen tells apart
+STAGES = (0.1, 0.25, 0.5, 1.0)  # shares of an agent's training that the table has a column for
 
 Floats = NDArray[np.float64]
 Curve = tuple[Floats, Band]
@@ -33,7 +35,11 @@ def section(report: Report) -> Section | None:
     ]
     if analysis.results.curves.empty or not any(data):
         return None
-    context = {"has_curves": [item is not None for item in data]}
+    context = {
+        "has_curves": [item is not None for item in data],
+        "stages": STAGES,
+        "tables": [[] if item is None else _table(item["evaluation"]["step"]) for item in data],
+    }
     return Section("curves", "Learning curves", context, data, by_environment=True)
 
 
@@ -81,3 +87,14 @@ def _curve_data(curve: Curve) -> dict[str, Floats]:
         "low": band.low[chosen],
         "high": band.high[chosen],
     }
+
+
+def _table(curves: Mapping[str, Mapping[str, Floats]]) -> list[tuple[str, list[dict[str, float]]]]:
+    """What an agent's curve comes to by each stage: for those who cannot see the figure."""
+    return [(agent, [_at(curve, share) for share in STAGES]) for agent, curve in curves.items()]
+
+
+def _at(curve: Mapping[str, Floats], share: float) -> dict[str, float]:
+    """The point of a curve that lies nearest to a share of its way."""
+    nearest = np.abs(curve["x"] - share * curve["x"][-1]).argmin()
+    return {name: values[nearest] for name, values in curve.items()}

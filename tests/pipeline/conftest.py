@@ -39,6 +39,20 @@ def small_study() -> StudySpec:
 
 
 @pytest.fixture(scope="session")
+def do_study():
+    """Does the runs of a study that are missing, in this process, and reads its results."""
+
+    def do(study, root):
+        planned = plan(study, root)
+        for run in planned:
+            if not run.is_finished:
+                do_run(run, draft_path(root, run), "compare.py s.yml")
+        return read_results(study, planned, root)
+
+    return do
+
+
+@pytest.fixture(scope="session")
 def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
     study, root = small_study(), tmp_path_factory.mktemp("study")

@@ -18,11 +18,9 @@ from pipeline.study.batches import STATISTICS_FILE, read_run, stacked_statistics
 from pipeline.study.planning import plan
 from pipeline.study.pulls import PullStatistics
 from pipeline.study.reading import read_study
-from pipeline.study.results import read_results
 from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.study.tables import print_analysis
 from pipeline.study.words import sentences
-from pipeline.study.work import do_run, draft_path
 from pipeline.training import train
 
 STUDIES = sorted((Path(__file__).parents[2] / "studies").glob("bandit-*.yml"))
@@ -37,15 +35,6 @@ def study_of(agents, environments=(SEGMENTS,), n_seeds=5):
     ]
     specs = [replace(spec, tuned=False) for spec in specs]
     return StudySpec("s", "S", tuple(specs), environments, n_seeds=n_seeds, metric="regret")
-
-
-def do(study, root):
-    """The study done in this process, as its results."""
-    planned = plan(study, root)
-    for run in planned:
-        if not run.is_finished:
-            do_run(run, draft_path(root, run), "compare.py s.yml")
-    return read_results(study, planned, root)
 
 
 # --- batches where they may be, and runs else -----------------------------------------------------
@@ -106,9 +95,9 @@ AGENTS = {
 
 
 @pytest.fixture(scope="module")
-def batches(tmp_path_factory):
+def batches(tmp_path_factory, do_study):
     """A small study, done."""
-    return do(study_of(AGENTS), tmp_path_factory.mktemp("batches"))
+    return do_study(study_of(AGENTS), tmp_path_factory.mktemp("batches"))
 
 
 def trained(spec, folder):
@@ -153,29 +142,29 @@ def test_statistics_are_those_of_the_batch(batches):
     assert (info["engine"], info["n_runs"], info["n_timesteps"]) == ("compiled batch", 5, 200)
 
 
-def test_what_has_no_compiled_copy_goes_one_by_one(tmp_path, monkeypatch):
+def test_what_has_no_compiled_copy_goes_one_by_one(tmp_path, monkeypatch, do_study):
     from agents.bandits.worlds import NotBatchable
 
     def refuse(*args):
         raise NotBatchable("of a reason")
 
-    expected = do(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "one")
+    expected = do_study(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "one")
     monkeypatch.setattr("pipeline.study.batches.run_batch", refuse)
-    found = do(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "two")
+    found = do_study(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "two")
     assert found.summary["engine"].unique().tolist() == ["one by one: of a reason"]
     assert found.summary["regret"].tolist() == expected.summary["regret"].tolist()
 
 
-def test_a_batch_that_is_there_is_not_done_again_and_a_longer_one_is(tmp_path):
+def test_a_batch_that_is_there_is_not_done_again_and_a_longer_one_is(tmp_path, do_study):
     study = study_of({"ucb": {"algo": "ucb"}}, n_seeds=3)
-    first = do(study, tmp_path)
+    first = do_study(study, tmp_path)
     (planned,) = plan(study, tmp_path)
     assert planned.is_finished
     before = (planned.path / STATISTICS_FILE).stat().st_mtime_ns
-    do(study, tmp_path)
+    do_study(study, tmp_path)
     assert (planned.path / STATISTICS_FILE).stat().st_mtime_ns == before
 
-    more = do(replace(study, n_seeds=6), tmp_path)
+    more = do_study(replace(study, n_seeds=6), tmp_path)
     assert more.summary["regret"].tolist()[:3] == first.summary["regret"].tolist()
     assert len(more.summary) == 6
     assert [path.name for path in (tmp_path / "runs" / "ucb").iterdir()] == ["segments_1"]
@@ -187,14 +176,14 @@ def test_a_batch_that_is_there_is_not_done_again_and_a_longer_one_is(tmp_path):
     assert not changed.is_finished
 
 
-def test_runs_beside_batches(tmp_path):
+def test_runs_beside_batches(tmp_path, do_study):
     """An agent of the library goes run by run, and its regret is counted over as many pulls."""
     agents = {
         "ucb": {"algo": "ucb"},
         "ppo": {"algo": "ppo", "policy": "MlpPolicy", "n_steps": 64, "batch_size": 64, "n_envs": 2},
     }
     short = replace(SEGMENTS, settings={"n_timesteps": 100})
-    results = do(study_of(agents, (short,), n_seeds=2), tmp_path)
+    results = do_study(study_of(agents, (short,), n_seeds=2), tmp_path)
     assert {agent: len(p.total_regret) for (agent, _), p in results.pulls.items()} == {
         "ucb": 2,
         "ppo": 2,
@@ -221,10 +210,12 @@ def test_runs_beside_batches(tmp_path):
         ("LinearBandit-v0", {}, False),
     ],
 )
-def test_an_arm_is_recommended_where_one_is_the_best(env_id, env_kwargs, has_simple, tmp_path):
+def test_an_arm_is_recommended_where_one_is_the_best(
+    env_id, env_kwargs, has_simple, tmp_path, do_study
+):
     place = EnvironmentSpec("it", env_id, {"n_timesteps": 30, "env_kwargs": env_kwargs})
     agent = "lin_epsilon_greedy" if env_id.startswith("Linear") else "epsilon_greedy"
-    results = do(study_of({"it": {"algo": agent}}, (place,), n_seeds=2), tmp_path)
+    results = do_study(study_of({"it": {"algo": agent}}, (place,), n_seeds=2), tmp_path)
     simple = results.pulls["it", "it"].simple_regret
     assert np.isfinite(simple).all() if has_simple else np.isnan(simple).all()
 
@@ -232,13 +223,13 @@ def test_an_arm_is_recommended_where_one_is_the_best(env_id, env_kwargs, has_sim
 # --- verdicts on what should be low ---------------------------------------------------------------
 
 
-def test_less_regret_is_better(tmp_path):
+def test_less_regret_is_better(tmp_path, do_study):
     agents = {
         "random": {"algo": "epsilon_greedy", "exploration_initial_eps": 1.0},
         "Thompson": {"algo": "thompson"},
     }
     place = EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 500})
-    results = do(study_of(agents, (place,), n_seeds=10), tmp_path)
+    results = do_study(study_of(agents, (place,), n_seeds=10), tmp_path)
     analysis = analyse(results)
     (environment,) = analysis.environments
     assert [agent.agent for agent in environment.agents] == ["Thompson", "random"]

@@ -12,11 +12,8 @@ from pipeline.report import bandits, write_report
 from pipeline.report.sections import Report
 from pipeline.study.analysis import analyse
 from pipeline.study.figures import write_figures
-from pipeline.study.planning import plan
 from pipeline.study.posteriors import density, grid, is_normal, truth
-from pipeline.study.results import read_results
 from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.study.work import do_run, draft_path
 
 PLACES = (
     EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 400}),
@@ -31,19 +28,11 @@ AGENTS = (
 )
 
 
-def do(study, root):
-    planned = plan(study, root)
-    for run in planned:
-        if not run.is_finished:
-            do_run(run, draft_path(root, run), "compare.py s.yml")
-    return analyse(read_results(study, planned, root))
-
-
 @pytest.fixture(scope="module")
-def analysis(tmp_path_factory):
+def analysis(tmp_path_factory, do_study):
     """Agents for clicks on two bandits; the third knows one of them alone."""
     study = StudySpec("s", "S", AGENTS, PLACES[:2], n_seeds=4, metric="regret")
-    return do(study, tmp_path_factory.mktemp("study"))
+    return analyse(do_study(study, tmp_path_factory.mktemp("study")))
 
 
 @pytest.fixture(scope="module")
@@ -153,11 +142,11 @@ def test_figures(analysis):
     }
 
 
-def test_bandits_whose_arms_are_drawn_anew(tmp_path):
+def test_bandits_whose_arms_are_drawn_anew(tmp_path, do_study):
     """There are no arms to tell apart over runs, and no bounds; curves there are."""
     agents = (AGENTS[2], AGENTS[3])
     study = StudySpec("s", "S", agents, PLACES[2:], n_seeds=3, metric="regret")
-    analysis = do(study, tmp_path)
+    analysis = analyse(do_study(study, tmp_path))
     (item,) = bandits.section(Report(analysis, "")).data
     assert item["best"] == pytest.approx(1.5388, abs=1e-4)
     assert (item["bounds"], item["arms"], item["posteriors"]) == (None, None, [])
@@ -166,7 +155,7 @@ def test_bandits_whose_arms_are_drawn_anew(tmp_path):
     assert names == {"testbed_pulls", "testbed_regret"}
 
 
-def test_a_parameter_is_drawn_by_its_values(tmp_path):
+def test_a_parameter_is_drawn_by_its_values(tmp_path, do_study):
     agents = tuple(
         AgentSpec(
             f"epsilon={value}",
@@ -179,17 +168,17 @@ def test_a_parameter_is_drawn_by_its_values(tmp_path):
         for value in (0.05, 0.1, 0.2)
     )
     study = StudySpec("s", "S", agents, PLACES[:1], n_seeds=2, metric="training")
-    names = {path.stem for path in write_figures(do(study, tmp_path), None)}
+    names = {path.stem for path in write_figures(analyse(do_study(study, tmp_path)), None)}
     assert "coins_sweep" in names
 
 
-def test_a_study_of_both_kinds(tmp_path):
+def test_a_study_of_both_kinds(tmp_path, do_study):
     """Curves by step where there is no bandit, curves by pull where there is."""
     lake = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 200})
     coins = replace(PLACES[0], settings={"n_timesteps": 60})
     agents = (AgentSpec("qlearning", "qlearning", tuned=False),)
     study = StudySpec("s", "S", agents, (lake, coins), n_seeds=2)
-    analysis = do(study, tmp_path)
+    analysis = analyse(do_study(study, tmp_path))
     path = tmp_path / "report.html"
     write_report(analysis, path, "")
     page = path.read_text(encoding="utf-8")

@@ -10,22 +10,10 @@ from pipeline.study.bounds import (
     auer_bound,
     best_of_normals,
 )
-from pipeline.study.planning import plan
 from pipeline.study.reading import read_study
-from pipeline.study.results import read_results
-from pipeline.study.work import do_run, draft_path
 
 STUDIES = sorted((Path(__file__).parents[2] / "studies").glob("bandit-*.yml"))
 COINS = (0.2, 0.5, 0.75)
-
-
-def do(study, root):
-    """The study done in this process, as its results."""
-    planned = plan(study, root)
-    for run in planned:
-        if not run.is_finished:
-            do_run(run, draft_path(root, run), "compare.py s.yml")
-    return read_results(study, planned, root)
 
 
 # --- the studies as they are shipped, with fewer runs --------------------------------------------
@@ -35,16 +23,21 @@ def do(study, root):
 # are: that the label stands for the agent, on the bandit, for as many pulls.
 
 
-def done(name, root, seeds, agents, environment=0):
-    """Statistics of some agents of a study on one of its environments, with fewer seeds."""
-    (path,) = [path for path in STUDIES if path.stem == f"bandit-{name}"]
-    study = read_study(path)
-    kept = tuple(spec for spec in study.agents if spec.label in agents)
-    assert len(kept) == len(agents)
-    place = study.environments[environment]
-    study = replace(study, agents=kept, environments=(place,), n_seeds=seeds)
-    results = do(study, root)
-    return {agent: results.pulls[agent, place.label] for agent in agents}
+@pytest.fixture
+def done(do_study, tmp_path):
+    """Does agents of a study on one of its environments, with fewer seeds: statistics."""
+
+    def do(name, seeds, agents, environment=0):
+        (path,) = [path for path in STUDIES if path.stem == f"bandit-{name}"]
+        study = read_study(path)
+        kept = tuple(spec for spec in study.agents if spec.label in agents)
+        assert len(kept) == len(agents)
+        place = study.environments[environment]
+        study = replace(study, agents=kept, environments=(place,), n_seeds=seeds)
+        results = do_study(study, tmp_path)
+        return {agent: results.pulls[agent, place.label] for agent in agents}
+
+    return do
 
 
 def mean_regret_from(statistics, pull):
@@ -54,8 +47,8 @@ def mean_regret_from(statistics, pull):
     return (statistics.cumulative_regret[-1] - before) / (last - pull)
 
 
-def test_the_testbed(tmp_path):
-    found = done("testbed", tmp_path, 200, ["epsilon 0.1", "UCB c=2", "optimistic", "greedy"])
+def test_the_testbed(done):
+    found = done("testbed", 200, ["epsilon 0.1", "UCB c=2", "optimistic", "greedy"])
     # .1705 with a spread of .0067 over 200 runs.
     assert mean_regret_from(found["epsilon 0.1"], 900) == pytest.approx(0.1705, abs=4 * 0.0067)
     # The best of ten arms has just been found by all runs, 1.08; before, each arm was tried once.
@@ -72,10 +65,10 @@ def test_the_testbed(tmp_path):
     assert found["greedy"].true_means.size == 0
 
 
-def test_gradients_around_four(tmp_path):
+def test_gradients_around_four(done):
     """Figure 2.5: 5.507 with a baseline and 5.215 without, at the last pulls."""
     labels = ["gradient 0.1", "gradient 0.1, no baseline"]
-    found = done("testbed", tmp_path, 300, labels, environment=1)
+    found = done("testbed", 300, labels, environment=1)
     # One mean of 2000 runs spreads by .025 to .04, of 300 by three times that.
     for label, reward in zip(labels, (5.507, 5.215), strict=True):
         assert found[label].reward[-1] == pytest.approx(reward, abs=4 * 0.04 * (2000 / 300) ** 0.5)
@@ -89,9 +82,9 @@ def within(found, expected, tolerances):
         assert statistics.pulls[-1] == 10_000
 
 
-def test_bernoulli_arms(tmp_path):
+def test_bernoulli_arms(done):
     expected = {"Thompson": 14.8, "UCB1": 82.0, "epsilon 0.1": 275.5, "random": 2666.7}
-    found = done("bernoulli", tmp_path, 60, list(expected))
+    found = done("bernoulli", 60, list(expected))
     # Four standard errors, and the half unit of the last digit.
     tolerances = {agent: 4 * s.total_regret.std() / 60**0.5 + 0.5 for agent, s in found.items()}
     assert tolerances["Thompson"] < 6
@@ -104,14 +97,14 @@ def test_bernoulli_arms(tmp_path):
     assert found["random"].shares == pytest.approx(np.full((1, 3), 1 / 3), abs=0.01)
 
 
-def test_segments(tmp_path):
+def test_segments(done):
     expected = {
         "random": 653.0,
         "Thompson, blind": 443.0,
         "Thompson by segment": 37.0,
         "LinUCB alpha=1": 31.0,
     }
-    found = done("segments", tmp_path, 60, [*expected, "LinUCB alpha=0.2"])
+    found = done("segments", 60, [*expected, "LinUCB alpha=0.2"])
     tolerances = {agent: 4 * s.total_regret.std() / 60**0.5 + 1 for agent, s in found.items()}
     within(found, expected, tolerances)
     # 155 with a spread of 228 over runs: the mean is worse than alpha=1, the median is not.
@@ -127,10 +120,10 @@ def test_segments(tmp_path):
     assert by_segment.argmax(axis=1).tolist() == [1, 0]
 
 
-def test_three_arms(tmp_path):
+def test_three_arms(done):
     """Epsilon-greedy ends at 3 - epsilon, exactly; the spread over seeds is .003 to .006."""
     labels = [spec.label for spec in read_study(STUDIES[1]).agents]
-    found = done("epsilon", tmp_path, 4, labels)
+    found = done("epsilon", 4, labels)
     for label, reward in zip(labels, (2.90, 2.95, 2.99), strict=True):
         last = found[label].reward[-1]
         width = found[label].pulls[-1] - found[label].pulls[-2]
@@ -141,9 +134,9 @@ def test_three_arms(tmp_path):
         assert found[label].total_reward.mean() / 100_000 == pytest.approx(reward, abs=0.01)
 
 
-def test_drifting_arms(tmp_path):
+def test_drifting_arms(done):
     """Exercise 2.5: a constant step size loses at first and wins in the end."""
-    found = done("nonstationary", tmp_path, 60, ["sample averages", "step size 0.1"])
+    found = done("nonstationary", 60, ["sample averages", "step size 0.1"])
     averages, constant = found["sample averages"], found["step size 0.1"]
     assert mean_regret_from(constant, 5000) < 0.6 * mean_regret_from(averages, 5000)
     assert constant.optimal[-20:].mean() > averages.optimal[-20:].mean() + 0.1
@@ -152,10 +145,10 @@ def test_drifting_arms(tmp_path):
     assert difference > 4 * spread
 
 
-def test_linear_rewards(tmp_path):
+def test_linear_rewards(done):
     """The contextual agents leave a random one far behind, which loses the mean gap of five."""
     labels = ["LinUCB alpha=1", "linear Thompson", "linear epsilon 0.1", "random"]
-    found = done("linear", tmp_path, 60, labels)
+    found = done("linear", 60, labels)
     # Given the context an arm is worth a normal with mean 0 and about unit variance; the variance
     # of the context's length takes something off.
     lost = found["random"].total_regret / 1000

@@ -174,6 +174,21 @@ def test_the_curves_end_with_the_final_evaluations(page, report_study):
         assert curves[agent]["x"][-1] == 2000
 
 
+def test_the_curves_stand_in_a_table_too(page):
+    tables = [text for _, text in page.all("details") if "as a table" in text]
+    assert len(tables) == 2
+    for place, table in enumerate(tables):
+        assert re.findall(r"\d+ %", table) == ["10 %", "25 %", "50 %", "100 %"]
+        for agent, curve in data_of(page, "data-curves")[place]["evaluation"]["step"].items():
+            row = table[table.index(agent) + len(agent) :].replace(",", "")
+            cells = re.findall(r"(\S+)\s+(?:\S+ to \S+ )?(\d+) steps", row)[:4]
+            means, steps = np.array(cells, dtype=float).T
+            assert steps.tolist() == [200, 500, 1000, 2000]
+            assert means == pytest.approx(
+                np.interp(steps, curve["x"], curve["y"]), rel=1e-3, abs=1e-4
+            )
+
+
 def test_an_agent_has_the_colour_of_the_printed_figures(page, report_study):
     marks = data_of(page, "data-page")["agents"]
     assert [COLOURS[mark["colour"]] for mark in marks] == [

@@ -12,6 +12,10 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import Select, WebDriverWait
 
+from pipeline.report import write_report
+from pipeline.study.analysis import analyse
+from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec
+
 BROWSER, DRIVER = (
     shutil.which("chromium") or shutil.which("google-chrome"),
     shutil.which("chromedriver"),
@@ -60,6 +64,31 @@ def page(browser, report_study):
     return browser
 
 
+@pytest.fixture(scope="module")
+def bandit_study(do_study, tmp_path_factory):
+    """The page of a study on two bandits, one of them with contexts."""
+    places = tuple(
+        EnvironmentSpec(name, name, {"n_timesteps": 300})
+        for name in ("BernoulliBandit-v0", "SegmentBandit-v0")
+    )
+    agents = tuple(AgentSpec(name, name, tuned=False) for name in ("thompson", "epsilon_greedy"))
+    root = tmp_path_factory.mktemp("bandits")
+    study = StudySpec("b", "Bandits", agents, places, n_seeds=3, metric="regret")
+    path = root / "report.html"
+    write_report(analyse(do_study(study, root)), path, "compare.py b.yml")
+    return path
+
+
+@pytest.fixture
+def bandit_page(browser, bandit_study):
+    """The page on bandits, freshly loaded in a wide window, with nothing in the log."""
+    resize(browser, 1280)
+    browser.get_log("browser")
+    browser.get(bandit_study.as_uri())
+    wait(browser, lambda: plots(browser) >= 6)
+    return browser
+
+
 def resize(browser, width):
     size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
@@ -95,7 +124,7 @@ def figure(browser, css):
           x: plot.data.map((trace) => trace.x),
           y: plot.data.map((trace) => trace.y),
           names: plot.data.map((trace) => trace.name).filter((name) => name),
-          xTitle: plot.layout.xaxis.title.text,
+          xTitle: plot.layout.xaxis.title?.text,
           xType: plot.layout.xaxis.type,
           yTitle: plot.layout.yaxis.title?.text,
           tickText: plot.layout.yaxis.ticktext,
@@ -331,3 +360,52 @@ def test_a_phone_has_nothing_beyond_its_edge(page, width):
         time.sleep(0.3)
         reach = page.execute_script("return document.documentElement.scrollWidth")
         assert reach <= width
+
+
+def test_curves_by_pull_change_with_their_toggles(bandit_page):
+    regret = figure(bandit_page, "#pull-regret")
+    assert (regret["xTitle"], regret["xType"]) == ("pulls", "log")
+    assert "Auer, for UCB1" in regret["names"]
+    choose(bandit_page, "pull-axis", "linear")
+    assert figure(bandit_page, "#pull-regret")["xType"] == "linear"
+    choose(bandit_page, "pull-spread", "runs")
+    assert figure(bandit_page, "#pull-regret")["y"] != regret["y"]
+    script_click(bandit_page, find_all(bandit_page, "#bandits .legend button")[0])
+    assert len(figure(bandit_page, "#pull-optimal")["names"]) == 1
+    assert len(figure(bandit_page, "#arm-shares")["names"]) == 1
+    assert bandit_page.get_log("browser") == []
+
+
+def test_beliefs_are_chosen_by_context_and_moment(bandit_page):
+    # One context has nothing to choose from.
+    assert not find(bandit_page, ".pick.context").is_displayed()
+    Select(find(bandit_page, "#environment")).select_by_index(1)
+    last = figure(bandit_page, "#pull-posteriors")
+    assert last["names"] == ["arm 0", "arm 1", "arm 2"]
+    Select(find(bandit_page, ".pick.context select")).select_by_index(1)
+    casual = figure(bandit_page, "#pull-posteriors")
+    assert casual["y"] != last["y"]
+    Select(find(bandit_page, ".pick.moment select")).select_by_index(0)
+    first = figure(bandit_page, "#pull-posteriors")
+    # A density that knows less is lower.
+    assert max(v for y in first["y"] for v in y) < max(v for y in casual["y"] for v in y)
+    assert bandit_page.get_log("browser") == []
+
+
+def test_the_table_of_arms_is_that_of_the_environment(bandit_page):
+    def rows():
+        cells = find_all(bandit_page, "#bandits figure tbody tr th")
+        return [cell.text for cell in cells if cell.is_displayed()]
+
+    assert len(rows()) == 4
+    Select(find(bandit_page, "#environment")).select_by_index(1)
+    assert len(rows()) == 8
+    assert rows()[-1] == "context 1, regret of a pull"
+
+
+def test_a_phone_shows_bandits_within_its_edge(bandit_page):
+    resize(bandit_page, 380)
+    for environment in (0, 1):
+        Select(find(bandit_page, "#environment")).select_by_index(environment)
+        time.sleep(0.3)
+        assert bandit_page.execute_script("return document.documentElement.scrollWidth") <= 380
