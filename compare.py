@@ -74,7 +74,7 @@ def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
     args = build_parser().parse_args()
     if args.logged or args.policy:
-        from pipeline.logged_tables import compare_on_log
+        from pipeline.off_policy.tables import compare_on_log
 
         return compare_on_log(args)
     from pipeline.study.requests import study_spec

@@ -23,7 +23,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation import Yardstick, evaluate
 from pipeline.exact import exact_evaluator
-from pipeline.hyperparams import split
+from pipeline.settings.hyperparams import split
 from pipeline.specs import TrainSpec
 
 EPISODES = 100

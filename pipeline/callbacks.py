@@ -21,7 +21,7 @@ from agents.blocks import BlockCallback, Horizon, calls_until_multiple
 from pipeline.evaluation import Evaluation
 from pipeline.files import replacing
 from pipeline.run import Run
-from pipeline.value_maps import ValueMapRecorder
+from pipeline.value_maps.recording import ValueMapRecorder
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:

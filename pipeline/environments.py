@@ -88,7 +88,7 @@ def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
 
 def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
     """The wrappers that the hyperparameters name, as one function, or None for none."""
-    from pipeline.components import wrapper_factory
+    from pipeline.settings.components import wrapper_factory
 
     inner = wrapper_factory(spec.hyperparams.env_wrapper, spec.gym_packages)
     outer = (
@@ -151,7 +151,7 @@ def _make_vec_env(
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.env_util import make_vec_env
 
-    from pipeline.components import vec_wrapper_factory
+    from pipeline.settings.components import vec_wrapper_factory
 
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
 

@@ -15,13 +15,13 @@ import numpy as np
 from gymnasium.wrappers import RenderCollection
 from rich.console import Console
 
-from pipeline import hyperparams
 from pipeline.environments import check_env_id, import_gym_packages, make_evaluation_env
 from pipeline.errors import UserError, one_line
-from pipeline.literals import parse_assignments
 from pipeline.loading import check_model_file, hand_written_algorithm, load_model, run_of
 from pipeline.requests import check_algorithm
 from pipeline.run import Run
+from pipeline.settings import hyperparams
+from pipeline.settings.literals import parse_assignments
 from pipeline.specs import TrainSpec
 from pipeline.summary import describe
 

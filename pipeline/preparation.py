@@ -16,8 +16,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents import load_algorithm
 from agents.blocks import EpisodeBudget
-from pipeline import components
-from pipeline.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.callbacks import (
     EpisodeCheckpoint,
     EvaluationCallback,
@@ -32,8 +30,10 @@ from pipeline.loading import load_model
 from pipeline.progress import ProgressDisplay
 from pipeline.pulls import PullRecorder, are_bandits
 from pipeline.run import Run
+from pipeline.settings import components
+from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.specs import TrainSpec
-from pipeline.value_maps import ValueMapRecorder
+from pipeline.value_maps.recording import ValueMapRecorder
 
 EVALUATIONS_PER_RUN = 20
 

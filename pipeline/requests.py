@@ -9,10 +9,10 @@ from typing import Any
 
 from agents import ALGORITHMS, fitting_algorithms
 from agents.registry import is_bandit
-from pipeline import hyperparams
 from pipeline.environments import check_env_id, import_gym_packages, make_single_env
 from pipeline.errors import UserError, unknown
-from pipeline.literals import parse_assignments
+from pipeline.settings import hyperparams
+from pipeline.settings.literals import parse_assignments
 from pipeline.specs import TrainSpec
 
 

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pipeline.hyperparams import Hyperparams
+from pipeline.settings.hyperparams import Hyperparams
 
 
 @dataclass(frozen=True)

@@ -28,8 +28,8 @@ from pipeline.pulls import PullSummary, summarise_pulls
 from pipeline.run import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.specs import TrainSpec
 from pipeline.summary import print_header
-from pipeline.value_map_plots import draw_value_map
-from pipeline.value_maps import value_map
+from pipeline.value_maps.plots import draw_value_map
+from pipeline.value_maps.recording import value_map
 
 FINAL_EVALUATION_EPISODES = 100
 # A budget in episodes has no number of steps; this one is never reached.

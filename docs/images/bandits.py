@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 import envs  # noqa: F401  # registers the bandits
 from agents.bandits.batch import run_batch
 from envs.bandits import log_uniformly, read_log
-from pipeline.off_policy import evaluate_policy, mean_reward
-from pipeline.reward_models import cross_fit
+from pipeline.off_policy.estimators import evaluate_policy, mean_reward
+from pipeline.off_policy.reward_models import cross_fit
 from pipeline.study.drawing import COLOURS
 
 FOLDER = Path(__file__).parent

@@ -11,11 +11,11 @@ from typing import Any
 
 from agents import ALGORITHMS
 from envs.model import time_limit
-from pipeline import hyperparams
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
 from pipeline.requests import check_algorithm, check_fit
 from pipeline.run import FINISHED, Run, environment_name
+from pipeline.settings import hyperparams
 from pipeline.specs import TrainSpec
 from pipeline.study.spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 
@@ -139,8 +139,8 @@ def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
     Raises:
         UserError: if one cannot.
     """
-    from pipeline import components
     from pipeline.preparation import algorithm_kwargs
+    from pipeline.settings import components
 
     agents = {agent.label: agent for agent in study.agents}
     for run in planned:

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from pipeline import hyperparams
+from pipeline.settings import hyperparams
 from pipeline.specs import TrainSpec
 from pipeline.training import train
 

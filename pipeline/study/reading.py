@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
-from pipeline.coercion import coerce
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, shown, unknown
-from pipeline.strict_yaml import key_lines, read_yaml
+from pipeline.settings.coercion import coerce
+from pipeline.settings.strict_yaml import key_lines, read_yaml
 from pipeline.study.spec import (
     AgentSpec,
     EnvironmentSpec,

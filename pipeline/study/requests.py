@@ -11,7 +11,7 @@ from typing import Any
 from agents import ALGORITHMS
 from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError, unknown
-from pipeline.literals import parse_assignments
+from pipeline.settings.literals import parse_assignments
 from pipeline.study.reading import read_study
 from pipeline.study.spec import (
     METRICS,

@@ -10,8 +10,8 @@ from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
 from envs.bandits import log_uniformly
-from pipeline import hyperparams
 from pipeline.pulls import PULLS_FILE, PullSummary, summarise_pulls
+from pipeline.settings import hyperparams
 from pipeline.specs import TrainSpec
 from pipeline.summary import describe_pulls, print_outcome
 from pipeline.training import train
@@ -102,7 +102,7 @@ class Stop(BaseCallback):
 
 
 def test_ctrl_c_leaves_the_pulls_so_far(tmp_path, monkeypatch):
-    monkeypatch.setattr("pipeline.components.callbacks", lambda *args: [Stop()])
+    monkeypatch.setattr("pipeline.settings.components.callbacks", lambda *args: [Stop()])
     outcome, _ = train_on(tmp_path, "ucb", "GaussianBandit-v0")
     assert outcome.state == "interrupted"
     pulls = pulls_of(outcome)

@@ -28,12 +28,17 @@ from torch import nn, optim
 
 from agents import load_algorithm
 from agents.schedules import ExponentialSchedule
-from pipeline.algorithm_kwargs import build_algorithm_kwargs
-from pipeline.coercion import ScheduleSpec
-from pipeline.components import build_value, callbacks, vec_wrapper_factory, wrapper_factory
 from pipeline.errors import UserError
-from pipeline.hyperparams import component_specs, read_hyperparams, split
-from pipeline.literals import DottedName
+from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.settings.coercion import ScheduleSpec
+from pipeline.settings.components import (
+    build_value,
+    callbacks,
+    vec_wrapper_factory,
+    wrapper_factory,
+)
+from pipeline.settings.hyperparams import component_specs, read_hyperparams, split
+from pipeline.settings.literals import DottedName
 
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 CLIP = "gymnasium.wrappers.ClipReward"
@@ -366,7 +371,8 @@ def test_a_wrong_agent_is_told(kwargs: dict[str, Any], complaint: str) -> None:
 
 def test_reading_needs_no_heavy_library() -> None:
     code = (
-        "import sys, pipeline.hyperparams, pipeline.literals, pipeline.components\n"
+        "import sys\n"
+        "from pipeline.settings import components, hyperparams, literals\n"
         "print({'torch', 'stable_baselines3', 'numba', 'rl_zoo3', 'gymnasium'} & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -20,7 +20,7 @@ from pipeline.environments import (
     training_kwargs,
 )
 from pipeline.errors import UserError
-from pipeline.hyperparams import split
+from pipeline.settings.hyperparams import split
 from pipeline.specs import TrainSpec
 
 

@@ -9,8 +9,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import load_algorithm
 from pipeline.evaluation import Evaluation, evaluate, evaluation_seed
-from pipeline.hyperparams import split
 from pipeline.loading import load_model
+from pipeline.settings.hyperparams import split
 from pipeline.specs import TrainSpec
 from pipeline.training import train
 

@@ -9,7 +9,7 @@ from mdp import policy_return, value_iteration
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation import Yardstick, evaluate
 from pipeline.exact import exact_evaluator, policy_matrix
-from pipeline.hyperparams import split
+from pipeline.settings.hyperparams import split
 from pipeline.specs import TrainSpec
 
 # Two-sided, of the normal distribution.

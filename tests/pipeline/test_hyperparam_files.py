@@ -6,16 +6,16 @@ import gymnasium as gym
 import pytest
 
 from agents import ALGORITHMS, load_algorithm
-from pipeline import hyperparams
-from pipeline.algorithm_kwargs import build_algorithm_kwargs
-from pipeline.components import callbacks, vec_wrapper_factory
 from pipeline.environments import make_single_env, make_training_env
-from pipeline.hyperparams import entry_names, override, read_hyperparams, split
 from pipeline.requests import check_fit
+from pipeline.settings import hyperparams
+from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.settings.components import callbacks, vec_wrapper_factory
+from pipeline.settings.hyperparams import entry_names, override, read_hyperparams, split
+from pipeline.settings.strict_yaml import read_yaml
 from pipeline.specs import TrainSpec
-from pipeline.strict_yaml import read_yaml
 
-FOLDER = Path(hyperparams.__file__).parent.parent / "hyperparams"
+FOLDER = Path(hyperparams.__file__).parents[2] / "hyperparams"
 FILES = sorted(FOLDER.glob("*.yml"))
 ENTRIES = [(path.stem, key) for path in FILES for key in read_yaml(path)]
 

@@ -17,11 +17,11 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents import load_algorithm
-from pipeline.arguments import RANGES, constructor_parameters
-from pipeline.coercion import ScheduleSpec, coerce, parse_schedule
-from pipeline.components import build_value
 from pipeline.errors import UserError
-from pipeline.hyperparams import (
+from pipeline.settings.arguments import RANGES, constructor_parameters
+from pipeline.settings.coercion import ScheduleSpec, coerce, parse_schedule
+from pipeline.settings.components import build_value
+from pipeline.settings.hyperparams import (
     ComponentSpec,
     Hyperparams,
     NoEntryError,
@@ -31,8 +31,8 @@ from pipeline.hyperparams import (
     read_hyperparams,
     split,
 )
-from pipeline.literals import DottedName
-from pipeline.strict_yaml import parse_yaml, read_yaml
+from pipeline.settings.literals import DottedName
+from pipeline.settings.strict_yaml import parse_yaml, read_yaml
 
 
 def rl_zoo3_folder() -> Path:

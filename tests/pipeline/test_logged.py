@@ -16,9 +16,9 @@ from agents import load_algorithm
 from envs.bandits import log_uniformly, read_log
 from pipeline.cli import run_command
 from pipeline.errors import UserError
-from pipeline.logged import compare_policies, probabilities, read_policy
-from pipeline.logged_tables import sentences, shown, verdict
-from pipeline.off_policy import mean_reward
+from pipeline.off_policy.estimators import mean_reward
+from pipeline.off_policy.judging import compare_policies, probabilities, read_policy
+from pipeline.off_policy.tables import sentences, shown, verdict
 from pipeline.statistics import Estimate, paired_difference
 
 NAMES = {"0": "core", "1": "casual"}

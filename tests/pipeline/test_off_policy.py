@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as arrays
 
 import envs  # noqa: F401
 from envs.bandits import log_uniformly, read_log
-from pipeline.off_policy import (
+from pipeline.off_policy.estimators import (
     check_support,
     direct_method,
     doubly_robust,
@@ -22,7 +22,7 @@ from pipeline.off_policy import (
     mean_reward,
     snips,
 )
-from pipeline.reward_models import ArmMeans, ArmRegressions, cross_fit
+from pipeline.off_policy.reward_models import ArmMeans, ArmRegressions, cross_fit
 
 ESTIMATORS = ("ips", "snips", "direct", "doubly_robust")
 # The best treatment for each segment, at .159 clicks a user.

@@ -8,8 +8,8 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from pipeline.coercion import ScheduleSpec, coerce
 from pipeline.errors import UserError, shown, unknown
+from pipeline.settings.coercion import ScheduleSpec, coerce
 
 _FINITE = sys.float_info.max
 
@@ -74,7 +74,7 @@ def check_arguments(
         also_known: further names that a message may suggest.
 
     Returns:
-        The arguments, each as its annotation asks for, see `pipeline.coercion.coerce`.
+        The arguments, each as its annotation asks for, see `pipeline.settings.coercion.coerce`.
 
     Raises:
         UserError: if a name is not known, naming the nearest, or a type does not fit.

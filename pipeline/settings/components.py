@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.arguments import check_arguments, constructor_parameters
-from pipeline.class_names import find_class
-from pipeline.coercion import ScheduleSpec
 from pipeline.errors import UserError, one_line
-from pipeline.hyperparams import component_specs
-from pipeline.literals import DottedName
+from pipeline.settings.arguments import check_arguments, constructor_parameters
+from pipeline.settings.class_names import find_class
+from pipeline.settings.coercion import ScheduleSpec
+from pipeline.settings.hyperparams import component_specs
+from pipeline.settings.literals import DottedName
 
 if TYPE_CHECKING:
     import gymnasium as gym
@@ -109,7 +109,7 @@ def build_value(
     """Turn the names and schedules in nested values into classes and schedule objects.
 
     Args:
-        raw: a value as `pipeline.hyperparams.check_algorithm_kwargs` leaves it.
+        raw: a value as `pipeline.settings.hyperparams.check_algorithm_kwargs` leaves it.
         extra_packages: packages that the user admits beside the usual ones.
         where: begins every error message.
 

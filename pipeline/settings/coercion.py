@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Union, get_args, get_origin
 
 from pipeline.errors import UserError, did_you_mean, shown
-from pipeline.literals import DottedName, parse_literal
+from pipeline.settings.literals import DottedName, parse_literal
 
 _SCHEDULE = re.compile(r"([A-Za-z]+)_([-+.\d][^_]*)(?:_([^_]+))?")
 _SCHEDULE_FORMS = "lin_START, lin_START_END and exp_START_END"

@@ -13,13 +13,13 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
-from pipeline.arguments import check_arguments, check_range
-from pipeline.coercion import coerce
 from pipeline.errors import UserError, did_you_mean, shown
-from pipeline.literals import contains_name
-from pipeline.strict_yaml import read_yaml
+from pipeline.settings.arguments import check_arguments, check_range
+from pipeline.settings.coercion import coerce
+from pipeline.settings.literals import contains_name
+from pipeline.settings.strict_yaml import read_yaml
 
-_FOLDER = Path(__file__).resolve().parent.parent / "hyperparams"
+_FOLDER = Path(__file__).resolve().parents[2] / "hyperparams"
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 _TOP_LEVEL_KEY = re.compile(r"^([\w./-]+):", re.MULTILINE)
 _STAND_INS = ("default", "atari")
@@ -265,12 +265,13 @@ def check_algorithm_kwargs(
 
     Args:
         kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
-        parameters: those of the constructor, from `pipeline.arguments.constructor_parameters`.
+        parameters: those of the constructor, see
+            `pipeline.settings.arguments.constructor_parameters`.
         where: begins every error message.
 
     Returns:
         The arguments as their annotations ask for; classes as `DottedName` and schedules as
-        `ScheduleSpec`, which `pipeline.components.build_value` turns into objects.
+        `ScheduleSpec`, which `pipeline.settings.components.build_value` turns into objects.
 
     Raises:
         UserError: naming the argument, and what it must be.

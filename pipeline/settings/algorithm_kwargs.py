@@ -6,12 +6,12 @@ import inspect
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_args, get_origin
 
-from pipeline.arguments import check_arguments, constructor_parameters
-from pipeline.class_names import find_class
-from pipeline.components import build_value
 from pipeline.errors import UserError, unknown
-from pipeline.hyperparams import check_algorithm_kwargs
-from pipeline.literals import DottedName
+from pipeline.settings.arguments import check_arguments, constructor_parameters
+from pipeline.settings.class_names import find_class
+from pipeline.settings.components import build_value
+from pipeline.settings.hyperparams import check_algorithm_kwargs
+from pipeline.settings.literals import DottedName
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

@@ -1,7 +1,7 @@
 """Values written as Python literals, read without ever running them.
 
 The text is parsed to a syntax tree, and the tree is rebuilt from a short list of node types. A
-dotted name stays a name: `pipeline.components` decides what it may stand for.
+dotted name stays a name: `pipeline.settings.components` decides what it may stand for.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.errors import UserError, one_line, shown
-from pipeline.strict_yaml import parse_yaml
+from pipeline.settings.strict_yaml import parse_yaml
 
 # A deeper or longer expression than this is no hyperparameter, and could exhaust the parser.
 _MAX_CHARACTERS = 10_000

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.reward_models import CrossFit
+from pipeline.off_policy.reward_models import CrossFit
 from pipeline.statistics import Estimate, paired_difference
 
 Floats = NDArray[np.float64]
@@ -64,7 +64,7 @@ def evaluate_policy(
         arms: the arms pulled, shape (n,).
         rewards: what they gave, shape (n,).
         propensities: the probability with which each was chosen, shape (n,).
-        model: of the rewards; see `pipeline.reward_models.cross_fit`.
+        model: of the rewards; see `pipeline.off_policy.reward_models.cross_fit`.
 
     Raises:
         ValueError: if the arrays are not such, or the log cannot tell what the policy is worth.

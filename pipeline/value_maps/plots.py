@@ -12,7 +12,7 @@ from envs.layout import GOAL, PRIZE, TRAP, WALL, GridLayout
 from envs.sprites import INK, Colour
 from pipeline.files import replacing
 from pipeline.plots import ORANGE
-from pipeline.value_map_cells import (
+from pipeline.value_maps.cells import (
     BELOW,
     BELOW_HATCH,
     GROUND,
@@ -29,7 +29,7 @@ from pipeline.value_map_cells import (
     policies_in,
     shade,
 )
-from pipeline.value_maps import ValueMap
+from pipeline.value_maps.recording import ValueMap
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

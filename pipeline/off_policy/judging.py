@@ -16,9 +16,9 @@ from envs.bandits import LoggedData, read_log
 from pipeline.errors import UserError, one_line
 from pipeline.exact import policy_matrix
 from pipeline.loading import check_model_file, hand_written_algorithm, load_model, run_of
-from pipeline.off_policy import PolicyTerms, check_rewards, evaluate_policy
+from pipeline.off_policy.estimators import PolicyTerms, check_rewards, evaluate_policy
+from pipeline.off_policy.reward_models import CrossFit, cross_fit
 from pipeline.requests import check_algorithm
-from pipeline.reward_models import CrossFit, cross_fit
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from envs.sprites import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, SHELF, WHITE, Colour
 from envs.sprites import ORANGE as AMBER
 from pipeline.plots import ORANGE
-from pipeline.value_maps import ValueMap
+from pipeline.value_maps.recording import ValueMap
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,14 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline.errors import UserError
-from pipeline.logged import Comparison, Judged, compare_policies, read_logged, read_policy
-from pipeline.off_policy import mean_reward
+from pipeline.off_policy.estimators import mean_reward
+from pipeline.off_policy.judging import (
+    Comparison,
+    Judged,
+    compare_policies,
+    read_logged,
+    read_policy,
+)
 from pipeline.statistics import Estimate, paired_difference
 from pipeline.study.command import WIDTH_WITHOUT_TERMINAL
 

@@ -1,0 +1,1 @@
+"""Policies judged by pulls that another one made: ``compare.py --logged``."""

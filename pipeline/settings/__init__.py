@@ -1,0 +1,1 @@
+"""Settings from files and command lines: read, checked and built, without running any of them."""

@@ -1,0 +1,1 @@
+"""Where on the map an agent acts well: recorded at evaluations, and drawn."""
