@@ -1,6 +1,6 @@
 """Bandits: each step pulls one arm, and no pull changes what the next ones give."""
 
-from envs.bandits.base import Bandit
+from envs.bandits.base import Bandit, StochasticBandit
 from envs.bandits.clicks import BernoulliBandit, ClickBandit, SegmentBandit
 from envs.bandits.gaussian import GaussianBandit
 from envs.bandits.linear import LinearBandit
@@ -16,6 +16,7 @@ __all__ = [
     "LoggedData",
     "ReplayBandit",
     "SegmentBandit",
+    "StochasticBandit",
     "log_uniformly",
     "read_log",
 ]

@@ -1,7 +1,8 @@
-"""What every bandit shares: counting pulls, what `step` tells, and rendering."""
+"""What bandits share: counting pulls, rendering, and what `step` tells where arms are known."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import gymnasium as gym
@@ -18,13 +19,11 @@ MAX_PULLS = 10**9
 MAX_ARMS = 10_000
 
 
-class Bandit(gym.Env[Any, Any]):
-    """Arms to pull, one a step, each with an expected reward in the present context.
+class Bandit(gym.Env[Any, Any], ABC):
+    """Arms to pull, one a step, in the present context.
 
-    A subclass says with `_begin` how arms and first context are drawn, with `expected_rewards`
-    what each arm is worth in the context, and with `_pull` what reward it gives and which context
-    comes next. Its docstring lists the random numbers in the order in which it draws them: compiled
-    copies draw the same ones.
+    A subclass says with `_begin` how an episode begins, with `step` what a pull gives, and with
+    `_true_means` what is known of the arms.
 
     Args:
         n_arms: the number of arms.
@@ -74,14 +73,6 @@ class Bandit(gym.Env[Any, Any]):
         space = self.observation_space
         return int(space.n) if isinstance(space, spaces.Discrete) else 0
 
-    def expected_rewards(self) -> list[float]:
-        """What each arm gives on average in the present context.
-
-        Raises:
-            NotImplementedError: where nobody knows, as with logged data.
-        """
-        raise NotImplementedError(f"{type(self).__name__} does not know what its arms are worth")
-
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -94,27 +85,6 @@ class Bandit(gym.Env[Any, Any]):
         if self.render_mode == "human":
             self.render()
         return self.context, {}
-
-    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Pull an arm; see the class for the meaning of what is returned.
-
-        Raises:
-            ValueError: if there is no such arm.
-        """
-        arm = self._checked(action)
-        expected = self.expected_rewards()
-        best = max(expected)
-        self.pulls_done += 1
-        before = self.context
-        reward = self._pull(arm)
-        info = {
-            "optimal_action": expected.index(best),
-            "expected_reward": expected[arm],
-            "regret": best - expected[arm],
-            "feedback_due": self.pulls_done % self.batch_size == 0 or self.pulls_done == self.pulls,
-        }
-        self._show_pull(before, arm, reward)
-        return self.context, reward, False, False, info
 
     def render(self) -> str | NDArray[np.uint8] | None:
         """The arms as text (``ansi``), as a picture of shape (height, width, 3), or in a window."""
@@ -156,17 +126,55 @@ class Bandit(gym.Env[Any, Any]):
         if self.render_mode == "human":
             self.render()
 
+    @abstractmethod
     def _true_means(self) -> NDArray[np.float64] | None:
         """What each arm gives on average, one row for each of the tally's; None if not known."""
-        return np.array([self.expected_rewards()])
 
+    @abstractmethod
     def _begin(self) -> None:
-        """Draw arms and first context; every kind of bandit has its own way."""
-        raise NotImplementedError(f"{type(self).__name__} does not say how it begins")
+        """Make ready for the first pull of an episode."""
 
+
+class StochasticBandit(Bandit):
+    """Arms whose rewards are drawn, each with an expected one in the present context.
+
+    A subclass says with `_begin` how arms and first context are drawn, with `expected_rewards`
+    what each arm is worth in the context, and with `_pull` what reward it gives and which context
+    comes next. Its docstring lists the random numbers in the order in which it draws them: compiled
+    copies draw the same ones.
+    """
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Pull an arm; see the class for the meaning of what is returned.
+
+        Raises:
+            ValueError: if there is no such arm.
+        """
+        arm = self._checked(action)
+        expected = self.expected_rewards()
+        best = max(expected)
+        self.pulls_done += 1
+        before = self.context
+        reward = self._pull(arm)
+        info = {
+            "optimal_action": expected.index(best),
+            "expected_reward": expected[arm],
+            "regret": best - expected[arm],
+            "feedback_due": self.pulls_done % self.batch_size == 0 or self.pulls_done == self.pulls,
+        }
+        self._show_pull(before, arm, reward)
+        return self.context, reward, False, False, info
+
+    @abstractmethod
+    def expected_rewards(self) -> list[float]:
+        """What each arm gives on average in the present context."""
+
+    @abstractmethod
     def _pull(self, arm: int) -> float:
-        """Draw the reward of an arm, and the next context; what is logged is not drawn."""
-        raise NotImplementedError(f"{type(self).__name__} draws no rewards")
+        """Draw the reward of an arm, and the next context."""
+
+    def _true_means(self) -> NDArray[np.float64] | None:
+        return np.array([self.expected_rewards()])
 
 
 def agreed_size(name: str, asked: int | None, given: int | None, default: int, low: int) -> int:

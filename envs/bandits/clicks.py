@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from envs import DEFAULT_PULLS
 from envs.arguments import check_numbers, check_table
-from envs.bandits.base import Bandit
+from envs.bandits.base import StochasticBandit
 from mdp.model import TransitionModel
 
 # How far probabilities of segments may be from summing to one.
@@ -20,7 +20,7 @@ TOLERANCE = 1e-9
 MAX_OUTCOMES = 2_000_000
 
 
-class ClickBandit(Bandit):
+class ClickBandit(StochasticBandit):
     """Arms with a click rate in each of finitely many contexts.
 
     As `envs.grid.GridWorld`, `reset` and `step` draw one uniform number each and choose by

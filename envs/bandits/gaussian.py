@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from envs import DEFAULT_PULLS
 from envs.arguments import check_number, check_numbers
-from envs.bandits.base import Bandit, agreed_size
+from envs.bandits.base import StochasticBandit, agreed_size
 
 
-class GaussianBandit(Bandit):
+class GaussianBandit(StochasticBandit):
     """Arms with normally distributed rewards, whose means may wander.
 
     ## Description

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 
 from envs import DEFAULT_PULLS
 from envs.arguments import check_number, check_table
-from envs.bandits.base import Bandit, agreed_size
+from envs.bandits.base import StochasticBandit, agreed_size
 
 
-class LinearBandit(Bandit):
+class LinearBandit(StochasticBandit):
     """Arms whose expected reward is a weighted sum of what is observed.
 
     ## Description
