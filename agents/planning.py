@@ -82,7 +82,7 @@ class PlanningAgent(OnlineAlgorithm):
         tensorboard_log: folder for TensorBoard, or None.
         verbose: 0 silent, 1 information.
         seed: seeds the agent's generators, its action space and its environments.
-        device: not used.
+        device: not used, as there is no network.
 
     Raises:
         ValueError: if ``gamma`` lies outside [0, 1]; by `learn`, if the model is not known.

@@ -57,7 +57,7 @@ class ReferenceAgent(OnlineAlgorithm):
         tensorboard_log: folder for TensorBoard, or None.
         verbose: 0 silent, 1 information.
         seed: seeds the agent's generators, its action space and its environments.
-        device: not used.
+        device: not used, as there is no network.
     """
 
     def __init__(

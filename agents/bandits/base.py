@@ -58,7 +58,7 @@ class BanditAlgorithm(OnlineAlgorithm):
         tensorboard_log: folder for TensorBoard, or None.
         verbose: 0 silent, 1 information.
         seed: seeds the agent's generators, its action space and its environments.
-        device: tables live on the CPU; any other device is refused.
+        device: not used, as tables live on the CPU.
 
     Raises:
         ValueError: if an argument lies outside its range, or a space or a reward does not fit.

@@ -65,7 +65,7 @@ class TabularAlgorithm(OnlineAlgorithm):
         policy_kwargs: further arguments of the policy.
         verbose: 0 silent, 1 information.
         seed: seeds the agent's generators, its action space and its environments.
-        device: tables live on the CPU; any other device is refused.
+        device: not used, as tables live on the CPU.
 
     Raises:
         ValueError: if an argument lies outside its range or a space does not fit.
