@@ -18,6 +18,8 @@ from pipeline.study.results import StudyResults, read_episodes
 from pipeline.study.spec import METRIC_WORDS, StudySpec
 from pipeline.study.words import environment_sentences, interval, number
 
+MOST_AGENT_WIDTH = 20
+
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
     """Print a table for each environment, and what it says in words."""
@@ -40,7 +42,7 @@ def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table
         title_justify="left",
         caption_justify="left",
     )
-    table.add_column("agent", overflow="fold", min_width=12)
+    table.add_column("agent", overflow="fold", min_width=_agent_width(environment))
     has_score = any(agent.score is not None for agent in environment.agents)
     headings = ["mean", "IQM", *(["score"] if has_score else []), "training"]
     headings += ["steps", "solved", "time"]
@@ -49,6 +51,11 @@ def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table
     for agent in environment.agents:
         table.add_row(escape(agent.agent), *_cells(agent, has_score))
     return table
+
+
+def _agent_width(environment: EnvironmentAnalysis) -> int:
+    """Room for the agents' names; longer ones go over several lines."""
+    return min(max(len(agent.agent) for agent in environment.agents), MOST_AGENT_WIDTH)
 
 
 def _pulls_on(results: StudyResults, environment: EnvironmentAnalysis) -> dict[str, PullStatistics]:
@@ -75,7 +82,7 @@ def _bandit_ranking(
         title_justify="left",
         caption_justify="left",
     )
-    table.add_column("agent", overflow="fold", min_width=12)
+    table.add_column("agent", overflow="fold", min_width=_agent_width(environment))
     for heading in ("mean regret", quantiles, "simple regret", "reward", "best arm", "time"):
         table.add_column(heading, justify="right")
     for agent in environment.agents:
