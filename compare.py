@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from pipeline.cli import OneLineParser, command_line, run_command
+from commands.parsing import OneLineParser, command_line, run_command
 
 EPILOG = """\
 examples:
@@ -74,20 +74,20 @@ def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
     args = build_parser().parse_args()
     if args.logged or args.policy:
-        from pipeline.off_policy.tables import compare_on_log
+        from report.off_policy_table import compare_on_log
 
         return compare_on_log(args)
-    from pipeline.study.requests import study_spec
+    from commands.study_request import study_spec
 
     study = study_spec(args)
-    from pipeline.study.planning import plan
+    from experiments.study_plan import plan
 
     planned = plan(study, Path(args.log_folder) / study.name)
-    from pipeline.study.launchers import start_server
+    from experiments.child_processes import start_server
 
     if not all(run.is_finished for run in planned):
         start_server()  # it imports the libraries while this process does
-    from pipeline.study.command import run_study
+    from commands.study_output import run_study
 
     return run_study(study, planned, args, command_line())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from pipeline.cli import OneLineParser, run_command
+from commands.parsing import OneLineParser, run_command
 
 EPILOG = """\
 examples:

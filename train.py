@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from pipeline.cli import INTERRUPT, OneLineParser, command_line, run_command
+from commands.parsing import INTERRUPT, OneLineParser, command_line, run_command
 
 EPILOG = """\
 examples:
@@ -82,17 +82,17 @@ def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
     args = build_parser().parse_args()
     if args.list:
-        from pipeline.listing import print_lists
+        from commands.listing import print_lists
 
         print_lists()
         return 0
-    from pipeline.requests import train_spec
+    from commands.train_request import train_spec
 
     spec = train_spec(args)
     from rich.console import Console
 
-    from pipeline.run import INTERRUPTED
-    from pipeline.summary import print_outcome
+    from commands.run_output import print_outcome
+    from pipeline.run_folder import INTERRUPTED
     from pipeline.training import train
 
     console = Console(quiet=spec.verbose < 1)

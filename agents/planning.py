@@ -18,8 +18,8 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.online import OnlineAlgorithm
-from envs.model import observations_of_states, time_limit, transition_model
+from agents.common.online import OnlineAlgorithm
+from envs.known_models import observations_of_states, time_limit, transition_model
 from mdp import TransitionModel, finite_horizon_optimum, value_iteration
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from agents.online import OnlineAlgorithm
+from agents.common.online import OnlineAlgorithm
 
 POLE_ANGLE = 2
 LEFT, RIGHT = 0, 1

@@ -99,7 +99,7 @@ def _linear(name: str, summary: str) -> AlgorithmEntry:
 
 def _mabwiser(name: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
     return AlgorithmEntry(
-        f"agents.bandits.mabwiser_agents:{name}",
+        f"agents.mabwiser.mabwiser_agents:{name}",
         f"{summary} (MABWiser)",
         observations,
         DISCRETE,

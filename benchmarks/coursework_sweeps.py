@@ -22,8 +22,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from pipeline.study.execution import available_cores
-from pipeline.study.reading import read_study
+from experiments.execution import available_cores
+from experiments.study_files import read_study
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDIES = ("warehouse-learning-rate", "warehouse-discount", "warehouse-epsilon")

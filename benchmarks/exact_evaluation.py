@@ -21,10 +21,10 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation import Yardstick, evaluate
-from pipeline.exact import exact_evaluator
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.sampled import Yardstick, evaluate
 from pipeline.settings.hyperparams import split
-from pipeline.specs import TrainSpec
+from pipeline.train_spec import TrainSpec
 
 EPISODES = 100
 TRAINING_STEPS = 200_000

@@ -11,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.arguments import check_choice, check_flag, check_number
+from envs.argument_checks import check_choice, check_flag, check_number
 from envs.grid_dynamics import MOVES, POSSIBLE_MOVES, GridDynamics, Tile
 from envs.grid_map import GOAL, Description, GridMap
 from envs.rendering import GridRenderer
@@ -19,7 +19,7 @@ from envs.scene import Scene
 from envs.text_rendering import render_text
 
 if TYPE_CHECKING:
-    from mdp.model import TransitionModel
+    from mdp.transition_model import TransitionModel
 
 Observation = int | NDArray[np.float32]
 RENDER_MODES = ("ansi", "rgb_array", "human")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from envs.grid_map import MAX_STATES, GridMap
 
 if TYPE_CHECKING:
-    from mdp.model import TransitionModel
+    from mdp.transition_model import TransitionModel
 
 MOVE_NAMES = ("up", "down", "left", "right")
 MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
@@ -115,7 +115,7 @@ class GridDynamics:
             A model with 4 actions and one outcome, or three where moves may slip: as meant, then
             to the two sides. Equal outcomes stay apart.
         """
-        from mdp.model import TransitionModel
+        from mdp.transition_model import TransitionModel
 
         chosen = np.array(POSSIBLE_MOVES)[:, : len(self.outcome_prob)]
         next_state, reward, terminated = self._all_moves()

@@ -99,7 +99,7 @@ class GridLayout:
 
 
 def grid_layout(env: gym.Env[Any, Any]) -> GridLayout | None:
-    """The layout of an environment, for the states of its ``envs.model.transition_model``.
+    """The layout of an environment, for the states of its ``envs.known_models.transition_model``.
 
     Returns:
         The layout of this project's grid worlds, FrozenLake and CliffWalking; None for all others.

@@ -6,7 +6,7 @@ from array import array
 
 import numpy as np
 
-from envs.arguments import check_number, check_whole_number
+from envs.argument_checks import check_number, check_whole_number
 from envs.grid_map import MAX_STATES
 
 MAX_SIZE = int(MAX_STATES**0.5)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envs.arguments import check_number
+from envs.argument_checks import check_number
 from envs.grid import GridWorld
 from envs.grid_dynamics import Tile
 from envs.grid_map import Description

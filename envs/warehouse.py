@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.arguments import check_choice, check_number
+from envs.argument_checks import check_choice, check_number
 from envs.grid import GridWorld, Observation
 from envs.grid_dynamics import Tile
 from envs.grid_map import Description

@@ -9,11 +9,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from mdp.model import TransitionModel
+from mdp.transition_model import TransitionModel
 
 if TYPE_CHECKING:
     from mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
-    from mdp.planning import Plan, policy_iteration, value_iteration
+    from mdp.optimal_policies import Plan, policy_iteration, value_iteration
     from mdp.policy_evaluation import (
         PolicyReturn,
         best_blind_return,
@@ -42,9 +42,9 @@ __all__ = [
 _HOMES = {
     "FiniteHorizonPlan": "mdp.finite_horizon",
     "finite_horizon_optimum": "mdp.finite_horizon",
-    "Plan": "mdp.planning",
-    "policy_iteration": "mdp.planning",
-    "value_iteration": "mdp.planning",
+    "Plan": "mdp.optimal_policies",
+    "policy_iteration": "mdp.optimal_policies",
+    "value_iteration": "mdp.optimal_policies",
     "PolicyReturn": "mdp.policy_evaluation",
     "best_blind_return": "mdp.policy_evaluation",
     "blind_policies": "mdp.policy_evaluation",

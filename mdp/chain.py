@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.graph import reachable_states, steps_to_end
-from mdp.model import TransitionModel
+from mdp.transition_model import TransitionModel
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

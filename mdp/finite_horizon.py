@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import compiled
-from mdp.model import TransitionModel
+from mdp.machine_code import compiled
 from mdp.sweeps import TIE_TOLERANCE, Floats, Indices, Mask, States
+from mdp.transition_model import TransitionModel
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import compiled
-from mdp.model import TransitionModel
+from mdp.machine_code import compiled
+from mdp.transition_model import TransitionModel
 
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.int64]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.model import TransitionModel
+from mdp.transition_model import TransitionModel
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from mdp.chain import PolicyChain
 from mdp.graph import reachable_states
-from mdp.model import TransitionModel
 from mdp.moments import moments_under_limit, visits_under_limit
 from mdp.policies import Policy, actions_used, canonical_policy, chances_in, policy_matrix
+from mdp.transition_model import TransitionModel
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.graph import steps_to_end
-from mdp.model import TransitionModel
 from mdp.sweeps import action_values, evaluate, first_guess, policy_rows
+from mdp.transition_model import TransitionModel
 from mdp.undiscounted import FinitePart, finite_part
 
 Floats = NDArray[np.float64]

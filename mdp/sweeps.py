@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import compiled
+from mdp.machine_code import compiled
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.graph import end_components, steps_to_end
-from mdp.model import TransitionModel
+from mdp.transition_model import TransitionModel
 
 Mask = NDArray[np.bool_]
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import compiled
 from mdp.finite_horizon import finite_horizon_optimum
-from mdp.model import TransitionModel
+from mdp.machine_code import compiled
 from mdp.policies import Policy, canonical_policy, chances_in
+from mdp.transition_model import TransitionModel
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

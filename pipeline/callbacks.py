@@ -17,11 +17,11 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from agents.blocks import BlockCallback, Horizon, calls_until_multiple
-from pipeline.evaluation import Evaluation
+from agents.common.callback_horizons import BlockCallback, Horizon, calls_until_multiple
+from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
-from pipeline.run import Run
-from pipeline.value_maps.recording import ValueMapRecorder
+from pipeline.run_folder import Run
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:

@@ -11,7 +11,7 @@ import gymnasium as gym
 
 import envs  # noqa: F401  # registers the project's environments
 from pipeline.errors import UserError, one_line, unknown
-from pipeline.specs import TrainSpec
+from pipeline.train_spec import TrainSpec
 
 # Where neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
 # policy that runs in a circle would never end.

@@ -15,15 +15,15 @@ import numpy as np
 from gymnasium.wrappers import RenderCollection
 from rich.console import Console
 
+from commands.run_output import describe
+from commands.train_request import check_algorithm
 from pipeline.environments import check_env_id, import_gym_packages, make_evaluation_env
 from pipeline.errors import UserError, one_line
-from pipeline.loading import check_model_file, hand_written_algorithm, load_model, run_of
-from pipeline.requests import check_algorithm
-from pipeline.run import Run
+from pipeline.model_loading import check_model_file, hand_written_algorithm, load_model, run_of
+from pipeline.run_folder import Run
 from pipeline.settings import hyperparams
 from pipeline.settings.literals import parse_assignments
-from pipeline.specs import TrainSpec
-from pipeline.summary import describe
+from pipeline.train_spec import TrainSpec
 
 FILM_SUFFIXES = (".gif", ".mp4")
 FRAMES_PER_SECOND = 10
@@ -162,7 +162,7 @@ def play(chosen: ChosenModel, args: argparse.Namespace) -> None:
 
 def _print_exact(console: Console, spec: TrainSpec, model: Any, *, deterministic: bool) -> None:
     """Say what the policy is worth, where that can be computed."""
-    from pipeline.exact import exact_evaluator
+    from pipeline.evaluation.exact import exact_evaluator
 
     evaluator = exact_evaluator(spec)
     if evaluator is None:

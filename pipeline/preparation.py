@@ -15,7 +15,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents import load_algorithm
-from agents.blocks import EpisodeBudget
+from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import (
     EpisodeCheckpoint,
     EvaluationCallback,
@@ -24,16 +24,16 @@ from pipeline.callbacks import (
 )
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.errors import UserError
-from pipeline.evaluation import evaluate, evaluation_seed
-from pipeline.exact import exact_evaluator
-from pipeline.loading import load_model
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.sampled import evaluate, evaluation_seed
+from pipeline.evaluation.value_maps import ValueMapRecorder
+from pipeline.model_loading import load_model
 from pipeline.progress import ProgressDisplay
-from pipeline.pulls import PullRecorder, are_bandits
-from pipeline.run import Run
+from pipeline.pull_recording import PullRecorder, are_bandits
+from pipeline.run_folder import Run
 from pipeline.settings import components
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
-from pipeline.specs import TrainSpec
-from pipeline.value_maps.recording import ValueMapRecorder
+from pipeline.train_spec import TrainSpec
 
 EVALUATIONS_PER_RUN = 20
 

@@ -14,7 +14,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from agents.blocks import BlockCallback
+from agents.common.callback_horizons import BlockCallback
 from agents.tabular.base import TabularAlgorithm
 from agents.tabular.engine_choice import must_compile
 

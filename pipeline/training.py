@@ -16,20 +16,20 @@ import torch as th
 import yaml
 from rich.console import Console
 
+from commands.run_output import print_header
 from pipeline.callbacks import save_model, save_normalization
 from pipeline.errors import UserError, one_line
-from pipeline.evaluation import Evaluation, evaluate, evaluation_seed
-from pipeline.exact import ExactEvaluator
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
+from pipeline.evaluation.value_maps import value_map
 from pipeline.files import write_text
-from pipeline.plots import draw_learning_curve
+from pipeline.pictures.learning_curve import draw_learning_curve
+from pipeline.pictures.pull_curve import draw_pulls
+from pipeline.pictures.value_map import draw_value_map
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
-from pipeline.pull_plots import draw_pulls
-from pipeline.pulls import PullSummary, summarise_pulls
-from pipeline.run import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
-from pipeline.specs import TrainSpec
-from pipeline.summary import print_header
-from pipeline.value_maps.plots import draw_value_map
-from pipeline.value_maps.recording import value_map
+from pipeline.pull_recording import PullSummary, summarise_pulls
+from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
+from pipeline.train_spec import TrainSpec
 
 FINAL_EVALUATION_EPISODES = 100
 # A budget in episodes has no number of steps; this one is never reached.

@@ -1,8 +1,11 @@
-"""What holds for every test: no window, one thread, unhurried property tests."""
+"""What holds for every test: no window, one thread, unhurried property tests; and a small study."""
 
+import dataclasses
 import os
+from types import SimpleNamespace
 
 import hypothesis
+import pytest
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -14,3 +17,86 @@ for library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):
 # are the same every time, so that a failure there can be repeated.
 hypothesis.settings.register_profile("yardstick", deadline=None, derandomize="CI" in os.environ)
 hypothesis.settings.load_profile("yardstick")
+
+HOSTILE = "</script><script>document.title='taken'</script>"
+
+
+def small_study():
+    """Three agents, one of them with a name that is an attack, on two maps with two seeds."""
+    from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+
+    agents = (
+        AgentSpec("Q-learning & co", "qlearning"),
+        AgentSpec("sarsa", "sarsa", {"gamma": 0.9}),
+        AgentSpec(HOSTILE, "random"),
+    )
+    environments = tuple(
+        EnvironmentSpec(name, name, {"n_timesteps": 2000})
+        for name in ("FrozenLake-v1", "Warehouse-v0")
+    )
+    return StudySpec(
+        name="small",
+        title="Small & <b>bold</b>",
+        description="What an <i>agent</i> does.",
+        agents=agents,
+        environments=environments,
+        n_seeds=2,
+    )
+
+
+@pytest.fixture(scope="session")
+def do_study():
+    """Does the runs of a study that are missing, in this process, and reads its results."""
+    from experiments.results import read_results
+    from experiments.run_in_child import do_run, draft_path
+    from experiments.study_plan import plan
+
+    def do(study, root):
+        planned = plan(study, root)
+        for run in planned:
+            if not run.is_finished:
+                do_run(run, draft_path(root, run), "compare.py s.yml")
+        return read_results(study, planned, root)
+
+    return do
+
+
+@pytest.fixture(scope="session")
+def report_study(tmp_path_factory):
+    """The study, all of its runs done but one, which has failed; its page and how it was asked."""
+    from experiments.analysis import analyse
+    from experiments.execution import failure_log
+    from experiments.results import read_results
+    from experiments.run_in_child import do_run, draft_path
+    from experiments.study_plan import plan
+    from pipeline.files import write_text
+    from report.page import write_report
+
+    study, root = small_study(), tmp_path_factory.mktemp("study")
+    planned = plan(study, root)
+    failed = planned[-1]
+    for run in planned[:-1]:
+        do_run(run, draft_path(root, run), "compare.py small.yml")
+    log = failure_log(root, failed)
+    log.parent.mkdir()
+    write_text(log, "Traceback:\nValueError: <the> disk & all is full\n")
+    analysis = analyse(read_results(study, planned, root))
+    page = root / "report.html"
+    write_report(analysis, page, "python compare.py 'a & b.yml'")
+    return SimpleNamespace(
+        study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page
+    )
+
+
+@pytest.fixture
+def one_environment(report_study):
+    """The same with its first environment alone."""
+    from experiments.analysis import analyse
+    from experiments.results import read_results
+    from experiments.study_plan import plan
+
+    study = dataclasses.replace(
+        report_study.study, environments=report_study.study.environments[:1]
+    )
+    planned = plan(study, report_study.root)
+    return analyse(read_results(study, planned, report_study.root))

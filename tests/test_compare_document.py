@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 import compare
-from pipeline.study.planning import plan
-from pipeline.study.reading import _QUICK_VALUES, _STUDY_KEYS, read_study
-from pipeline.study.requests import study_spec
+from commands.study_request import study_spec
+from experiments.study_files import _QUICK_VALUES, _STUDY_KEYS, read_study
+from experiments.study_plan import plan
 
 ROOT = Path(compare.__file__).parent
 TEXT = (ROOT / "docs" / "compare.md").read_text()

@@ -9,8 +9,8 @@ import pytest
 import compare
 import enjoy
 import train
-from pipeline.requests import train_spec
-from pipeline.study.requests import study_spec
+from commands.study_request import study_spec
+from commands.train_request import train_spec
 
 ROOT = Path(train.__file__).parent
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]

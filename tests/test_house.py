@@ -16,7 +16,16 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ("mdp", "envs", "agents", "pipeline")
+PACKAGES = (
+    "mdp",
+    "verdicts",
+    "envs",
+    "agents",
+    "pipeline",
+    "experiments",
+    "report",
+    "commands",
+)
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 

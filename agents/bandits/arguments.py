@@ -10,7 +10,7 @@ from typing import Any, Literal, TypedDict, get_args
 import torch as th
 from gymnasium import spaces
 
-from agents.step_sizes import SAMPLE_AVERAGE
+from agents.common.step_sizes import SAMPLE_AVERAGE
 
 TieBreaking = Literal["random", "first"]
 ExplorationDecay = Literal["constant", "linear", "exponential"]

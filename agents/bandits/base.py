@@ -22,8 +22,8 @@ from agents.bandits.arguments import (
     full_signature,
 )
 from agents.bandits.rewards import ANY, check_kinds, check_reward
-from agents.online import OnlineAlgorithm, Transitions
-from agents.step_sizes import SAMPLE_AVERAGE
+from agents.common.online import OnlineAlgorithm, Transitions
+from agents.common.step_sizes import SAMPLE_AVERAGE
 
 
 class Pull(NamedTuple):

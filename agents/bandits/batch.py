@@ -24,9 +24,9 @@ from agents.bandits.table_bandit import TableBandit
 from agents.bandits.tables import Tables
 from agents.bandits.thompson import Thompson
 from agents.bandits.worlds import NotBatchable, World, check_world, world_of
+from agents.common.schedules import ScheduleRow, schedule_row
 from agents.registry import load_algorithm
-from agents.schedules import ScheduleRow, schedule_row
-from envs.model import time_limit
+from envs.known_models import time_limit
 
 DEFAULT_MOMENTS = (10, 100, 1000)
 

@@ -23,14 +23,14 @@ from agents.bandits.tables import (
     Tables,
     total_count,
 )
-from agents.exploration import (
+from agents.common.exploration import (
     BOLTZMANN,
     boltzmann_action,
     choose_action,
     greedy_action,
     highest_value,
 )
-from mdp.compiled import inlined
+from mdp.machine_code import inlined
 
 
 @inlined

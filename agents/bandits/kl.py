@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from mdp.compiled import inlined
+from mdp.machine_code import inlined
 
 MAX_NEWTON_STEPS = 60
 PRECISION = 1e-13

@@ -20,8 +20,8 @@ from agents.bandits.tables import (
     mean_reward,
     total_count,
 )
-from agents.step_sizes import step_size
-from mdp.compiled import inlined
+from agents.common.step_sizes import step_size
+from mdp.machine_code import inlined
 
 
 @inlined

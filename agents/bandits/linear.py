@@ -24,8 +24,8 @@ from agents.bandits.base import BanditAlgorithm, Pull
 from agents.bandits.linear_rules import LinearSettings
 from agents.bandits.policy import LinearBanditPolicy, features
 from agents.bandits.steps import choose_linear_arms, learn_linear_from
-from agents.exploration import EPSILON_GREEDY
-from agents.schedules import epsilon_schedule
+from agents.common.exploration import EPSILON_GREEDY
+from agents.common.schedules import epsilon_schedule
 
 
 class LinearBanditAgent(BanditAlgorithm):

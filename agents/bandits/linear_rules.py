@@ -13,8 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.exploration import choose_action, greedy_action
-from mdp.compiled import inlined
+from agents.common.exploration import choose_action, greedy_action
+from mdp.machine_code import inlined
 
 LIN_UCB = 0
 LIN_THOMPSON = 1

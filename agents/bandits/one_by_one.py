@@ -12,7 +12,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from agents.bandits.batch import checked_pulls
 from agents.bandits.linear import LinearBanditAgent
-from agents.bandits.records import PullLog
+from agents.bandits.pull_log import PullLog
 from agents.bandits.results import BatchResult
 from agents.bandits.table_bandit import TableBandit
 from agents.registry import load_algorithm

@@ -21,8 +21,8 @@ from agents.bandits.linear_rules import (
 )
 from agents.bandits.tables import Settings, Tables
 from agents.bandits.worlds import World, expect, feedback_is_due, pull_arm
-from agents.schedules import ScheduleRow, schedule_value
-from mdp.compiled import inlined, kernel
+from agents.common.schedules import ScheduleRow, schedule_value
+from mdp.machine_code import inlined, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -14,7 +14,7 @@ from agents.bandits.linear_rules import (
     learn_linear,
 )
 from agents.bandits.tables import Floats, Ints, Settings, Tables
-from mdp.compiled import compiled
+from mdp.machine_code import compiled
 
 
 @compiled

@@ -15,7 +15,7 @@ from agents.bandits.base import BanditAlgorithm, Pull
 from agents.bandits.policy import BanditPolicy
 from agents.bandits.steps import choose_arms, learn_from
 from agents.bandits.tables import Settings, Tables
-from agents.exploration import EPSILON_GREEDY
+from agents.common.exploration import EPSILON_GREEDY
 
 
 class TableBandit(BanditAlgorithm):

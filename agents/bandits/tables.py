@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import inlined
+from mdp.machine_code import inlined
 
 VALUES = 0
 UCB = 1

@@ -17,8 +17,8 @@ from agents.bandits.arguments import (
 )
 from agents.bandits.table_bandit import TableBandit
 from agents.bandits.tables import VALUES, Settings
-from agents.exploration import STRATEGIES
-from agents.schedules import epsilon_schedule
+from agents.common.exploration import STRATEGIES
+from agents.common.schedules import epsilon_schedule
 
 StepSize = float | Schedule | Literal["sample_average"]
 

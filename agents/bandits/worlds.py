@@ -14,8 +14,8 @@ from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 
 from envs.bandits import BernoulliBandit, GaussianBandit, LinearBandit, SegmentBandit
-from envs.model import time_limit
-from mdp.compiled import inlined
+from envs.known_models import time_limit
+from mdp.machine_code import inlined
 
 CLICKS = 0
 GAUSSIAN = 1

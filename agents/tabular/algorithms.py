@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.online import Transitions
+from agents.common.online import Transitions
 from agents.tabular import rules
 from agents.tabular.base import TabularAlgorithm
 from agents.tabular.steps import UNDECIDED

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
 from gymnasium import spaces
 
-from agents.step_sizes import SAMPLE_AVERAGE
+from agents.common.step_sizes import SAMPLE_AVERAGE
 
 if TYPE_CHECKING:
     from agents.tabular.base import TabularAlgorithm

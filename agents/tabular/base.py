@@ -12,15 +12,15 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from agents.exploration import (
+from agents.common.exploration import (
     GAUSSIAN_NOISE,
     STRATEGIES,
     action_probabilities,
     draws_per_choice,
 )
-from agents.online import OnlineAlgorithm, Transitions
-from agents.schedules import epsilon_schedule
-from agents.step_sizes import SAMPLE_AVERAGE
+from agents.common.online import OnlineAlgorithm, Transitions
+from agents.common.schedules import epsilon_schedule
+from agents.common.step_sizes import SAMPLE_AVERAGE
 from agents.tabular.arguments import (
     EngineChoice,
     ExplorationDecay,

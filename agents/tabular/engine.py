@@ -17,16 +17,16 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.blocks import EpisodeBudget, horizon, members, pass_over
-from agents.exploration import STRATEGIES, draws_per_choice
-from agents.schedules import schedule_row
+from agents.common.callback_horizons import EpisodeBudget, horizon, members, pass_over
+from agents.common.exploration import STRATEGIES, draws_per_choice
+from agents.common.schedules import schedule_row
+from agents.compiled.interrupts import interrupts_held
+from agents.compiled.random_streams import UniformStreams
 from agents.tabular import rollout
 from agents.tabular.episodes import Episodes, record_in_monitors
-from agents.tabular.interrupts import interrupts_held
 from agents.tabular.records import ENV, EPISODE, PROGRESS, Learner
 from agents.tabular.simulator import CART_POLE, MAX_DRAWS_PER_STEP, World
 from agents.tabular.stepping import add_to_return
-from agents.tabular.streams import UniformStreams
 from agents.tabular.worlds import layers, monitor_of
 
 if TYPE_CHECKING:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.blocks import unknown_callbacks
-from agents.schedules import schedule_row
+from agents.common.callback_horizons import unknown_callbacks
+from agents.common.schedules import schedule_row
 from agents.tabular import rollout
 from agents.tabular.engine import CompiledEngine
 from agents.tabular.simulator import World

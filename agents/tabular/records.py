@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.schedules import ScheduleRow
+from agents.common.schedules import ScheduleRow
 
 # One environment and the step that it took last.
 ENV = np.dtype(

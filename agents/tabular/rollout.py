@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.exploration import GAUSSIAN_NOISE
-from agents.schedules import ScheduleRow, schedule_value
+from agents.common.exploration import GAUSSIAN_NOISE
+from agents.common.schedules import ScheduleRow, schedule_value
 from agents.tabular.records import Learner
 from agents.tabular.rules import SARSA, behaviour_action, update
 from agents.tabular.simulator import MODEL, World
@@ -26,7 +26,7 @@ from agents.tabular.stepping import (
     step_model,
 )
 from agents.tabular.steps import UNDECIDED
-from mdp.compiled import inlined, kernel
+from mdp.machine_code import inlined, kernel
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.exploration import choose_action, expected_value, greedy_action, highest_value
-from agents.step_sizes import step_size
-from mdp.compiled import inlined
+from agents.common.exploration import choose_action, expected_value, greedy_action, highest_value
+from agents.common.step_sizes import step_size
+from mdp.machine_code import inlined
 
 Q_LEARNING = 0
 SARSA = 1

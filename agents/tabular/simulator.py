@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mdp.compiled import inlined
+from mdp.machine_code import inlined
 
 MODEL = 0
 CART_POLE = 1

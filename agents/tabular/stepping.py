@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.tabular.simulator import CartPole, bin_index, cart_pole_step, pick_outcome, pick_start
-from mdp.compiled import inlined
+from mdp.machine_code import inlined
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

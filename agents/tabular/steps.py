@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.tabular.rules import behaviour_action, update
-from mdp.compiled import kernel
+from mdp.machine_code import kernel
 
 UNDECIDED = -1
 

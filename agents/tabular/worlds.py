@@ -13,14 +13,14 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.tabular.simulator import CART_POLE, MODEL, OUTCOME, CartPole, World
-from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
+from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
 from envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
     ScaleReward,
     TerminationReward,
 )
-from mdp.model import TransitionModel
+from mdp.transition_model import TransitionModel
 
 Env = gym.Env[Any, Any]
 

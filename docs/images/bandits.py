@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 import envs  # noqa: F401  # registers the bandits
 from agents.bandits.batch import run_batch
 from envs.bandits import log_uniformly, read_log
-from pipeline.off_policy.estimators import evaluate_policy, mean_reward
-from pipeline.off_policy.reward_models import cross_fit
-from pipeline.study.drawing import COLOURS
+from experiments.off_policy.estimators import evaluate_policy, mean_reward
+from experiments.off_policy.reward_models import cross_fit
+from report.figures.figure_style import COLOURS
 
 FOLDER = Path(__file__).parent
 PULLS, RUNS = 10_000, 400

@@ -1,6 +1,6 @@
 """Bandits: each step pulls one arm, and no pull changes what the next ones give."""
 
-from envs.bandits.base import Bandit, StochasticBandit
+from envs.bandits.bandit import Bandit, StochasticBandit
 from envs.bandits.clicks import BernoulliBandit, ClickBandit, SegmentBandit
 from envs.bandits.gaussian import GaussianBandit
 from envs.bandits.linear import LinearBandit

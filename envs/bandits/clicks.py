@@ -10,9 +10,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs import DEFAULT_PULLS
-from envs.arguments import check_numbers, check_table
-from envs.bandits.base import StochasticBandit
-from mdp.model import TransitionModel
+from envs.argument_checks import check_numbers, check_table
+from envs.bandits.bandit import StochasticBandit
+from mdp.transition_model import TransitionModel
 
 # How far probabilities of segments may be from summing to one.
 TOLERANCE = 1e-9

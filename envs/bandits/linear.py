@@ -10,8 +10,8 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs import DEFAULT_PULLS
-from envs.arguments import check_number, check_table
-from envs.bandits.base import StochasticBandit, agreed_size
+from envs.argument_checks import check_number, check_table
+from envs.bandits.bandit import StochasticBandit, agreed_size
 
 
 class LinearBandit(StochasticBandit):

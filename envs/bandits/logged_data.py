@@ -18,7 +18,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.bandits.base import MAX_ARMS
+from envs.bandits.bandit import MAX_ARMS
 
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from envs.bandits.base import Bandit
+from envs.bandits.bandit import Bandit
 from envs.bandits.logged_data import LoggedData, read_log
 
 # By what part a propensity may differ from one in so many arms: files round.

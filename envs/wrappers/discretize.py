@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
-from envs.arguments import check_whole_number
+from envs.argument_checks import check_whole_number
 from envs.wrappers.encodings import row_major
 
 

@@ -7,7 +7,7 @@ from typing import Any, SupportsFloat
 import gymnasium as gym
 from gymnasium.utils import RecordConstructorArgs
 
-from envs.arguments import check_flag, check_number
+from envs.argument_checks import check_flag, check_number
 
 
 class ScaleReward(gym.RewardWrapper[Any, Any], RecordConstructorArgs):

@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 
-from envs.bandits.base import Bandit
+from envs.bandits.bandit import Bandit
 from envs.grid import GridWorld
 
 

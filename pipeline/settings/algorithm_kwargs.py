@@ -7,9 +7,9 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, get_args, get_origin
 
 from pipeline.errors import UserError, unknown
-from pipeline.settings.arguments import check_arguments, constructor_parameters
 from pipeline.settings.class_names import find_class
 from pipeline.settings.components import build_value
+from pipeline.settings.constructor_arguments import check_arguments, constructor_parameters
 from pipeline.settings.hyperparams import check_algorithm_kwargs
 from pipeline.settings.literals import DottedName
 

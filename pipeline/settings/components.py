@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError, one_line
-from pipeline.settings.arguments import check_arguments, constructor_parameters
 from pipeline.settings.class_names import find_class
 from pipeline.settings.coercion import ScheduleSpec
+from pipeline.settings.constructor_arguments import check_arguments, constructor_parameters
 from pipeline.settings.hyperparams import component_specs
 from pipeline.settings.literals import DottedName
 
@@ -134,7 +134,7 @@ def _build_schedule(spec: ScheduleSpec) -> Callable[[float], float]:
         from stable_baselines3.common.utils import LinearSchedule
 
         return LinearSchedule(spec.start, spec.end, 1.0)
-    from agents.schedules import ExponentialSchedule
+    from agents.common.schedules import ExponentialSchedule
 
     return ExponentialSchedule(spec.start, spec.end)
 

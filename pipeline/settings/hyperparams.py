@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
 from pipeline.errors import UserError, did_you_mean, shown
-from pipeline.settings.arguments import check_arguments, check_range
 from pipeline.settings.coercion import coerce
+from pipeline.settings.constructor_arguments import check_arguments, check_range
 from pipeline.settings.literals import contains_name
 from pipeline.settings.strict_yaml import read_yaml
 
@@ -266,7 +266,7 @@ def check_algorithm_kwargs(
     Args:
         kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
         parameters: those of the constructor, see
-            `pipeline.settings.arguments.constructor_parameters`.
+            `pipeline.settings.constructor_arguments.constructor_parameters`.
         where: begins every error message.
 
     Returns:

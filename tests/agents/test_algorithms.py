@@ -25,7 +25,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
 from agents import load_algorithm
-from agents.schedules import ExponentialSchedule
+from agents.common.schedules import ExponentialSchedule
 
 TABULAR = ["qlearning", "sarsa", "expected_sarsa", "double_qlearning"]
 HAND_WRITTEN = [*TABULAR, "random", "angle"]

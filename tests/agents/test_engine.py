@@ -13,8 +13,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 from agents import load_algorithm
-from agents.blocks import EpisodeBudget
-from agents.schedules import ExponentialSchedule
+from agents.common.callback_horizons import EpisodeBudget
+from agents.common.schedules import ExponentialSchedule
 from envs.wrappers import DiscretizeObservation, FlattenToDiscrete, ScaleReward, TerminationReward
 
 ENGINES = ("interpreted", "compiled")

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from agents.exploration import (
+from agents.common.exploration import (
     BOLTZMANN,
     EPSILON_GREEDY,
     GAUSSIAN_NOISE,

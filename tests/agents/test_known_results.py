@@ -9,9 +9,9 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401
-from agents.blocks import EpisodeBudget
+from agents.common.callback_horizons import EpisodeBudget
 from agents.tabular.algorithms import SARSA, QLearning
-from envs.model import transition_model
+from envs.known_models import transition_model
 from mdp import policy_return
 
 N_SEEDS = 10

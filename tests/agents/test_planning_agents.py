@@ -8,7 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 import envs  # noqa: F401
 from agents.planning import Optimal, ValueIteration
-from envs.model import time_limit, transition_model
+from envs.known_models import time_limit, transition_model
 from mdp import finite_horizon_optimum, policy_return
 
 

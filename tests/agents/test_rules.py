@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agents.exploration import BOLTZMANN, EPSILON_GREEDY
+from agents.common.exploration import BOLTZMANN, EPSILON_GREEDY
 from agents.tabular.rules import DOUBLE_Q_LEARNING, EXPECTED_SARSA, Q_LEARNING, SARSA, update
 
 # Two states, three actions. The transition: state 0, action 1, reward 2, then state 1, where SARSA

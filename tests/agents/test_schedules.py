@@ -7,7 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from agents.schedules import EXPONENTIAL, LINEAR, ExponentialSchedule, schedule_row, schedule_value
+from agents.common.schedules import (
+    EXPONENTIAL,
+    LINEAR,
+    ExponentialSchedule,
+    schedule_row,
+    schedule_value,
+)
 
 # Training may run past its end, by a rollout or an episode.
 progress = st.floats(-0.5, 1)

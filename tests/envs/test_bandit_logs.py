@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import envs  # noqa: F401
 from envs.bandits import LoggedData, ReplayBandit, log_uniformly, read_log
-from envs.model import time_limit, transition_model
+from envs.known_models import time_limit, transition_model
 
 LOG = Path(__file__).parent / "uniform_log.csv"
 

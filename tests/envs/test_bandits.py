@@ -16,7 +16,7 @@ from scipy import integrate, stats
 import envs  # noqa: F401
 from envs.bandits import Bandit, BernoulliBandit, GaussianBandit, LinearBandit, SegmentBandit
 from envs.bandits.clicks import ClickBandit
-from envs.model import observations_of_states, success_outcomes, time_limit, transition_model
+from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
 from envs.wrappers import ScaleReward
 from mdp import best_blind_return, finite_horizon_optimum, policy_return
 

@@ -18,7 +18,7 @@ from gymnasium.utils.seeding import np_random
 
 import envs  # noqa: F401
 from envs.grid import GridWorld
-from mdp.model import TransitionModel
+from mdp.transition_model import TransitionModel
 
 GRID_WORLDS: list[tuple[str, dict[str, Any]]] = [
     ("Warehouse-v0", {}),

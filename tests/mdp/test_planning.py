@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import ArrayLike
 
-from envs.model import transition_model
+from envs.known_models import transition_model
 from mdp import (
     TransitionModel,
     finite_horizon_optimum,

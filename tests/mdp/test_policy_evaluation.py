@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envs.model import success_outcomes, transition_model
+from envs.known_models import success_outcomes, transition_model
 from mdp import (
     TransitionModel,
     best_blind_return,

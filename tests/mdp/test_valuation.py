@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from envs.model import transition_model
+from envs.known_models import transition_model
 from mdp import (
     TransitionModel,
     finite_horizon_optimum,

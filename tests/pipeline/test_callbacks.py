@@ -22,15 +22,15 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import load_algorithm
-from agents.blocks import EpisodeBudget
+from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import (
     EpisodeCheckpoint,
     EvaluationCallback,
     ExponentialExploration,
     StepCheckpoint,
 )
-from pipeline.evaluation import Evaluation, evaluate
-from pipeline.run import Run
+from pipeline.evaluation.sampled import Evaluation, evaluate
+from pipeline.run_folder import Run
 
 TINY_DQN = {
     "buffer_size": 200,

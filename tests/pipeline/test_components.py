@@ -27,7 +27,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from torch import nn, optim
 
 from agents import load_algorithm
-from agents.schedules import ExponentialSchedule
+from agents.common.schedules import ExponentialSchedule
 from pipeline.errors import UserError
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.settings.coercion import ScheduleSpec

@@ -21,7 +21,7 @@ from pipeline.environments import (
 )
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
-from pipeline.specs import TrainSpec
+from pipeline.train_spec import TrainSpec
 
 
 def spec_of(env_id, entry=None, **kwargs):

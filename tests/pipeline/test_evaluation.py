@@ -8,10 +8,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import load_algorithm
-from pipeline.evaluation import Evaluation, evaluate, evaluation_seed
-from pipeline.loading import load_model
+from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
+from pipeline.model_loading import load_model
 from pipeline.settings.hyperparams import split
-from pipeline.specs import TrainSpec
+from pipeline.train_spec import TrainSpec
 from pipeline.training import train
 
 

@@ -7,10 +7,10 @@ from gymnasium import spaces
 from agents import load_algorithm
 from mdp import policy_return, value_iteration
 from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation import Yardstick, evaluate
-from pipeline.exact import exact_evaluator, policy_matrix
+from pipeline.evaluation.exact import exact_evaluator, policy_matrix
+from pipeline.evaluation.sampled import Yardstick, evaluate
 from pipeline.settings.hyperparams import split
-from pipeline.specs import TrainSpec
+from pipeline.train_spec import TrainSpec
 
 # Two-sided, of the normal distribution.
 WITHIN_999 = 3.2905

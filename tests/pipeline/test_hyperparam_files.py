@@ -6,14 +6,14 @@ import gymnasium as gym
 import pytest
 
 from agents import ALGORITHMS, load_algorithm
+from commands.train_request import check_fit
 from pipeline.environments import make_single_env, make_training_env
-from pipeline.requests import check_fit
 from pipeline.settings import hyperparams
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.settings.components import callbacks, vec_wrapper_factory
 from pipeline.settings.hyperparams import entry_names, override, read_hyperparams, split
 from pipeline.settings.strict_yaml import read_yaml
-from pipeline.specs import TrainSpec
+from pipeline.train_spec import TrainSpec
 
 FOLDER = Path(hyperparams.__file__).parents[2] / "hyperparams"
 FILES = sorted(FOLDER.glob("*.yml"))

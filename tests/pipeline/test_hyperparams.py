@@ -18,9 +18,9 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from agents import load_algorithm
 from pipeline.errors import UserError
-from pipeline.settings.arguments import RANGES, constructor_parameters
 from pipeline.settings.coercion import ScheduleSpec, coerce, parse_schedule
 from pipeline.settings.components import build_value
+from pipeline.settings.constructor_arguments import RANGES, constructor_parameters
 from pipeline.settings.hyperparams import (
     ComponentSpec,
     Hyperparams,

@@ -16,7 +16,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.results_plotter import ts2xy
 
 import train
-from pipeline.run import Run
+from pipeline.run_folder import Run
 
 ROOT = Path(train.__file__).parent
 

@@ -8,10 +8,9 @@ from PIL import Image
 
 from agents import load_algorithm
 from pipeline.environments import make_training_env
-from pipeline.exact import exact_evaluator
-from pipeline.settings.hyperparams import split
-from pipeline.specs import TrainSpec
-from pipeline.value_maps.cells import (
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.value_maps import value_map
+from pipeline.pictures.map_cells import (
     draw_arrows,
     draw_ground,
     draw_numbers,
@@ -20,8 +19,9 @@ from pipeline.value_maps.cells import (
     policies_in,
     short_number,
 )
-from pipeline.value_maps.plots import decimals_for, draw_value_map, layer_name, shown_layers
-from pipeline.value_maps.recording import value_map
+from pipeline.pictures.value_map import decimals_for, draw_value_map, layer_name, shown_layers
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
 
 UP, DOWN, LEFT, RIGHT = range(4)
 MINUS = "\N{MINUS SIGN}"

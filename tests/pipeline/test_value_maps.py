@@ -8,13 +8,13 @@ from rich.console import Console
 from agents import load_algorithm
 from mdp import policy_return
 from pipeline.environments import make_training_env
-from pipeline.exact import exact_evaluator
-from pipeline.loading import load_model
+from pipeline.evaluation import value_maps
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.value_maps import ValueMapRecorder, value_map
+from pipeline.model_loading import load_model
 from pipeline.settings.hyperparams import split
-from pipeline.specs import TrainSpec
+from pipeline.train_spec import TrainSpec
 from pipeline.training import train
-from pipeline.value_maps import recording
-from pipeline.value_maps.recording import ValueMapRecorder, value_map
 
 UP, DOWN, LEFT, RIGHT = range(4)
 # The cells are 0 S, 1 free, 2 free; 3 free, 4 shelf, 5 goal.
@@ -201,7 +201,7 @@ def recorded(recorder: ValueMapRecorder) -> list[int]:
 
 
 def test_of_very_many_maps_every_second_is_kept(recorder, monkeypatch):
-    monkeypatch.setattr(recording, "MAX_MAPS", 4)
+    monkeypatch.setattr(value_maps, "MAX_MAPS", 4)
     agent = made(spec_of("FrozenLake-v1"))
     for step, expected in [
         (40, [10, 20, 30, 40]),
@@ -228,7 +228,7 @@ def test_the_last_map_is_kept_once(recorder):
 
 def test_the_file_is_written_no_more_than_once_in_a_while(recorder, monkeypatch):
     clock = [recorder._last_write]
-    monkeypatch.setattr(recording.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(value_maps.time, "monotonic", lambda: clock[0])
     agent = made(spec_of("FrozenLake-v1"))
     recorder.record(agent, 10)
     assert not recorder.path.exists()

@@ -17,14 +17,14 @@ import pytest
 import compare
 from agents import load_algorithm
 from envs.warehouse import WarehouseEnv
+from experiments.results import read_episodes, read_results
+from experiments.run_in_child import do_run
+from experiments.study_files import read_study
+from experiments.study_plan import plan
+from experiments.study_spec import QuickSpec
 from mdp import value_iteration
-from pipeline.loading import load_model
+from pipeline.model_loading import load_model
 from pipeline.preparation import algorithm_kwargs
-from pipeline.study.planning import plan
-from pipeline.study.reading import read_study
-from pipeline.study.results import read_episodes, read_results
-from pipeline.study.spec import QuickSpec
-from pipeline.study.work import do_run
 
 ROOT = Path(compare.__file__).parent
 # Bandits have a guide of their own.

@@ -1,0 +1,1 @@
+"""What every hand-written agent shares."""

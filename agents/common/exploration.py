@@ -1,0 +1,181 @@
+"""How an agent that knows the value of each action chooses one.
+
+Pure compiled functions: they are handed their random numbers, so that an interpreted and a compiled
+training loop that draw from the same generator choose the same actions. A choice takes a row of
+`draws_per_choice` numbers: standard normal ones for `GAUSSIAN_NOISE`, else uniform in [0, 1).
+
+Sutton and Barto (2nd edition): epsilon-greedy section 2.2, softmax section 2.8.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdp.machine_code import inlined
+
+EPSILON_GREEDY = 0
+BOLTZMANN = 1
+GAUSSIAN_NOISE = 2
+
+STRATEGIES = {
+    "epsilon_greedy": EPSILON_GREEDY,
+    "boltzmann": BOLTZMANN,
+    "gaussian_noise": GAUSSIAN_NOISE,
+}
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+def draws_per_choice(strategy: int, n_actions: int) -> int:
+    """Number of random numbers that one choice among ``n_actions`` consumes."""
+    if strategy == GAUSSIAN_NOISE:
+        return n_actions
+    return 2 if strategy == EPSILON_GREEDY else 1
+
+
+@inlined
+def highest_value(values: Floats) -> float:
+    """The highest of ``values``, shape (A,); a plain loop is faster here than NumPy's."""
+    highest = values[0]
+    for action in range(1, len(values)):
+        highest = max(highest, values[action])
+    return float(highest)
+
+
+@inlined
+def greedy_action(values: Floats, uniform: float) -> int:
+    """A best action; ``uniform`` picks among ties, and 0 picks the first, as argmax does.
+
+    Args:
+        values: action values, shape (A,).
+        uniform: a number in [0, 1).
+    """
+    best_action = 0
+    n_best = 1
+    for action in range(1, len(values)):
+        if values[action] > values[best_action]:
+            best_action = action
+            n_best = 1
+        elif values[action] == values[best_action]:
+            n_best += 1
+    if n_best == 1:
+        return best_action
+    skip = int(uniform * n_best)
+    for action in range(best_action, len(values)):
+        if values[action] == values[best_action]:
+            if skip == 0:
+                return action
+            skip -= 1
+    return best_action
+
+
+@inlined
+def epsilon_greedy_action(values: Floats, epsilon: float, tie_scale: float, draws: Floats) -> int:
+    """A uniformly random action with probability ``epsilon``, else a greedy one."""
+    if draws[0] < epsilon:
+        return int(draws[1] * len(values))
+    return greedy_action(values, draws[1] * tie_scale)
+
+
+@inlined
+def boltzmann_action(values: Floats, temperature: float, draws: Floats) -> int:
+    """An action with probability proportional to exp(value / temperature)."""
+    highest = highest_value(values)
+    total = 0.0
+    for action in range(len(values)):
+        total += math.exp((values[action] - highest) / temperature)
+    remaining = draws[0] * total
+    for action in range(len(values) - 1):
+        remaining -= math.exp((values[action] - highest) / temperature)
+        if remaining < 0.0:
+            return action
+    return len(values) - 1
+
+
+@inlined
+def noisy_greedy_action(values: Floats, noise_std: float, draws: Floats) -> int:
+    """The best action after Gaussian noise of standard deviation ``noise_std`` on each value."""
+    best_action = 0
+    best_value = values[0] + noise_std * draws[0]
+    for action in range(1, len(values)):
+        value = values[action] + noise_std * draws[action]
+        if value > best_value:
+            best_action = action
+            best_value = value
+    return best_action
+
+
+@inlined
+def choose_action(
+    strategy: int, values: Floats, rate: float, tie_scale: float, draws: Floats
+) -> int:
+    """Choose by ``strategy``.
+
+    Args:
+        strategy: one of `STRATEGIES`.
+        values: action values, shape (A,).
+        rate: how much to explore: epsilon, temperature or standard deviation.
+        tie_scale: 1 to break ties at random, 0 to take the first best action.
+        draws: random numbers, shape (draws_per_choice,).
+    """
+    if strategy == EPSILON_GREEDY:
+        return epsilon_greedy_action(values, rate, tie_scale, draws)
+    if strategy == BOLTZMANN:
+        return boltzmann_action(values, rate, draws)
+    return noisy_greedy_action(values, rate, draws)
+
+
+@inlined
+def expected_value(strategy: int, values: Floats, rate: float) -> float:
+    """Mean of ``values``, shape (A,), under the exploring policy.
+
+    Ties do not matter, since tied actions are of equal value. Gaussian noise has no closed form and
+    is refused where an agent is built.
+    """
+    highest = highest_value(values)
+    if strategy == EPSILON_GREEDY:
+        total = 0.0
+        for action in range(len(values)):
+            total += values[action]
+        return rate * total / len(values) + (1.0 - rate) * highest
+    total = 0.0
+    weighted = 0.0
+    for action in range(len(values)):
+        weight = math.exp((values[action] - highest) / rate)
+        total += weight
+        weighted += weight * values[action]
+    return weighted / total
+
+
+def action_probabilities(
+    strategy: int, values: Floats, rate: float, *, random_ties: bool
+) -> Floats:
+    """The exploring policy as a matrix.
+
+    Args:
+        strategy: `EPSILON_GREEDY` or `BOLTZMANN`.
+        values: action values, shape (S, A).
+        rate: epsilon or temperature.
+        random_ties: whether tied greedy actions share their probability or the first has it all.
+
+    Returns:
+        Probabilities, shape (S, A).
+
+    Raises:
+        ValueError: for Gaussian noise, whose probabilities have no closed form.
+    """
+    if strategy == GAUSSIAN_NOISE:
+        raise ValueError("Gaussian noise on the values has no closed-form action probabilities")
+    highest = values.max(axis=1, keepdims=True)
+    if strategy == BOLTZMANN:
+        weights = np.exp((values - highest) / rate)
+        return np.asarray(weights / weights.sum(axis=1, keepdims=True))
+    greedy = (values == highest).astype(np.float64)
+    if not random_ties:
+        greedy = np.eye(values.shape[1])[values.argmax(axis=1)]
+    greedy /= greedy.sum(axis=1, keepdims=True)
+    return np.asarray(rate / values.shape[1] + (1.0 - rate) * greedy)

@@ -1,0 +1,209 @@
+"""The base of every hand-written agent: one environment step at a time.
+
+`OnlineAlgorithm` is a Stable-Baselines3 algorithm whose callbacks, logger and Monitor statistics
+behave as those of the library's own off-policy algorithms do. What an agent adds is how it chooses
+actions and what it learns from them.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any, Self, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import MaybeCallback
+
+from agents.common.model_files import JsonAlgorithm
+
+
+@dataclass(slots=True)
+class Transitions:
+    """One step of every environment.
+
+    Attributes:
+        obs: observations before the step, shape (n_envs, ...).
+        actions: what was done, shape (n_envs, ...).
+        rewards: float64 of shape (n_envs,).
+        terminated: the episode ended for good, bool of shape (n_envs,).
+        dones: it ended for good or was truncated, bool of shape (n_envs,).
+        next_obs: observations after the step, before any reset, shape (n_envs, ...).
+    """
+
+    obs: Any
+    actions: Any
+    rewards: NDArray[np.float64]
+    terminated: NDArray[np.bool_]
+    dones: NDArray[np.bool_]
+    next_obs: Any
+
+
+class OnlineAlgorithm(JsonAlgorithm):
+    """Acts and learns one step at a time, with generators of its own.
+
+    Subclasses define `_setup_model`, which ends in a call of ``set_random_seed``, and
+    `_choose_actions`, and override `_learn_from` where they learn.
+    """
+
+    rng: np.random.Generator
+    predict_rng: np.random.Generator
+
+    @abstractmethod
+    def _choose_actions(self) -> NDArray[Any]:
+        """Actions for `_last_obs`, shape (n_envs, ...)."""
+
+    def _begin_episodes(self) -> None:
+        """Forget what belongs to episodes under way: all environments are about to be reset."""
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        """Learn from one step of every environment; an agent that does not learn leaves it."""
+
+    def _record_training(self) -> None:
+        """Hand the agent's own figures to the logger, just before it writes."""
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int | None = 100,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """Train for at least ``total_timesteps`` environment steps.
+
+        Args:
+            total_timesteps: number of steps, counted over all environments.
+            callback: one or several callbacks, called at every step.
+            log_interval: episodes between two log records, or None for none.
+            tb_log_name: name of the TensorBoard run; by default the class's name.
+            reset_num_timesteps: start counting anew rather than go on.
+            progress_bar: show one.
+
+        Returns:
+            The agent itself.
+        """
+        tb_log_name = tb_log_name or type(self).__name__
+        total_timesteps, callback = self._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        callback.on_training_start(locals(), globals())
+        self._run(total_timesteps, callback, log_interval)
+        callback.on_training_end()
+        return self
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        if reset_num_timesteps or self._last_obs is None:
+            self._begin_episodes()
+        total_timesteps, callback = super()._setup_learn(
+            total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar
+        )
+        # As in the library, a training of no steps is none, and no error.
+        self._update_current_progress_remaining(self.num_timesteps, max(self._total_timesteps, 1))
+        return total_timesteps, callback
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        """Step until ``num_timesteps`` is reached or a callback asks to stop."""
+        while self.num_timesteps < total_timesteps and self._step(callback, log_interval):
+            pass
+
+    def _step(self, callback: BaseCallback, log_interval: int | None) -> bool:
+        """Act, tell the callbacks, learn; False once a callback asks to stop.
+
+        The order is that of the library's off-policy algorithms. Unlike there, the last transition
+        is learnt from even when a callback stops the training on it.
+        """
+        assert self.env is not None
+        callback.on_rollout_start()
+        obs, actions = self._last_obs, self._choose_actions()
+        new_obs, rewards, dones, infos = self.env.step(actions)
+        self.num_timesteps += self.env.num_envs
+
+        # Written out, since `locals()` would take longer than all that callbacks do.
+        callback.update_locals(
+            {
+                "obs": obs,
+                "actions": actions,
+                "new_obs": new_obs,
+                "rewards": rewards,
+                "dones": dones,
+                "infos": infos,
+            }
+        )
+        keep_going = callback.on_step()
+
+        self._update_info_buffer(infos, dones)
+        self._update_current_progress_remaining(self.num_timesteps, self._total_timesteps)
+        finished = dones.tolist().count(True)
+        next_obs, terminated = true_outcome(new_obs, dones, infos) if finished else (new_obs, dones)
+        self._learn_from(
+            Transitions(obs, actions, rewards.astype(np.float64), terminated, dones, next_obs)
+        )
+        self._last_obs = cast(Any, new_obs)
+        if finished:
+            self._count_episodes(finished, log_interval)
+        callback.on_rollout_end()
+        return keep_going
+
+    def _count_episodes(self, finished: int, log_interval: int | None) -> None:
+        before = self._episode_num
+        self._episode_num += finished
+        if log_interval is not None and self._episode_num // log_interval > before // log_interval:
+            self.dump_logs()
+
+    def dump_logs(self) -> None:
+        """Write the log: episode statistics, speed, and what the agent records."""
+        self._record_training()
+        OffPolicyAlgorithm.dump_logs(cast(OffPolicyAlgorithm, self))
+
+    def set_random_seed(self, seed: int | None = None) -> None:
+        """Seed the agent's generators, its action space and its environments.
+
+        The global generators of NumPy, Python and torch are left alone: no hand-written agent draws
+        from them.
+        """
+        self.rng, self.predict_rng = np.random.default_rng(seed).spawn(2)
+        if seed is None:
+            return
+        self.action_space.seed(seed)
+        if self.env is not None:
+            self.env.seed(seed)
+
+
+def true_outcome(
+    new_obs: Any, dones: NDArray[np.bool_], infos: list[dict[str, Any]]
+) -> tuple[Any, NDArray[np.bool_]]:
+    """What the environments showed before they were reset, and whether they had terminated.
+
+    A VecEnv resets a finished environment within the same step.
+
+    Args:
+        new_obs: observations as ``VecEnv.step`` returns them, shape (n_envs, ...).
+        dones: bool of shape (n_envs,).
+        infos: one dictionary for each environment.
+
+    Returns:
+        The observations reached, shape (n_envs, ...), and ``terminated``, shape (n_envs,).
+    """
+    terminated = dones.copy()
+    next_obs = deepcopy(new_obs)
+    for i in np.flatnonzero(dones):
+        terminated[i] = not infos[i].get("TimeLimit.truncated", False)
+        last_obs = infos[i]["terminal_observation"]
+        if isinstance(next_obs, dict):
+            for key in next_obs:
+                next_obs[key][i] = last_obs[key]
+        else:
+            next_obs[i] = last_obs
+    return next_obs, terminated

@@ -1,0 +1,102 @@
+"""Schedules of a number over training, beside those of Stable-Baselines3.
+
+A schedule maps ``progress_remaining``, which falls from 1 at the first step to 0 at the last, to a
+value. `schedule_row` puts the schedules known here into four numbers, so that compiled code can
+evaluate them; `schedule_value` does so, and is the only place where the arithmetic stands.
+"""
+
+from __future__ import annotations
+
+import math
+
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+
+from mdp.machine_code import inlined
+
+LINEAR = 0.0
+EXPONENTIAL = 1.0
+
+ScheduleRow = tuple[float, float, float, float]
+
+
+@inlined
+def schedule_value(row: ScheduleRow, progress_remaining: float) -> float:
+    """Value of the schedule ``row`` = (kind, start, end, end_fraction)."""
+    kind, start, end, end_fraction = row
+    elapsed = 1.0 - progress_remaining
+    if elapsed > end_fraction:
+        return end
+    if kind == LINEAR:
+        return start + elapsed * (end - start) / end_fraction
+    return start * math.exp(math.log(end / start) * elapsed / end_fraction)
+
+
+class ExponentialSchedule:
+    """Decay from ``start`` to ``end`` by a constant factor a step.
+
+    Args:
+        start: the value at the first step, above 0.
+        end: the value from ``end_fraction`` on, above 0.
+        end_fraction: the share of training after which the value is ``end``, in (0, 1].
+
+    Raises:
+        ValueError: if a value lies outside its range.
+    """
+
+    def __init__(self, start: float, end: float, end_fraction: float = 1.0) -> None:
+        if not (start > 0 and end > 0):
+            raise ValueError(
+                f"an exponential schedule needs start and end above 0, not {start} and {end}"
+            )
+        if not 0 < end_fraction <= 1:
+            raise ValueError(f"end_fraction must lie in (0, 1], not {end_fraction}")
+        self.start = start
+        self.end = end
+        self.end_fraction = end_fraction
+
+    def __call__(self, progress_remaining: float) -> float:
+        return schedule_value(_row(EXPONENTIAL, self), progress_remaining)
+
+    def __repr__(self) -> str:
+        return (
+            f"ExponentialSchedule(start={self.start}, end={self.end}, "
+            f"end_fraction={self.end_fraction})"
+        )
+
+
+def epsilon_schedule(decay: str, start: float, end: float, end_fraction: float) -> Schedule:
+    """Epsilon over training.
+
+    Args:
+        decay: ``"constant"`` (stays at the start), ``"linear"`` or ``"exponential"``.
+        start: the value at the first step.
+        end: the value from ``end_fraction`` on.
+        end_fraction: the share of training over which it falls, in [0, 1].
+    """
+    if decay == "constant":
+        return FloatSchedule(start)
+    if end_fraction == 0:
+        return FloatSchedule(end)
+    if decay == "exponential":
+        return ExponentialSchedule(start, end, end_fraction)
+    return LinearSchedule(start, end, end_fraction)
+
+
+def _row(kind: float, schedule: ExponentialSchedule | LinearSchedule) -> ScheduleRow:
+    return kind, float(schedule.start), float(schedule.end), float(schedule.end_fraction)
+
+
+def schedule_row(schedule: float | Schedule) -> ScheduleRow | None:
+    """The schedule as (kind, start, end, end_fraction); None for a foreign function."""
+    if isinstance(schedule, FloatSchedule):
+        return schedule_row(schedule.value_schedule)
+    if isinstance(schedule, ConstantSchedule):
+        return schedule_row(schedule.val)
+    if isinstance(schedule, LinearSchedule):
+        return _row(LINEAR, schedule)
+    if isinstance(schedule, ExponentialSchedule):
+        return _row(EXPONENTIAL, schedule)
+    if isinstance(schedule, int | float):
+        return LINEAR, float(schedule), float(schedule), 1.0
+    return None

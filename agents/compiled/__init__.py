@@ -1,0 +1,1 @@
+"""The compiled engine: environments, random streams, the loop, batches of runs."""

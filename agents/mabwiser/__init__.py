@@ -1,0 +1,1 @@
+"""MABWiser's bandits behind the interface of the others."""

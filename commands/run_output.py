@@ -1,0 +1,87 @@
+"""The few lines before and after a training run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.table import Table
+
+from pipeline.run_folder import FINISHED
+from pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from pipeline.evaluation.sampled import Evaluation
+    from pipeline.pull_recording import PullSummary
+    from pipeline.training import Outcome
+
+
+def describe(evaluation: Evaluation) -> str:
+    """An evaluation in a few words."""
+    text = f"return {evaluation.mean_return:.2f}"
+    if evaluation.is_exact:
+        text += " (exact)"
+    else:
+        text += f" ± {evaluation.std_return:.2f} over {len(evaluation.returns)} episodes"
+    if evaluation.success_rate is not None:
+        text += f", success {evaluation.success_rate:.1%}"
+    yardstick = evaluation.yardstick
+    if yardstick is not None:
+        text += (
+            f", optimum {yardstick.optimum:.2f}, best blind policy {yardstick.blind:.2f}, "
+            f"score {yardstick.score(evaluation.mean_return):.2f}"
+        )
+    return text
+
+
+def describe_pulls(pulls: PullSummary) -> str:
+    """The pulls of a training in a few words."""
+    from pipeline.pull_recording import LAST_PULLS
+
+    if pulls.regret is not None:
+        last = min(LAST_PULLS, pulls.n_pulls)
+        return (
+            f"{pulls.regret:,.2f} over {pulls.n_pulls:,} pulls; "
+            f"a best arm in {pulls.optimal:.0%} of the last {last}"
+        )
+    if pulls.reward is None:
+        return f"not known: none of {pulls.n_pulls:,} pulls is in the log"
+    return (
+        f"not known; reward {pulls.reward:.4f} a pull over the {pulls.n_matched:,} "
+        f"of {pulls.n_pulls:,} that are in the log"
+    )
+
+
+def print_header(console: Console, spec: TrainSpec) -> None:
+    """Say what is about to be trained, and with which hyperparameters."""
+    budget = spec.hyperparams.n_timesteps or spec.hyperparams.n_episodes or 0
+    unit = "steps" if spec.hyperparams.n_timesteps else "episodes"
+    console.print(
+        f"[bold]{spec.algo}[/] on [bold]{spec.env_id}[/], seed {spec.seed}, {budget:,} {unit}"
+    )
+    settings = "  ".join(f"{key}={value}" for key, value in spec.saved_hyperparams.items())
+    console.print(f"[dim]{settings}[/]", highlight=False)
+
+
+def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
+    """Say what came out and where the files lie."""
+    speed = outcome.n_steps / max(outcome.seconds, 1e-9)
+    table = Table.grid(padding=(0, 2))
+    done = "trained" if outcome.state == FINISHED else "interrupted"
+    table.add_row(
+        done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)"
+    )
+    if outcome.engine:
+        table.add_row("engine", outcome.engine)
+    if outcome.pulls is not None:
+        table.add_row("regret", describe_pulls(outcome.pulls))
+    if outcome.final is not None:
+        table.add_row("final", describe(outcome.final))
+    if outcome.best_return is not None:
+        table.add_row(
+            "best", f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
+        )
+    table.add_row("files", str(outcome.run.path))
+    folder = "" if str(spec.log_folder) == "logs" else f" -f {spec.log_folder}"
+    table.add_row("watch", f"python enjoy.py --algo {spec.algo} --env {spec.env_id}{folder}")
+    console.print(table, highlight=False)

@@ -1,0 +1,102 @@
+"""What ``compare.py`` does: run what is missing, then judge what is there."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+from commands.study_progress import StudyProgress
+from experiments.execution import RunFailure, available_cores, execute
+from experiments.results import StudyResults, read_results
+from experiments.study_plan import PlannedRun, check_settings
+from experiments.study_spec import StudySpec
+
+WIDTH_WITHOUT_TERMINAL = 120
+
+
+def run_study(
+    study: StudySpec, planned: Sequence[PlannedRun], args: argparse.Namespace, command: str
+) -> int:
+    """Do a study as planned; the exit code is 1 where a run failed.
+
+    Raises:
+        UserError: if an agent cannot be made with its settings.
+    """
+    check_settings(study, planned)
+    console = Console()
+    if not console.is_terminal:
+        console = Console(width=WIDTH_WITHOUT_TERMINAL)
+    root = Path(args.log_folder) / study.name
+    console.print(study.title, style="bold", markup=False, highlight=False)
+    failures = _do_missing(console, planned, root, args, command)
+    results = read_results(study, planned, root)
+    if len(results.summary):
+        _judge(console, results, args, command)
+    for failure in failures:
+        console.print(
+            f"failed: {failure.planned.agent} on {failure.planned.environment}, "
+            f"seed {failure.planned.seed}: {failure.reason}; see {failure.log}",
+            markup=False,
+            highlight=False,
+            soft_wrap=True,
+        )
+    return 1 if failures else 0
+
+
+def _do_missing(
+    console: Console,
+    planned: Sequence[PlannedRun],
+    root: Path,
+    args: argparse.Namespace,
+    command: str,
+) -> list[RunFailure]:
+    missing = [run for run in planned if not run.is_finished]
+    done = [run for run in planned if run.is_finished]
+    n_workers = args.jobs if args.jobs > 0 else available_cores()
+    console.print(
+        f"{len(planned)} runs, {len(done)} of them there already; {n_workers} at once, in {root}",
+        markup=False,
+        highlight=False,
+    )
+    with StudyProgress(console, planned, done) as progress:
+        return execute(missing, root, command, n_workers, progress.note)
+
+
+def _judge(console: Console, results: StudyResults, args: argparse.Namespace, command: str) -> None:
+    from experiments.analysis import analyse
+    from report.tables import (
+        episodes_table,
+        print_analysis,
+        print_episodes_table,
+        write_tables,
+    )
+
+    analysis = analyse(results)
+    print_analysis(console, analysis)
+    width = results.study.episodes_table
+    blocks = episodes_table(results, width) if width else None
+    if blocks is not None:
+        print_episodes_table(console, blocks, width)
+    files = write_tables(results)
+    if results.study.render_every:
+        from report.training_films import write_films
+
+        films, refused = write_films(results)
+        files += films
+        for reason in refused:
+            console.print(f"no film: {reason}", markup=False, highlight=False)
+    if not args.no_report:
+        from report.figures.study_figures import write_figures
+        from report.page import write_report
+
+        files += write_figures(analysis, blocks)
+        page = results.root / "report.html"
+        write_report(analysis, page, command)
+        files.append(page)
+    console.print()
+    console.print(f"files: {results.root}", markup=False, highlight=False)
+    for path in files:
+        console.print(f"  {path.relative_to(results.root)}", markup=False, highlight=False)

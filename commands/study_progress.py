@@ -1,0 +1,116 @@
+"""What a person watching a study sees: one table that moves, or a line now and then."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.markup import escape
+from rich.progress_bar import ProgressBar
+from rich.table import Table
+
+from experiments.execution import RunFailure
+from experiments.study_plan import PlannedRun
+
+SECONDS_BETWEEN_LINES = 10.0
+
+
+class StudyProgress:
+    """How far the runs of a study are, by agent and environment.
+
+    Args:
+        console: where to.
+        runs: all runs of the study.
+        done: those of them that had been done before.
+    """
+
+    def __init__(
+        self, console: Console, runs: Sequence[PlannedRun], done: Sequence[PlannedRun]
+    ) -> None:
+        self.console = console
+        self.total = Counter((run.agent, run.environment) for run in runs)
+        self.done = Counter((run.agent, run.environment) for run in done)
+        self.failed: Counter[tuple[str, str]] = Counter()
+        self.n_missing = len(runs) - len(done)
+        self.n_ended = 0
+        self.started = time.monotonic()
+        self.last_line = self.started
+        self.live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+
+    def __enter__(self) -> StudyProgress:
+        if self.live is not None:
+            self.live.start()
+            self._show()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self.live is not None:
+            self._show()
+            self.live.stop()
+        if isinstance(error, KeyboardInterrupt):
+            self.console.print(f"{self._figures()}; the same command goes on", highlight=False)
+
+    def note(self, run: PlannedRun, failure: RunFailure | None) -> None:
+        """Count a run that has ended now."""
+        self.n_ended += 1
+        key = (run.agent, run.environment)
+        if failure is None:
+            self.done[key] += 1
+        else:
+            self.failed[key] += 1
+            self.console.print(
+                f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}",
+                markup=False,
+                highlight=False,
+            )
+        self._show()
+
+    def _show(self) -> None:
+        if self.live is not None:
+            self.live.update(self._table(), refresh=True)
+        elif self._is_time_for_a_line():
+            self.last_line = time.monotonic()
+            self.console.print(self._figures(), highlight=False)
+
+    def _is_time_for_a_line(self) -> bool:
+        is_last = self.n_ended == self.n_missing
+        return is_last or time.monotonic() - self.last_line > SECONDS_BETWEEN_LINES
+
+    def _figures(self) -> str:
+        seconds = time.monotonic() - self.started
+        text = f"{self.n_ended} of {self.n_missing} runs in {_duration(seconds)}"
+        if 0 < self.n_ended < self.n_missing:
+            left = seconds / self.n_ended * (self.n_missing - self.n_ended)
+            text += f", about {_duration(left)} left"
+        return text
+
+    def _table(self) -> Table:
+        table = Table(box=None, pad_edge=False, caption=self._figures(), caption_justify="left")
+        for heading in ("agent", "environment", "runs", "", "failed"):
+            table.add_column(heading)
+        for key, total in self.total.items():
+            done, failed = self.done[key], self.failed[key]
+            table.add_row(
+                *map(escape, key),
+                f"{done}/{total}",
+                ProgressBar(total=total, completed=done, width=24),
+                f"[red]{failed}[/]" if failed else "",
+            )
+        return table
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

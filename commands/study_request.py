@@ -1,0 +1,109 @@
+"""From the arguments of ``compare.py`` to a study."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from agents import ALGORITHMS
+from experiments.study_files import read_study
+from experiments.study_spec import (
+    METRICS,
+    AgentSpec,
+    EnvironmentSpec,
+    StudySpec,
+    file_name,
+    layered,
+)
+from pipeline.environments import check_env_id, import_gym_packages
+from pipeline.errors import UserError, unknown
+from pipeline.settings.literals import parse_assignments
+
+_LEAST = {
+    "seeds": 1,
+    "n_timesteps": 1,
+    "n_episodes": 1,
+    "episodes_table": 1,
+    "render_every": 0,
+    "jobs": 0,
+}
+
+
+def study_spec(args: argparse.Namespace) -> StudySpec:
+    """The study that the arguments mean, with what they change in it.
+
+    Raises:
+        UserError: if it is not clear what to compare, or on what.
+    """
+    _check_output(args)
+    import_gym_packages(tuple(args.gym_packages))
+    study = _study_of_file(args) if args.study else _study_of_flags(args)
+    changes: dict[str, Any] = {
+        "gym_packages": tuple(args.gym_packages),
+        "tensorboard": args.tensorboard,
+        "render_every": args.render_every,
+        "n_seeds": args.seeds,
+        "metric": args.metric,
+        "margin": args.margin,
+        "episodes_table": args.episodes_table,
+        "name": args.name,
+    }
+    changes = {key: value for key, value in changes.items() if value is not None}
+    study = replace(_with_settings(study, args), **changes)
+    return study.quickened() if args.quick else study
+
+
+def _check_output(args: argparse.Namespace) -> None:
+    for key, least in _LEAST.items():
+        value = getattr(args, key)
+        if value is not None and value < least:
+            raise UserError(f"--{key.replace('_', '-')} must be at least {least}, not {value}")
+    if args.margin is not None and not args.margin >= 0:
+        raise UserError(f"--margin must be at least 0, not {args.margin}")
+    if args.metric is not None and args.metric not in METRICS:
+        raise unknown("--metric: unknown metric", args.metric, METRICS)
+    if args.tensorboard and importlib.util.find_spec("tensorboard") is None:
+        raise UserError("-tb needs: pip install 'rl-yardstick[tensorboard]'")
+
+
+def _study_of_file(args: argparse.Namespace) -> StudySpec:
+    if args.env or args.algos:
+        raise UserError("give a study file, or --env and --algos, not both")
+    return read_study(Path(args.study))
+
+
+def _study_of_flags(args: argparse.Namespace) -> StudySpec:
+    if not (args.env and args.algos):
+        raise UserError("what to compare? give --env and --algos, or a study file")
+    for algo in args.algos:
+        if algo not in ALGORITHMS:
+            raise unknown("unknown agent", algo, ALGORITHMS)
+    for env_id in args.env:
+        check_env_id(env_id)
+    for flag, names in (("--env", args.env), ("--algos", args.algos)):
+        if len(set(names)) < len(names):
+            raise UserError(f"{flag} names one of them twice")
+    agents, environments = ", ".join(args.algos), ", ".join(args.env)
+    return StudySpec(
+        name=file_name(f"{'-'.join(args.env)}_{'-'.join(args.algos)}"),
+        title=f"{agents} on {environments}",
+        agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
+        environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),
+    )
+
+
+def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
+    """The study with the settings of the command line in every agent."""
+    changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
+    if args.env_kwargs:
+        changes["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
+    for key in ("n_timesteps", "n_episodes"):
+        if getattr(args, key) is not None:
+            changes[key] = getattr(args, key)
+    agents = tuple(
+        replace(agent, settings=layered(agent.settings, changes)) for agent in study.agents
+    )
+    return replace(study, agents=agents)

@@ -1,0 +1,178 @@
+"""What is known exactly about a Gymnasium environment: its dynamics, with the wrappers folded in.
+
+The answer is None wherever something in the chain of wrappers is not known to leave the dynamics
+alone: a wrong model would make every figure computed from it wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+from gymnasium.envs.toy_text.taxi import TaxiEnv
+from numpy.typing import NDArray
+
+from envs.bandits.clicks import ClickBandit
+from envs.grid import GridWorld
+from envs.grid_map import GOAL
+from envs.wrappers import (
+    DiscretizeObservation,
+    FlattenToDiscrete,
+    OneHotObservation,
+    ScaleReward,
+    TerminationReward,
+)
+from mdp.transition_model import TransitionModel
+
+Env = gym.Env[Any, Any]
+Wrapper = gym.Wrapper[Any, Any, Any, Any]
+
+# By name, and not as classes: environments know no Stable-Baselines3, and a subclass of one of
+# these may do anything.
+TRANSPARENT_WRAPPERS = frozenset(
+    {
+        "gymnasium.wrappers.common.OrderEnforcing",
+        "gymnasium.wrappers.common.PassiveEnvChecker",
+        "gymnasium.wrappers.common.RecordEpisodeStatistics",
+        "gymnasium.wrappers.common.TimeLimit",
+        "gymnasium.wrappers.rendering.HumanRendering",
+        "gymnasium.wrappers.rendering.RecordVideo",
+        "gymnasium.wrappers.rendering.RenderCollection",
+        "stable_baselines3.common.monitor.Monitor",
+    }
+)
+KNOWN_ENVIRONMENTS = (GridWorld, ClickBandit, FrozenLakeEnv, CliffWalkingEnv, TaxiEnv)
+OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
+
+
+def transition_model(env: Env) -> TransitionModel | None:
+    """The exact dynamics of an environment, with the rewards that its outermost wrapper gives.
+
+    Known are this project's grid worlds, its bandits with click rates, and environments that hold
+    ``P`` and ``initial_state_distrib`` as Gymnasium's FrozenLake, CliffWalking and Taxi do, under
+    wrappers that leave the dynamics alone, `ScaleReward`, and `TerminationReward` where it gives
+    its reward at terminations only. A time limit is no part of the model: see `time_limit`.
+
+    Returns:
+        The model, or None where it is not known.
+    """
+    base, wrappers = _layers(env)
+    if not all(_folds(wrapper) for wrapper in wrappers):
+        return None
+    model = _base_model(base)
+    if model is None:
+        return None
+    reward = model.reward
+    for wrapper in wrappers:
+        if isinstance(wrapper, ScaleReward):
+            reward = reward * wrapper.scale
+        elif isinstance(wrapper, TerminationReward):
+            reward = np.where(model.terminated, wrapper.last_reward, reward)
+    return model if reward is model.reward else replace(model, reward=reward)
+
+
+def time_limit(env: Env) -> int | None:
+    """The number of steps after which an episode is cut off, None where there is no limit."""
+    _, wrappers = _layers(env)
+    limits = [w._max_episode_steps for w in wrappers if isinstance(w, gym.wrappers.TimeLimit)]
+    return min(limits, default=None)
+
+
+def success_outcomes(env: Env) -> NDArray[np.bool_] | None:
+    """The transitions that end an episode well, bool of shape (S, A, K) as in `transition_model`.
+
+    In a grid world those are the ones that reach a goal. Elsewhere they are the ones that
+    terminate with the highest reward that any termination has before wrappers change it: the goal
+    of FrozenLake and CliffWalking, the passenger delivered in Taxi.
+
+    Returns:
+        The mask, or None where the model is not known or no episode terminates.
+    """
+    base, wrappers = _layers(env)
+    model = _base_model(base) if all(_folds(wrapper) for wrapper in wrappers) else None
+    if model is None:
+        return None
+    ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
+    if not ends.any():
+        return None
+    if isinstance(base, GridWorld):
+        codes = np.frombuffer(base.map.codes, np.uint8)
+        good = codes[model.next_state % base.map.n_cells] == ord(GOAL)
+    else:
+        good = model.reward == model.reward[ends].max()
+    success: NDArray[np.bool_] = ends & good
+    return success
+
+
+def observations_of_states(env: Env) -> NDArray[Any] | None:
+    """What an agent observes in each state of `transition_model`, states along the first axis.
+
+    Returns:
+        The observations of states 0, 1, ..., S-1, or None where they are not known.
+    """
+    base, wrappers = _layers(env)
+    if isinstance(base, GridWorld):
+        observations = base.observation_of(np.arange(base.dynamics.n_states))
+    elif isinstance(base, ClickBandit):
+        observations = np.arange(base.n_contexts)
+    elif _holds_model(base) and isinstance(base.observation_space, gym.spaces.Discrete):
+        observations = np.arange(base.observation_space.n)
+    else:
+        return None
+    for wrapper in wrappers:
+        if isinstance(wrapper, OBSERVATION_WRAPPERS):
+            observations = wrapper.map_observations(observations)
+        elif not _folds(wrapper):
+            return None
+    return observations
+
+
+def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
+    """The environment without its wrappers, and these, the innermost first."""
+    wrappers = []
+    while isinstance(env, gym.Wrapper):
+        wrappers.append(env)
+        env = env.env
+    return env, wrappers[::-1]
+
+
+def _folds(wrapper: Wrapper) -> bool:
+    """Whether a wrapper leaves the states alone and changes rewards, if so, in a known way."""
+    if type(wrapper) is TerminationReward:
+        return not wrapper.on_truncation
+    if type(wrapper) in {ScaleReward, *OBSERVATION_WRAPPERS}:
+        return True
+    return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
+
+
+def _base_model(base: Env) -> TransitionModel | None:
+    if _steps_otherwise(base):
+        return None
+    if isinstance(base, GridWorld | ClickBandit):
+        return base.transition_model()
+    if not _holds_model(base):
+        return None
+    P = base.get_wrapper_attr("P")  # noqa: N806 (Gymnasium's own name)
+    try:
+        return TransitionModel.from_gymnasium(P, base.get_wrapper_attr("initial_state_distrib"))
+    except ValueError as error:
+        gym.logger.warn(f"{base}: what its P says is no model and is not used: {error}")
+        return None
+
+
+def _steps_otherwise(base: Env) -> bool:
+    """Whether it is a subclass of an environment that is known, with a step or reset of its own."""
+    known = next((one for one in KNOWN_ENVIRONMENTS if isinstance(base, one)), type(base))
+    return type(base).step is not known.step or type(base).reset is not known.reset
+
+
+def _holds_model(base: Env) -> bool:
+    # A fickle passenger of Taxi changes his mind outside of P.
+    fickle = getattr(base, "fickle_passenger", False)
+    holds = isinstance(getattr(base, "P", None), Mapping) and hasattr(base, "initial_state_distrib")
+    return holds and not fickle

@@ -1,0 +1,291 @@
+"""From the runs of a study to judgements: estimates with intervals, verdicts on pairs, ranks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from experiments.results import StudyResults
+from experiments.study_spec import COSTS, StudySpec
+from verdicts import (
+    Band,
+    Estimate,
+    PairComparison,
+    Summary,
+    ThresholdSummary,
+    compare_pairs,
+    curve_band,
+    estimate,
+    on_grid,
+    performance_profile,
+    probability_of_improvement,
+    shared_grid,
+    summarise,
+    summarise_steps,
+)
+
+SEED = 0  # of all resampling: the same runs give the same figures
+CURVE_POINTS = 200
+MARGIN = 0.02  # of the way from the best blind policy to the optimum
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class AgentAnalysis:
+    """How one agent did on one environment.
+
+    Attributes:
+        agent: its label.
+        algo: its name in the table of agents.
+        n_runs: runs that finished.
+        n_missing: runs that did not.
+        metric: estimates of what the verdicts are about, over seeds.
+        score: the same of the final policy between the best blind policy (0) and the optimum (1);
+            None where those are not known.
+        final: mean return of the final policy.
+        area: mean return over the learning curve.
+        last_episodes: mean return of the last training episodes.
+        regret: on bandits, the sum over all pulls; else without a figure.
+        steps_to_threshold: when the learning curve reached the threshold; None without one.
+        episodes_to_threshold: likewise.
+        success_rate: of the final policy; None where the environment does not say.
+        seconds: time that training took.
+    """
+
+    agent: str
+    algo: str
+    n_runs: int
+    n_missing: int
+    metric: Summary
+    score: Summary | None
+    final: Estimate
+    area: Estimate
+    last_episodes: Estimate
+    regret: Estimate
+    steps_to_threshold: ThresholdSummary | None
+    episodes_to_threshold: ThresholdSummary | None
+    success_rate: Estimate | None
+    seconds: Estimate
+
+
+@dataclass(frozen=True)
+class EnvironmentAnalysis:
+    """How the agents compare on one environment.
+
+    Attributes:
+        environment: its label.
+        env_id: its Gymnasium id.
+        optimum: the highest expected return that any policy has, or None.
+        best_blind: that of the best policy that ignores what it observes, or None.
+        threshold: the return that counts as solved, or None.
+        margin: the difference within which agents count as equivalent.
+        exact: whether all final returns are expectations rather than means of episodes.
+        agents: the agents, the best first.
+        pairs: every two of them, the better ranked first.
+        missing: by agent, also those of which no run has finished, the runs that are not there.
+    """
+
+    environment: str
+    env_id: str
+    optimum: float | None
+    best_blind: float | None
+    threshold: float | None
+    margin: float
+    exact: bool
+    agents: tuple[AgentAnalysis, ...]
+    pairs: tuple[PairComparison, ...]
+    missing: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class OverallAnalysis:
+    """How the agents compare over all environments, by their scores.
+
+    Attributes:
+        scores: estimates by agent, the best first.
+        improvement: by two agents' labels, the probability that the first scores higher.
+        thresholds: scores at which the profiles are given, shape (n,).
+        profiles: by agent, the share of runs that score higher than each of them.
+    """
+
+    scores: Mapping[str, Summary]
+    improvement: Mapping[tuple[str, str], Estimate]
+    thresholds: Floats
+    profiles: Mapping[str, Band]
+
+
+@dataclass(frozen=True)
+class StudyAnalysis:
+    """What a study has shown.
+
+    Attributes:
+        results: the runs.
+        environments: by environment.
+        overall: over all of them; None for a single one, or where a score is not known.
+    """
+
+    results: StudyResults
+    environments: tuple[EnvironmentAnalysis, ...]
+    overall: OverallAnalysis | None
+
+    @property
+    def study(self) -> StudySpec:
+        """What was asked for."""
+        return self.results.study
+
+
+def analyse(results: StudyResults) -> StudyAnalysis:
+    """Judge the runs of a study."""
+    environments = [
+        _analyse_environment(results, environment.label)
+        for environment in results.study.environments
+        if (results.summary["environment"] == environment.label).any()
+    ]
+    return StudyAnalysis(results, tuple(environments), _analyse_overall(results))
+
+
+def values_over_seeds(results: StudyResults, environment: str, column: str) -> dict[str, Floats]:
+    """A column of the summary by agent, shape (n_seeds,); NaN where a run is missing."""
+    table = results.summary
+    table = table[table["environment"] == environment]
+    pivot = table.pivot(index="seed", columns="agent", values=column)
+    pivot = pivot.reindex(
+        index=range(results.study.n_seeds), columns=[a.label for a in results.study.agents]
+    )
+    return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
+
+
+def _first(table: pd.DataFrame, column: str) -> float | None:
+    known = table[column].dropna()
+    return None if known.empty else float(known.iloc[0])
+
+
+def _analyse_environment(results: StudyResults, environment: str) -> EnvironmentAnalysis:
+    study, table = results.study, results.summary
+    table = table[table["environment"] == environment]
+    metric = values_over_seeds(results, environment, study.metric)
+    sign = -1.0 if study.metric in COSTS else 1.0
+    agents = [_analyse_agent(results, environment, agent.label) for agent in study.agents]
+    missing = {agent.agent: agent.n_missing for agent in agents}
+    agents = [agent for agent in agents if agent.n_runs]
+    agents.sort(key=lambda agent: _rank(sign * agent.metric.mean.point), reverse=True)
+    optimum, blind = _first(table, "optimum"), _first(table, "best_blind")
+    margin = study.margin
+    if margin is None:
+        span = 0.0 if optimum is None or blind is None else optimum - blind
+        margin = MARGIN * span
+    return EnvironmentAnalysis(
+        environment=environment,
+        env_id=str(table["env_id"].iloc[0]),
+        optimum=optimum,
+        best_blind=blind,
+        threshold=_first(table, "threshold"),
+        margin=margin,
+        exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is no False here
+        agents=tuple(agents),
+        pairs=tuple(
+            compare_pairs({a.agent: sign * metric[a.agent] for a in agents}, margin, seed=SEED)
+        ),
+        missing=missing,
+    )
+
+
+def _rank(value: float) -> float:
+    return -np.inf if np.isnan(value) else value
+
+
+def _analyse_agent(results: StudyResults, environment: str, agent: str) -> AgentAnalysis:
+    study, table = results.study, results.summary
+    table = table[(table["environment"] == environment) & (table["agent"] == agent)]
+
+    def values(column: str) -> Floats:
+        column_of = table.set_index("seed")[column].reindex(range(study.n_seeds))
+        return column_of.to_numpy(dtype=np.float64, na_value=np.nan)
+
+    def mean(column: str) -> Estimate:
+        return estimate(values(column), "mean", seed=SEED)
+
+    has_threshold = bool(table["threshold"].notna().any())
+    metric = summarise(values(study.metric), seed=SEED)
+    return AgentAnalysis(
+        agent=agent,
+        algo=next(spec.algo for spec in study.agents if spec.label == agent),
+        n_runs=len(table),
+        n_missing=study.n_seeds - len(table),
+        metric=metric,
+        score=summarise(values("score"), seed=SEED) if table["score"].notna().any() else None,
+        final=mean("final"),
+        area=mean("area"),
+        last_episodes=mean("last_episodes"),
+        regret=metric.mean if study.metric == "regret" else mean("regret"),
+        steps_to_threshold=summarise_steps(values("steps_to_threshold")) if has_threshold else None,
+        episodes_to_threshold=summarise_steps(values("episodes_to_threshold"))
+        if has_threshold
+        else None,
+        success_rate=mean("success_rate") if table["success_rate"].notna().any() else None,
+        seconds=mean("seconds"),
+    )
+
+
+def _analyse_overall(results: StudyResults) -> OverallAnalysis | None:
+    study = results.study
+    labels = [environment.label for environment in study.environments]
+    if len(labels) < 2:
+        return None
+    columns = [values_over_seeds(results, label, "score") for label in labels]
+    scores = {
+        agent.label: np.column_stack([column[agent.label] for column in columns])
+        for agent in study.agents
+    }
+    if any(np.isnan(matrix).all(axis=0).any() for matrix in scores.values()):
+        return None
+    summaries = {agent: summarise(matrix, seed=SEED) for agent, matrix in scores.items()}
+    order = sorted(summaries, key=lambda agent: summaries[agent].iqm.point, reverse=True)
+    thresholds = np.linspace(0, 1, 101)
+    return OverallAnalysis(
+        scores={agent: summaries[agent] for agent in order},
+        improvement={
+            (one, two): probability_of_improvement(scores[one], scores[two], seed=SEED)
+            for one in order
+            for two in order
+            if one != two
+        },
+        thresholds=thresholds,
+        profiles={
+            agent: performance_profile(scores[agent], thresholds, seed=SEED) for agent in order
+        },
+    )
+
+
+def mean_curve(
+    results: StudyResults, environment: str, agent: str, kind: str, by: str
+) -> tuple[Floats, Band] | None:
+    """The mean learning curve of an agent over its seeds.
+
+    Args:
+        results: the runs.
+        environment: label of the environment.
+        agent: label of the agent.
+        kind: ``"evaluation"`` or ``"training"``.
+        by: ``"step"``, ``"episode"`` or ``"seconds"``.
+
+    Returns:
+        The points, shape (n,), and the mean there with its interval; None without any run, or where
+        one has ended before another has come to its first point.
+    """
+    table = results.curves
+    chosen = (table["environment"] == environment) & (table["agent"] == agent)
+    runs = [
+        (rows[by].to_numpy(dtype=np.float64), rows["value"].to_numpy(dtype=np.float64))
+        for _, rows in table[chosen & (table["kind"] == kind)].groupby("seed")
+    ]
+    if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
+        return None
+    grid = shared_grid([points for points, _ in runs], CURVE_POINTS)
+    values = np.array([on_grid(points, returns, grid) for points, returns in runs])
+    return grid, curve_band(values, seed=SEED)

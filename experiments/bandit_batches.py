@@ -1,0 +1,133 @@
+"""All runs of one bandit agent as one piece of work: each a fresh agent and one episode."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from agents.bandits.batch import run_batch
+from agents.bandits.one_by_one import run_one_by_one
+from agents.bandits.results import BatchResult
+from agents.bandits.worlds import NotBatchable
+from experiments.pull_statistics import PullStatistics, pull_statistics
+from pipeline.environments import make_single_env
+from pipeline.files import write_text
+from pipeline.preparation import algorithm_kwargs
+from pipeline.pull_recording import PULLS_FILE
+from pipeline.run_folder import FINISHED, Run
+from pipeline.train_spec import TrainSpec
+from pipeline.training import recorded_versions
+
+STATISTICS_FILE = "pull_statistics.npz"
+
+
+def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
+    """Do the runs with seeds 0 to ``n_runs`` - 1 and leave their statistics in the run folder."""
+    started = time.monotonic()
+    result, engine = _run(spec, n_runs)
+    env = make_single_env(spec)
+    try:
+        statistics = _statistics(env, result)
+    finally:
+        env.close()
+    statistics.save(run.path / STATISTICS_FILE)
+    write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
+    write_text(run.params_path / "command.txt", command + "\n")
+    run.update_info(
+        state=FINISHED,
+        env_name=run.env_name,
+        spec=spec.as_data(),
+        n_runs=n_runs,
+        n_timesteps=len(result.arms[0]),
+        versions=recorded_versions(),
+        seconds=round(time.monotonic() - started, 3),
+        engine=engine,
+    )
+
+
+def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
+    arguments: tuple[Any, ...] = (
+        spec.algo,
+        algorithm_kwargs(spec),
+        spec.env_id,
+        spec.hyperparams.env_kwargs,
+        range(n_runs),
+        spec.hyperparams.n_timesteps,
+    )
+    try:
+        return run_batch(*arguments), "compiled batch"
+    except NotBatchable as reason:
+        return run_one_by_one(*arguments), f"one by one: {reason}"
+
+
+def _statistics(env: gym.Env[Any, Any], result: BatchResult) -> PullStatistics:
+    bandit: Any = env.unwrapped
+    statistics = pull_statistics(
+        result.arms,
+        result.rewards,
+        result.regrets,
+        result.contexts,
+        bandit.n_arms,
+        max(bandit.n_contexts, 1),
+        result.estimates,
+        true_means(env),
+        result.moments,
+        result.posteriors,
+    )
+    return statistics if _has_best_arms(bandit) else _without_simple_regret(statistics)
+
+
+def _has_best_arms(bandit: Any) -> bool:
+    """Whether an arm could be recommended: not where its worth moves, or goes by a vector."""
+    return bandit.n_contexts > 0 and not getattr(bandit, "drift_std", 0.0) > 0
+
+
+def _without_simple_regret(statistics: PullStatistics) -> PullStatistics:
+    return replace(statistics, simple_regret=np.full_like(statistics.simple_regret, np.nan))
+
+
+def true_means(env: gym.Env[Any, Any]) -> NDArray[np.float64] | None:
+    """Means of the arms by context, shape (n_contexts, n_arms), where each run has the same."""
+    bandit: Any = env.unwrapped
+    moves = getattr(bandit, "redraws", False) or getattr(bandit, "drift_std", 0.0) > 0
+    means = getattr(bandit, "means", None)
+    return None if moves or means is None else np.array(means, dtype=np.float64)
+
+
+def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
+    """The pulls of a run of its own in the order of time, each of shape (n_pulls,).
+
+    Agents that collect whole rollouts go on beyond ``n_timesteps``; that is left out.
+    """
+    with np.load(folder / PULLS_FILE) as arrays:
+        return {name: array.T.ravel()[:n_timesteps] for name, array in arrays.items()}
+
+
+def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
+    """The same for runs that were done one by one, from the pulls in their folders."""
+    runs = [read_run(folder, spec.hyperparams.n_timesteps) for folder in folders]
+    n_pulls = min(len(run["arms"]) for run in runs)
+    env = make_single_env(spec)
+    try:
+        bandit: Any = env.unwrapped
+        n_contexts = max(bandit.n_contexts, 1)
+        stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
+        statistics = pull_statistics(
+            stacked["arms"],
+            stacked["rewards"],
+            stacked["regrets"],
+            stacked["contexts"] if n_contexts > 1 and "contexts" in stacked else None,
+            bandit.n_arms,
+            n_contexts,
+            true_means=true_means(env),
+        )
+        return statistics if _has_best_arms(bandit) else _without_simple_regret(statistics)
+    finally:
+        env.close()

@@ -1,0 +1,179 @@
+"""Work in processes of its own, so that one that dies takes nothing else with it.
+
+`supervise` runs a function in a fresh child process and waits for it; any executor whose workers
+can call it launches a study. Here that is a pool of threads, each with one child at a time. The
+children are forked from a server that has imported the heavy libraries once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing import forkserver, resource_tracker
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any
+
+PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
+
+# One thread in each process: small networks are slower with more, and runs go side by side.
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+_context = multiprocessing.get_context("forkserver")
+_children: set[BaseProcess] = set()
+_lock = threading.Lock()
+_stopping = threading.Event()
+
+
+class WorkFailedError(Exception):
+    """The function raised an exception, or its process died each time.
+
+    Attributes:
+        details: the traceback, or what is known.
+    """
+
+    def __init__(self, message: str, details: str) -> None:
+        super().__init__(message)
+        self.details = details
+
+
+class StoppedError(Exception):
+    """The work was called off."""
+
+
+def supervise(
+    function: Callable[..., Any],
+    *args: Any,
+    clean_up: Callable[[], object],
+    tries: int = 2,
+) -> Any:
+    """Call ``function`` in a child process; again if the process dies without an answer.
+
+    Args:
+        function: of a module that the child can import.
+        args: what to call it with.
+        clean_up: called here after each try, and in the child if this process dies before it.
+        tries: how often to begin.
+
+    Returns:
+        What the function returns.
+
+    Raises:
+        WorkFailedError: if it raised an exception, which is not tried again, or died each time.
+        StoppedError: if `stop_all` ended it.
+    """
+    for _ in range(tries):
+        receiver, sender = _context.Pipe(duplex=False)
+        child = _context.Process(target=_work, args=(sender, clean_up, function, args), daemon=True)
+        with _started(child):
+            sender.close()
+            try:
+                kind, answer = receiver.recv()
+            except EOFError:
+                kind, answer = "died", None
+            finally:
+                receiver.close()
+            child.join()
+            clean_up()
+        if _stopping.is_set():
+            raise StoppedError
+        if kind == "returned":
+            return answer
+        if kind == "raised":
+            raise WorkFailedError(*answer)
+    code = child.exitcode or 0
+    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    raise WorkFailedError(f"its process died {tries} times ({how})", f"{how}, {tries} times")
+
+
+@contextlib.contextmanager
+def _started(child: BaseProcess) -> Iterator[None]:
+    with _lock:
+        if _stopping.is_set():
+            raise StoppedError
+        child.start()
+        _children.add(child)
+    try:
+        yield
+    finally:
+        with _lock:
+            _children.discard(child)
+
+
+@contextlib.contextmanager
+def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
+    """As many supervisors as ``n_workers``; their children are ended when the block is left early.
+
+    Args:
+        n_workers: processes that work at once.
+    """
+    start_server()
+    _stopping.clear()
+    executor = ThreadPoolExecutor(n_workers)
+    try:
+        yield executor
+    except BaseException:
+        stop_all()
+        raise
+    finally:
+        executor.shutdown(cancel_futures=True)
+
+
+def start_server() -> None:
+    """Start the process that children are forked from, deaf to Ctrl-C while it imports.
+
+    It goes on by itself: who starts it early has it sooner.
+    """
+    for name in THREAD_VARIABLES:
+        os.environ.setdefault(name, "1")
+    _context.set_forkserver_preload(PRELOADED)
+    # It lets SIGINT through again after its own start, so that has to come first.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        forkserver.ensure_running()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def stop_all() -> None:
+    """End all children, and let none be started any more."""
+    with _lock:
+        _stopping.set()
+        for child in _children:
+            child.kill()
+
+
+def _work(
+    sender: Connection,
+    clean_up: Callable[[], object],
+    function: Callable[..., Any],
+    args: tuple[Any, ...],
+) -> None:
+    # Ctrl-C reaches the whole group of processes; the supervisor decides what it means.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, args=(clean_up,), daemon=True).start()
+    try:
+        answer = ("returned", function(*args))
+    except Exception as error:  # noqa: BLE001  # whatever it is, the supervisor is told
+        message = " ".join(str(error).split()) or type(error).__name__
+        answer = ("raised", (message, traceback.format_exc()))
+    with contextlib.suppress(BrokenPipeError):
+        sender.send(answer)
+    sender.close()
+
+
+def _end_with_parent(clean_up: Callable[[], object]) -> None:
+    """Leave nothing behind when the supervisor is gone."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    with contextlib.suppress(OSError):
+        clean_up()
+    os._exit(1)

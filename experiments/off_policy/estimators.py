@@ -1,0 +1,247 @@
+"""What a policy would have earned, estimated from pulls that another policy made.
+
+Each estimator returns a term for each logged pull. The mean of the terms is the estimate, and their
+spread over the square root of their number its standard error. Two policies on the same log are
+therefore compared by the differences of their terms, pull by pull, as `paired_difference` does.
+
+With a pull in context x of arm a, which the log chose with probability p and which gave r, a policy
+of probabilities pi(arm | x), and q(x, arm) a guess at the mean reward:
+
+    importance weight        w = pi(a | x) / p
+    inverse propensities     mean of w r
+    self-normalised          sum of w r / sum of w
+    direct method            mean of sum over arms of pi(arm | x) q(x, arm)
+    doubly robust            the direct method's terms, plus w (r - q(x, a))
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.off_policy.reward_models import CrossFit
+from verdicts import Estimate, paired_difference
+
+Floats = NDArray[np.float64]
+Arms = NDArray[np.int64]
+
+# By how many standard errors weights may miss their mean of 1 before the log is refused. Chance
+# does that only where next to none of what the policy does was logged.
+MOST_ERRORS = 5.0
+# By how much they may miss it besides: files round propensities.
+ROUNDED = 0.02
+_SUMS_TO_1 = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyTerms:
+    """The terms of each estimator, shapes (n,).
+
+    Attributes:
+        ips: inverse propensities.
+        snips: self-normalised.
+        direct: the direct method.
+        doubly_robust: doubly robust.
+        effective: how many pulls of the policy's own the log is worth.
+    """
+
+    ips: Floats
+    snips: Floats
+    direct: Floats
+    doubly_robust: Floats
+    effective: float
+
+
+def evaluate_policy(
+    policy: Floats, arms: Arms, rewards: Floats, propensities: Floats, model: CrossFit
+) -> PolicyTerms:
+    """Judge a policy by all four estimators.
+
+    Args:
+        policy: its probability of each arm before each pull, shape (n, n_arms).
+        arms: the arms pulled, shape (n,).
+        rewards: what they gave, shape (n,).
+        propensities: the probability with which each was chosen, shape (n,).
+        model: of the rewards; see `experiments.off_policy.reward_models.cross_fit`.
+
+    Raises:
+        ValueError: if the arrays are not such, or the log cannot tell what the policy is worth.
+    """
+    weights = importance_weights(policy, arms, propensities)
+    check_rewards(rewards, len(arms))
+    check_support(policy, arms, weights)
+    return PolicyTerms(
+        ips=ips(weights, rewards),
+        snips=snips(weights, rewards),
+        direct=direct_method(policy, model),
+        doubly_robust=doubly_robust(policy, weights, arms, rewards, model.predicted),
+        effective=effective_sample_size(weights),
+    )
+
+
+def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
+    """The mean of an estimator's terms with its t interval.
+
+    The interval holds where there are many terms and no few of them decide: look at the effective
+    sample size. What an estimator is biased by, it does not cover.
+    """
+    return paired_difference(terms, np.zeros_like(terms), confidence)
+
+
+def importance_weights(policy: Floats, arms: Arms, propensities: Floats) -> Floats:
+    """How much more often the policy makes each pull than the log did, shape (n,).
+
+    Args:
+        policy: shape (n, n_arms), rows summing to 1.
+        arms: shape (n,).
+        propensities: shape (n,), above 0.
+
+    Raises:
+        ValueError: if the shapes do not fit, or something is no probability.
+    """
+    n_pulls, n_arms = policy.shape
+    if arms.shape != (n_pulls,) or propensities.shape != (n_pulls,):
+        raise ValueError(
+            f"a policy of shape {policy.shape} needs {n_pulls} arms and propensities, "
+            f"not {arms.shape} and {propensities.shape}"
+        )
+    if n_pulls and not (arms.min() >= 0 and arms.max() < n_arms):
+        raise ValueError(f"arms must lie between 0 and {n_arms - 1}, as the policy's columns do")
+    _refuse(~((propensities > 0) & (propensities <= 1)), "propensity", propensities)
+    uneven = (policy < 0).any(axis=1) | ~(np.abs(policy.sum(axis=1) - 1) <= _SUMS_TO_1)
+    _refuse(uneven, "sum of the policy's probabilities", policy.sum(axis=1))
+    return np.asarray(policy[np.arange(n_pulls), arms] / propensities)
+
+
+def check_rewards(rewards: Floats, n_pulls: int) -> None:
+    """Refuse rewards that are not one finite number for each pull.
+
+    Raises:
+        ValueError: naming the first pull with another.
+    """
+    if rewards.shape != (n_pulls,):
+        raise ValueError(f"{n_pulls} pulls need as many rewards, not {rewards.shape}")
+    _refuse(~np.isfinite(rewards), "reward", rewards)
+
+
+def check_support(policy: Floats, arms: Arms, weights: Floats) -> None:
+    """Refuse a log that does not show what the policy would do.
+
+    Weights are expected to be 1 if the propensities are right and the log could choose every arm
+    that the policy chooses, wherever it does. How far their mean is from 1 is measured in standard
+    errors, for a mean of 1: too few large weights would make their own variance too small.
+
+    Args:
+        policy: shape (n, n_arms).
+        arms: shape (n,).
+        weights: from `importance_weights`, shape (n,).
+
+    Raises:
+        ValueError: naming the arm that was never logged, or what the weights are on average.
+    """
+    share = policy.mean(axis=0)
+    unlogged = np.setdiff1d(np.flatnonzero(share > 0), arms)
+    if len(unlogged):
+        arm = unlogged[0]
+        raise ValueError(
+            f"arm {arm} was never logged, and the policy chooses it for {share[arm]:.1%} of the "
+            "pulls: nothing is known of its rewards"
+        )
+    mean = weights.mean()
+    if mean == 0:
+        raise ValueError("the policy would have made none of the logged pulls")
+    variance = max(float((weights**2).mean() / mean) - 1, 0.0)
+    allowed = MOST_ERRORS * np.sqrt(variance / len(weights)) + ROUNDED
+    if mean < 1 - allowed:
+        raise ValueError(
+            f"the log holds too little of what the policy does: its weights are {mean:.3g} on "
+            "average, not 1, so it chooses arms in contexts in which they were hardly ever logged"
+        )
+    if mean > 1 + allowed:
+        raise ValueError(
+            f"the propensities are too small: the weights are {mean:.3g} on average, not 1; each "
+            "must be the probability with which the logged arm was chosen"
+        )
+
+
+def ips(weights: Floats, rewards: Floats) -> Floats:
+    """Inverse propensity scoring: w r, whose mean is unbiased where propensities are right.
+
+    Source: Horvitz and Thompson (1952), "A generalization of sampling without replacement from a
+    finite universe", JASA 47; for policies Strehl, Langford, Li and Kakade (2010), "Learning from
+    logged implicit exploration data", NeurIPS.
+    """
+    return weights * rewards
+
+
+def snips(weights: Floats, rewards: Floats) -> Floats:
+    """Self-normalised inverse propensities: a weighted mean of the rewards, and so within them.
+
+    Consistent, with a bias of order 1/n. The terms are the ratio's linear approximation (delta
+    method): s + w (r - s) / mean(w), s being the estimate.
+
+    Args:
+        weights: from `importance_weights`, shape (n,); not all 0, which `check_support` refuses.
+        rewards: shape (n,).
+
+    Source: Swaminathan and Joachims (2015), "The self-normalized estimator for counterfactual
+    learning", NeurIPS.
+    """
+    total = weights.sum()
+    estimate = weights @ rewards / total
+    return np.asarray(estimate + weights * (rewards - estimate) * (len(weights) / total))
+
+
+def direct_method(policy: Floats, model: CrossFit) -> Floats:
+    """The direct method: the rewards that a model predicts for what the policy does.
+
+    It needs no propensities, and is as biased as the model is; the interval covers none of that.
+    It does cover that the model was fitted to a sample: the terms contain what each reward adds
+    through the model, to first order (delta method). That has mean 0.
+
+    Source: Dudik, Langford and Li (2011), "Doubly robust policy evaluation and learning", ICML;
+    the variance as in Stefanski and Boos (2002), "The calculus of M-estimation", The American
+    Statistician 56.
+    """
+    added = model.reward_influence(policy)
+    return np.asarray((policy * model.predicted).sum(axis=1) + added - added.mean())
+
+
+def doubly_robust(
+    policy: Floats, weights: Floats, arms: Arms, rewards: Floats, predicted: Floats
+) -> Floats:
+    """The direct method, corrected by inverse propensities where the log shows the model to err.
+
+    Unbiased if the propensities are right, whatever the model, as long as no pull is predicted by a
+    model that has seen it; and the closer the model, the smaller the variance.
+
+    Args:
+        policy: shape (n, n_arms).
+        weights: from `importance_weights`, shape (n,).
+        arms: shape (n,).
+        rewards: shape (n,).
+        predicted: mean reward of each arm before each pull, shape (n, n_arms).
+
+    Source: Dudik, Langford and Li (2011); crossing folds as in Chernozhukov et al. (2018),
+    "Double/debiased machine learning", The Econometrics Journal 21.
+    """
+    errors = rewards - predicted[np.arange(len(arms)), arms]
+    return np.asarray((policy * predicted).sum(axis=1) + weights * errors)
+
+
+def effective_sample_size(weights: Floats) -> float:
+    """How many pulls of the policy's own would be worth as much: (sum of w)^2 / sum of w^2.
+
+    0 where every weight is. Source: Kish (1965), Survey Sampling, section 11.7.
+    """
+    squares = float(weights @ weights)
+    return float(weights.sum()) ** 2 / squares if squares else 0.0
+
+
+def _refuse(wrong: NDArray[np.bool_], name: str, values: Floats) -> None:
+    if wrong.any():
+        place = int(np.flatnonzero(wrong)[0])
+        wanted = {"reward": "finite", "propensity": "above 0 and at most 1"}.get(name, "1")
+        raise ValueError(f"{name} of pull {place + 1} is {values[place]:g}, it must be {wanted}")

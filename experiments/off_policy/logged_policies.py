@@ -1,0 +1,236 @@
+"""Trained agents judged on logged pulls: what ``compare.py --logged`` does before it prints."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from commands.train_request import check_algorithm
+from envs.bandits import LoggedData, read_log
+from experiments.off_policy.estimators import PolicyTerms, check_rewards, evaluate_policy
+from experiments.off_policy.reward_models import CrossFit, cross_fit
+from pipeline.errors import UserError, one_line
+from pipeline.evaluation.exact import policy_matrix
+from pipeline.model_loading import check_model_file, hand_written_algorithm, load_model, run_of
+
+Floats = NDArray[np.float64]
+
+# What changes an agent's observations, so that they are no longer the log's contexts.
+_OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
+_RUNS = Path("logs")
+
+
+@dataclass(frozen=True)
+class LoggedPolicy:
+    """A trained agent, to be judged on a log.
+
+    Attributes:
+        name: its path, as it was given.
+        agent: as it was loaded.
+        log: the log that it was trained on, or None if it was not, or if that is not known.
+    """
+
+    name: str
+    agent: BaseAlgorithm
+    log: Path | None
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One row of the comparison.
+
+    Attributes:
+        name: of the policy.
+        terms: of its estimates.
+        is_given: whether it is one of the policies asked about, and no alternative to them.
+    """
+
+    name: str
+    terms: PolicyTerms
+    is_given: bool = False
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Policies judged on one log.
+
+    Attributes:
+        data: the log.
+        rows: the policies asked about; then each arm shown to everybody, and the log's own policy.
+        notes: what has to be known to read the figures.
+    """
+
+    data: LoggedData
+    rows: tuple[Judged, ...]
+    notes: tuple[str, ...]
+
+
+def read_logged(path: str | Path) -> LoggedData:
+    """A log whose propensities are known.
+
+    Raises:
+        UserError: if it cannot be read or lacks them.
+    """
+    try:
+        data = read_log(path)
+    except ValueError as error:
+        raise UserError(one_line(error)) from error
+    if data.propensities is None:
+        raise UserError(
+            f"{path} has no column 'propensity': off-policy evaluation needs the probability with "
+            "which each arm was chosen, 1 divided by the number of arms where all were equally "
+            "likely"
+        )
+    return data
+
+
+def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
+    """Load an agent from its run folder or its zip.
+
+    Args:
+        path: either.
+        trust: load a zip of a library agent from outside ``logs``, which can run code.
+
+    Raises:
+        UserError: if there is no agent, or none that sees a context as the log has it.
+    """
+    zip_path = _final_model(path) if path.is_dir() else path
+    check_model_file(zip_path)
+    run = run_of(zip_path)
+    spec = {} if run is None else run.read_info().get("spec", {})
+    hand_written = hand_written_algorithm(zip_path)
+    algo = hand_written or spec.get("algo")
+    if algo is None:
+        raise UserError(f"{path} lies in no run folder: what agent it holds is not known")
+    if (
+        hand_written is None
+        and not trust
+        and not zip_path.resolve().is_relative_to(_RUNS.resolve())
+    ):
+        raise UserError(
+            f"{path} lies outside {_RUNS}, and loading a zip of a library agent can run code that "
+            "is hidden in it: add --trust if you know where it comes from"
+        )
+    settings = spec.get("hyperparams") or {}
+    changed = next((key for key in _OBSERVATION_SETTINGS if settings.get(key)), None)
+    if changed is not None:
+        raise UserError(f"{path} was trained with {changed}: it observes more than a log holds")
+    check_algorithm(algo)
+    agent = load_model(algo, zip_path, device="cpu")
+    if not isinstance(agent.action_space, spaces.Discrete):
+        raise UserError(f"{path} chooses no arms: its actions are {agent.action_space}")
+    log = (settings.get("env_kwargs") or {}).get("log")
+    return LoggedPolicy(str(path), agent, None if log is None else Path(log))
+
+
+def _final_model(folder: Path) -> Path:
+    run = run_of(folder / "any.zip")
+    if run is None:
+        raise UserError(f"{folder} is no run folder: it holds no whole run.json")
+    if not run.model_path.exists():
+        raise UserError(f"{folder} holds no {run.model_path.name}: its training may not have ended")
+    return run.model_path
+
+
+def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comparison:
+    """Judge policies, each arm shown to everybody, and the log's own policy.
+
+    Raises:
+        UserError: if a policy does not fit the log, or the log cannot tell what it is worth.
+    """
+    model = reward_model(data, max([data.n_arms, *(n_arms(p.agent) for p in policies)]))
+    notes = [note for policy in policies for note in _notes(data, policy)]
+    rows = [
+        Judged(policy.name, _judge(data, policy.name, probabilities(policy, data), model), True)
+        for policy in policies
+    ]
+    for arm in range(data.n_arms):
+        always = np.zeros(model.predicted.shape)
+        always[:, arm] = 1
+        try:
+            rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, model)))
+        except UserError as error:
+            notes.append(str(error))
+    told = data.rewards
+    as_logged = PolicyTerms(told, told, told, told, effective=float(len(data)))
+    if data.categories is not None:
+        numbered = ", ".join(f"{i} {name}" for i, name in enumerate(data.categories))
+        notes.append(f"{data.context_names[0]} was read as {numbered}")
+    return Comparison(data, (*rows, Judged("as logged", as_logged)), tuple(notes))
+
+
+def reward_model(data: LoggedData, n_arms: int) -> CrossFit:
+    """Means of the rewards where contexts are Discrete, else regressions.
+
+    Raises:
+        UserError: if there are too few pulls.
+    """
+    space = data.observation_space
+    discrete = isinstance(space, spaces.Discrete)
+    contexts = data.observations(space) if discrete else data.contexts
+    try:
+        check_rewards(data.rewards, len(data))
+        return cross_fit(contexts, data.arms, data.rewards, n_arms)
+    except ValueError as error:
+        raise UserError(f"{data.source}: {one_line(error)}") from error
+
+
+def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
+    """The probability of each arm before each logged pull, shape (n, arms of the agent).
+
+    Raises:
+        UserError: if the agent does not observe what the log has for context.
+    """
+    agent: Any = policy.agent
+    try:
+        observations = data.observations(agent.observation_space)
+    except ValueError as error:
+        raise UserError(f"{policy.name}: {one_line(error)}") from error
+    return policy_matrix(agent, observations)
+
+
+def n_arms(agent: BaseAlgorithm) -> int:
+    """The number of arms that an agent chooses from."""
+    assert isinstance(agent.action_space, spaces.Discrete)
+    return int(agent.action_space.n)
+
+
+def _judge(data: LoggedData, name: str, policy: Floats, model: CrossFit) -> PolicyTerms:
+    """Judge a policy that may know of fewer arms than there are."""
+    padded = np.zeros(model.predicted.shape)
+    padded[:, : policy.shape[1]] = policy
+    assert data.propensities is not None
+    try:
+        return evaluate_policy(padded, data.arms, data.rewards, data.propensities, model)
+    except ValueError as error:
+        raise UserError(f"{name} on {data.source}: {one_line(error)}") from error
+
+
+def _notes(data: LoggedData, policy: LoggedPolicy) -> list[str]:
+    """What is to be said of an agent that was trained on a log.
+
+    Raises:
+        UserError: if that log numbered contexts of text otherwise.
+    """
+    if policy.log is None or not policy.log.is_file():
+        return []
+    if policy.log.resolve() == Path(data.source).resolve():
+        return [f"{policy.name} was trained on this log: its figures flatter it; judge by another"]
+    trained = read_logged(policy.log)
+    if trained.categories != data.categories:
+        raise UserError(
+            f"{policy.name} was trained on {policy.log}, whose contexts are "
+            f"{_listed(trained)}; those of {data.source} are {_listed(data)}"
+        )
+    return []
+
+
+def _listed(data: LoggedData) -> str:
+    return "numbers" if data.categories is None else ", ".join(data.categories)

@@ -1,0 +1,83 @@
+"""One run of a study, in the process that does it."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import shutil
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.bandit_batches import do_batch
+from experiments.study_plan import PlannedRun
+from pipeline.environments import import_gym_packages
+from pipeline.run_folder import Run
+from pipeline.training import train
+
+
+def draft_path(root: Path, planned: PlannedRun) -> Path:
+    """Where a run of this process is written until it is whole."""
+    name = f"{planned.path.parent.name}@{planned.path.name}"
+    return root / ".drafts" / f"{os.getpid()}@{platform.node()}@{name}"
+
+
+def remove_draft(draft: Path) -> None:
+    """Remove what an unfinished run has left, even while it is being written."""
+    dead = draft.with_name(f"{draft.name}.dead")
+    with contextlib.suppress(FileNotFoundError):
+        draft.rename(dead)
+    shutil.rmtree(dead, ignore_errors=True)
+    for folder in (draft.parent, draft.parent.parent):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
+
+
+def remove_dead_drafts(root: Path) -> None:
+    """Remove what processes of this machine that are gone have left."""
+    for draft in list((root / ".drafts").glob(f"*@{platform.node()}@*")):
+        pid = draft.name.partition("@")[0]
+        if not (pid.isdigit() and _is_alive(int(pid))):
+            remove_draft(draft)
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder and those above it, also while another run removes those that are empty."""
+    for _ in range(1000):
+        with contextlib.suppress(FileNotFoundError):
+            path.mkdir(parents=True, exist_ok=True)
+            return
+    path.mkdir(parents=True)
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
+    """Train in ``draft``, and rename it into place; another's result that is there stays."""
+    import_gym_packages(planned.spec.gym_packages)
+    run = Run(draft, planned.run.env_name)
+    make_folder(run.params_path)
+    if planned.spec.tensorboard_log is not None:
+        shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)  # of an earlier try
+    if planned.is_batch:
+        do_batch(planned.spec, planned.n_runs, run, command)
+    else:
+        args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
+        train(planned.spec, Console(quiet=True), args, command, run)
+    if planned.path.exists() and not planned.is_finished:
+        shutil.rmtree(planned.path)  # of other settings, or cut off
+    planned.path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        draft.rename(planned.path)
+    except OSError:
+        if not planned.is_finished:
+            raise

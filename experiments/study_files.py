@@ -1,0 +1,211 @@
+"""Studies from YAML files: read strictly, mistakes named with file and line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from agents import ALGORITHMS
+from experiments.study_spec import (
+    AgentSpec,
+    EnvironmentSpec,
+    Metric,
+    QuickSpec,
+    StudySpec,
+    layered,
+)
+from pipeline.environments import check_env_id
+from pipeline.errors import UserError, shown, unknown
+from pipeline.settings.coercion import coerce
+from pipeline.settings.strict_yaml import key_lines, read_yaml
+
+BUDGETS = ("n_timesteps", "n_episodes")
+
+# Keys of a study, and what their values must be.
+_STUDY_VALUES: dict[str, Any] = {
+    "title": str,
+    "description": str,
+    "seeds": int,
+    "n_timesteps": int,
+    "n_episodes": int,
+    "tuned": bool,
+    "eval_freq": int,
+    "eval_episodes": int,
+    "metric": Metric,
+    "margin": float,
+    "threshold": float,
+    "episodes_table": int,
+}
+_STUDY_KEYS = (*_STUDY_VALUES, "agents", "environments", "settings", "sweep", "quick")
+_AGENT_KEYS = ("algo", "tuned", "summary", "sweep")
+_QUICK_VALUES: dict[str, Any] = {"seeds": int, "budget": float}
+_NOT_NEGATIVE = ("margin", "episodes_table")
+_AT_LEAST_ONE = ("seeds", "n_timesteps", "n_episodes", "eval_freq", "eval_episodes")
+
+Keys = tuple[str | int, ...]
+
+
+@dataclass(frozen=True)
+class _Document:
+    """A study file and where things stand in it."""
+
+    path: Path
+    lines: Mapping[Keys, int]
+
+    def at(self, *keys: str | int) -> str:
+        """Where a value stands, as ``file:line``."""
+        return f"{self.path}:{self.lines.get(keys, 1)}"
+
+    def mapping(self, value: Any, *keys: str | int) -> dict[str, Any]:
+        """The value, if it maps names to values or, inside the document, is left empty."""
+        if value is None and keys:
+            return {}
+        if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
+            what = str(keys[-1]) if keys else "a study"
+            raise UserError(f"{self.at(*keys)}: {what} must map names to values")
+        return value
+
+    def check_names(self, names: Iterable[str], known: Iterable[str], *keys: str | int) -> None:
+        """Refuse a name that is not known."""
+        known = list(known)
+        for name in names:
+            if name not in known:
+                raise unknown(f"{self.at(*keys, name)}: unknown key", name, known)
+
+    def values(
+        self, data: Mapping[str, Any], kinds: Mapping[str, Any], *keys: str | int
+    ) -> dict[str, Any]:
+        """The plain values among ``data``, each as its kind asks."""
+        result = {}
+        for key, kind in kinds.items():
+            if data.get(key) is None:
+                continue
+            place = f"{self.at(*keys, key)}: {key}"
+            result[key] = coerce(data[key], kind, place)
+            if key in _AT_LEAST_ONE and result[key] < 1:
+                raise UserError(f"{place} must be at least 1, not {result[key]}")
+            if key in _NOT_NEGATIVE and result[key] < 0:
+                raise UserError(f"{place} must be at least 0, not {result[key]}")
+            if key == "budget" and not 0 < result[key] <= 1:
+                raise UserError(f"{place} must be a share above 0 and up to 1, not {result[key]}")
+        return result
+
+    def check_budget(self, data: Mapping[str, Any], *keys: str | int) -> None:
+        """Refuse two budgets in one place."""
+        if all(data.get(key) is not None for key in BUDGETS):
+            place = self.at(*keys, BUDGETS[1])
+            raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
+
+
+def read_study(path: Path) -> StudySpec:
+    """Read a study file, whose name is the study's.
+
+    Raises:
+        UserError: if it cannot be read or says something that is not understood.
+    """
+    data = read_yaml(path)
+    document = _Document(path, key_lines(path))
+    data = document.mapping(data)
+    document.check_names(data, _STUDY_KEYS)
+    values = {"title": path.stem, **document.values(data, _STUDY_VALUES)}
+    document.check_budget(data)
+    shared = document.mapping(data.get("settings"), "settings")
+    document.check_budget(shared, "settings")
+    budget = {key: values.pop(key) for key in BUDGETS if key in values}
+    tuned = values.pop("tuned", True)
+    quick = document.mapping(data.get("quick"), "quick")
+    document.check_names(quick, _QUICK_VALUES, "quick")
+    return StudySpec(
+        name=path.stem,
+        agents=_agents(document, data, tuned),
+        environments=_environments(document, data, layered(shared, budget)),
+        n_seeds=values.pop("seeds", StudySpec.n_seeds),
+        quick=QuickSpec(**document.values(quick, _QUICK_VALUES, "quick")),
+        source=path,
+        **values,
+    )
+
+
+def _entries(
+    document: _Document, data: Mapping[str, Any], key: str
+) -> dict[str, tuple[Keys, dict[str, Any]]]:
+    """What stands under ``key`` by its labels, written as a list of names or as a mapping."""
+    value = data.get(key)
+    if isinstance(value, list) and all(isinstance(item, str) for item in value):
+        entries: dict[str, tuple[Keys, dict[str, Any]]] = {
+            item: ((key, index), {}) for index, item in enumerate(value)
+        }
+        if len(entries) < len(value):
+            raise UserError(f"{document.at(key)}: {key} names one of them twice")
+    elif isinstance(value, list):
+        raise UserError(f"{document.at(key)}: {key} must list names, or map them to settings")
+    else:
+        entries = {
+            label: ((key, label), document.mapping(entry, key, label))
+            for label, entry in document.mapping(value, key).items()
+        }
+    if not entries:
+        raise UserError(f"{document.at(key)}: {key} must list at least one name")
+    for keys, entry in entries.values():
+        document.check_budget(entry, *keys)
+    return entries
+
+
+def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[AgentSpec, ...]:
+    shared_sweep = _sweep(document, data)
+    agents: list[AgentSpec] = []
+    for label, (keys, entry) in _entries(document, data, "agents").items():
+        algo = entry.get("algo", label)
+        if not (isinstance(algo, str) and algo in ALGORITHMS):
+            place = document.at(*keys, "algo") if "algo" in entry else document.at(*keys)
+            raise unknown(f"{place}: unknown agent", str(algo), ALGORITHMS)
+        values = document.values(entry, {"tuned": bool, "summary": str}, *keys)
+        settings = {key: entry[key] for key in entry if key not in _AGENT_KEYS}
+        values = {"tuned": tuned, "where": document.at(*keys), **values}
+        agent = AgentSpec(label, algo, settings, **values)
+        agents += swept(agent, {**shared_sweep, **_sweep(document, entry, *keys)})
+    return tuple(agents)
+
+
+def _sweep(document: _Document, data: Mapping[str, Any], *keys: str | int) -> dict[str, list[Any]]:
+    sweep = document.mapping(data.get("sweep"), *keys, "sweep")
+    for name, values in sweep.items():
+        if not (isinstance(values, list) and values):
+            place = document.at(*keys, "sweep", name)
+            raise UserError(f"{place}: {name} must be a list of values, not {shown(values)}")
+    return sweep
+
+
+def swept(agent: AgentSpec, sweep: Mapping[str, Sequence[Any]]) -> list[AgentSpec]:
+    """The agent once for each combination of the values that are swept."""
+    agents = []
+    for values in product(*sweep.values()):
+        chosen = dict(zip(sweep, values, strict=True))
+        suffix = ", ".join(f"{name}={value}" for name, value in chosen.items())
+        label = f"{agent.label} {suffix}" if suffix else agent.label
+        settings = layered(agent.settings, chosen)
+        agents.append(
+            replace(agent, label=label, settings=settings, group=agent.label, swept=chosen)
+        )
+    return agents
+
+
+def _environments(
+    document: _Document, data: Mapping[str, Any], shared: Mapping[str, Any]
+) -> tuple[EnvironmentSpec, ...]:
+    environments = []
+    for label, (keys, entry) in _entries(document, data, "environments").items():
+        env_id = entry.get("id", label)
+        if not isinstance(env_id, str):
+            raise UserError(f"{document.at(*keys, 'id')}: id must be a text, not {shown(env_id)}")
+        try:
+            check_env_id(env_id)
+        except UserError as error:
+            place = document.at(*keys, "id") if "id" in entry else document.at(*keys)
+            raise UserError(f"{place}: {error}") from error
+        own = {key: value for key, value in entry.items() if key != "id"}
+        environments.append(EnvironmentSpec(label, env_id, layered(shared, own)))
+    return tuple(environments)

@@ -1,0 +1,235 @@
+"""From a study to the runs that it takes: one for each agent, environment and seed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from agents import ALGORITHMS
+from commands.train_request import check_algorithm, check_fit
+from envs.known_models import time_limit
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
+from pipeline.environments import check_env_id, make_single_env
+from pipeline.errors import UserError
+from pipeline.run_folder import FINISHED, Run, environment_name
+from pipeline.settings import hyperparams
+from pipeline.train_spec import TrainSpec
+
+# What a run of the same settings may differ in: where it is written, and what is shown meanwhile.
+_NO_PART_OF_IDENTITY = (
+    "log_folder",
+    "tensorboard_log",
+    "save_every_n_episodes",
+    "verbose",
+    "progress",
+    "log_interval",
+    "pictures",
+)
+
+# What a batch takes heed of, beside the agent's own arguments.
+_UNDERSTOOD = ("n_timesteps", "env_kwargs", "algorithm")
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a study.
+
+    Attributes:
+        agent: label of the agent.
+        environment: label of the environment.
+        seed: its seed.
+        spec: what to train.
+        path: its folder, there once it has finished.
+        is_batch: whether it stands for all seeds of a bandit agent, of which ``seed`` is the first.
+        n_runs: how many runs it stands for.
+    """
+
+    agent: str
+    environment: str
+    seed: int
+    spec: TrainSpec
+    path: Path
+    is_batch: bool = False
+    n_runs: int = 1
+
+    @property
+    def run(self) -> Run:
+        """The run folder."""
+        return Run(self.path, environment_name(self.spec.env_id))
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the folder holds this very run, to its end."""
+        info = self.run.read_info()
+        recorded = info.get("spec", {})
+        wanted = self.spec.save_every_n_episodes
+        return (
+            info.get("state") == FINISHED
+            and info.get("n_runs", 1) == self.n_runs
+            and _identity(recorded) == _identity(self.spec.as_data())
+            and (wanted < 1 or self.is_batch or recorded.get("save_every_n_episodes") == wanted)
+        )
+
+
+def _identity(spec: Mapping[str, Any]) -> Any:
+    kept = {key: value for key, value in spec.items() if key not in _NO_PART_OF_IDENTITY}
+    return json.loads(json.dumps(kept))
+
+
+def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
+    """All runs of a study, those of one seed together, so that agents can be compared early.
+
+    Args:
+        study: the study.
+        root: its folder.
+
+    Raises:
+        UserError: if an agent cannot be trained so, or does not fit an environment.
+    """
+    for what, labels in (
+        ("agents", [agent.label for agent in study.agents]),
+        ("environments", [environment.label for environment in study.environments]),
+    ):
+        _check_folders(what, labels)
+    specs = {}
+    for environment in study.environments:
+        check_env_id(environment.env_id)
+        for agent in study.agents:
+            with _told_where(agent):
+                spec = _train_spec(study, agent, environment)
+                check_fit(spec)
+            specs[agent.label, environment.label] = spec
+    batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
+    return [
+        _planned_run(study, root, agent, environment, seed, spec, (agent, environment) in batches)
+        for seed in range(study.n_seeds)
+        for (agent, environment), spec in specs.items()
+        if seed == 0 or (agent, environment) not in batches
+    ]
+
+
+def _planned_run(
+    study: StudySpec,
+    root: Path,
+    agent: str,
+    environment: str,
+    seed: int,
+    spec: TrainSpec,
+    is_batch: bool,
+) -> PlannedRun:
+    # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
+    place = Path(file_name(agent), f"{file_name(environment)}_{seed + 1}")
+    spec = replace(
+        spec,
+        seed=seed,
+        tensorboard_log=root / "tensorboard" / place if study.tensorboard else None,
+        save_every_n_episodes=study.render_every if seed == 0 else -1,
+    )
+    path, n_runs = root / "runs" / place, study.n_seeds if is_batch else 1
+    return PlannedRun(agent, environment, seed, spec, path, is_batch, n_runs)
+
+
+def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
+    """Make sure that the agents can be made with their settings, which takes the libraries.
+
+    Raises:
+        UserError: if one cannot.
+    """
+    from pipeline.preparation import algorithm_kwargs
+    from pipeline.settings import components
+
+    agents = {agent.label: agent for agent in study.agents}
+    for run in planned:
+        if run.seed == 0:
+            with _told_where(agents[run.agent]):
+                algorithm_kwargs(run.spec)
+                callbacks = run.spec.hyperparams.callback
+                components.callbacks(callbacks, run.spec.gym_packages, run.path)
+
+
+@contextmanager
+def _told_where(agent: AgentSpec) -> Iterator[None]:
+    """Say in mistakes where the study asks for the agent."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{agent.where}: {error}" if agent.where else str(error)) from error
+
+
+def _check_folders(what: str, labels: Sequence[str]) -> None:
+    """Refuse labels that are the same, or would have the same folder."""
+    places: dict[str, int] = {}
+    for index, label in enumerate(labels):
+        # Some file systems do not tell upper from lower case.
+        first = places.setdefault(file_name(label).lower(), index)
+        if first != index:
+            raise UserError(
+                f"{what}: {labels[first]!r} and {label!r} would share the folder "
+                f"{file_name(label)}: give them labels that differ in letters or digits"
+            )
+
+
+def _is_batch(spec: TrainSpec) -> bool:
+    """Whether the runs of a spec go as one batch: bandit agents as they are, for one episode."""
+    entry, special = ALGORITHMS[spec.algo], spec.hyperparams
+    untouched = hyperparams.Hyperparams()
+    if not (entry.for_bandits and entry.package is None) or special.n_timesteps is None:
+        return False
+    env = make_single_env(spec)
+    episode = time_limit(env) or 0
+    env.close()
+    if special.n_timesteps > episode:
+        return False
+    return all(
+        getattr(special, name) == getattr(untouched, name)
+        for name in vars(untouched)
+        if name not in _UNDERSTOOD
+    )
+
+
+def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
+    check_algorithm(agent.algo)
+    raw = _raw_hyperparams(agent, environment)
+    place = f"{agent.label} on {environment.label}"
+    if study.is_quick:
+        raw = _shortened(raw, study.quick.budget)
+    spec = TrainSpec(
+        algo=agent.algo,
+        env_id=environment.env_id,
+        hyperparams=hyperparams.split(raw, place),
+        saved_hyperparams=raw,
+        seed=0,
+        eval_freq=study.eval_freq,
+        eval_episodes=study.eval_episodes,
+        gym_packages=study.gym_packages,
+        verbose=0,
+        pictures=False,
+    )
+    if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
+        raise UserError(f"{place}: how long to train? give n_timesteps or n_episodes")
+    return spec
+
+
+def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str, Any]:
+    """The agent's file, the environment's settings over it, and the agent's own over those."""
+    raw: dict[str, Any] = {}
+    if agent.tuned:
+        try:
+            raw = hyperparams.read_hyperparams(agent.algo, environment.env_id)
+        except hyperparams.NoEntryError:
+            if not (agent.settings or environment.settings):
+                raise
+    for settings in (environment.settings, agent.settings):
+        raw = layered(raw, settings)
+    return raw
+
+
+def _shortened(raw: Mapping[str, Any], share: float) -> dict[str, Any]:
+    return {
+        key: max(round(value * share), 1) if key in ("n_timesteps", "n_episodes") else value
+        for key, value in raw.items()
+    }

@@ -1,0 +1,1 @@
+"""What a policy is worth: sampled, exact, and cell by cell."""

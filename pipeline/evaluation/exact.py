@@ -1,0 +1,139 @@
+"""Exact evaluation: what an agent's policy is worth, computed instead of sampled.
+
+Where the transition model of the environment is known, the policy is asked for every state at once,
+and its return under the time limit follows by arithmetic, without evaluation noise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.planning import PlanningAgent
+from agents.reference import RandomAgent
+from agents.tabular.base import TabularAlgorithm
+from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
+from envs.layout import GridLayout, grid_layout
+from mdp import (
+    TransitionModel,
+    best_blind_return,
+    finite_horizon_optimum,
+    optimal_choices,
+    policy_return,
+)
+from pipeline.environments import make_single_env
+from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.train_spec import TrainSpec
+
+# Beyond this, episodes are sampled: exact evaluation would take longer than training.
+MAX_STATES = 20_000
+
+
+@dataclass(frozen=True)
+class ExactEvaluator:
+    """Evaluates agents on an environment whose model is known.
+
+    Attributes:
+        model: the dynamics of the environment that agents are evaluated on.
+        observations: what an agent observes in each state, states along the first axis.
+        horizon: the time limit.
+        success: the outcomes that count as success, shape (S, A, K), or None.
+        yardstick: the best possible and the best blind return.
+        layout: where the states lie on a map, for grid worlds.
+    """
+
+    model: TransitionModel
+    observations: NDArray[Any]
+    horizon: int
+    success: NDArray[np.bool_] | None
+    yardstick: Yardstick
+    layout: GridLayout | None = None
+
+    def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
+        """The exact worth of the agent's policy as it is."""
+        policy = self.policy(agent, deterministic)
+        result = policy_return(self.model, policy, self.horizon, success=self.success)
+        rate = result.success_rate
+        return Evaluation(
+            returns=np.array([result.expected_return]),
+            lengths=np.array([result.expected_length]),
+            successes=None if rate is None else np.array([rate]),
+            exact_std=float(np.sqrt(result.return_variance)),
+            yardstick=self.yardstick,
+        )
+
+    @cached_property
+    def optimum(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """What each state is worth at best, shape (S,), and its optimal actions, shape (S, A)."""
+        return optimal_choices(self.model, self.horizon)
+
+    def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
+        """The agent's policy: of shape (S, A), or (horizon, S) where it depends on the time."""
+        if isinstance(agent, PlanningAgent):
+            steps = np.arange(self.horizon)[:, None]
+            return agent.policy.actions_after(self.observations[None], steps)
+        return policy_matrix(agent, self.observations, deterministic)
+
+
+def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
+    """The exact evaluator of a run, or None where episodes have to be sampled."""
+    special = spec.hyperparams
+    if special.normalize is not None or special.frame_stack or special.vec_env_wrapper:
+        return None
+    env = make_single_env(spec)
+    try:
+        model, observations = transition_model(env), observations_of_states(env)
+        horizon = time_limit(env)
+        if model is None or observations is None or horizon is None:
+            return None
+        if model.n_states > MAX_STATES:
+            return None
+        success, layout = success_outcomes(env), grid_layout(env)
+    finally:
+        env.close()
+    yardstick = Yardstick(
+        optimum=float(finite_horizon_optimum(model, horizon).start_value),
+        blind=float(best_blind_return(model, horizon)),
+    )
+    return ExactEvaluator(model, observations, horizon, success, yardstick, layout)
+
+
+def policy_matrix(
+    agent: BaseAlgorithm, observations: NDArray[Any], deterministic: bool = True
+) -> NDArray[np.float64]:
+    """The agent's policy as probabilities of shape (S, A).
+
+    Args:
+        agent: any agent with discrete actions whose policy depends on the observation alone.
+        observations: what it observes in each state, states along the first axis.
+        deterministic: its best actions rather than what it samples.
+
+    Raises:
+        TypeError: if the probabilities that the agent samples from are not known.
+    """
+    n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
+    if isinstance(agent, RandomAgent):
+        return np.full((n_states, n_actions), 1 / n_actions)
+    if deterministic:
+        actions, _ = agent.predict(observations, deterministic=True)
+        return np.eye(n_actions)[np.asarray(actions, dtype=np.int64)]
+    if isinstance(agent, TabularAlgorithm):
+        return np.asarray(agent.action_probabilities()[observations])
+    if isinstance(agent, PPO | A2C):
+        with th.no_grad():
+            tensor, _ = agent.policy.obs_to_tensor(observations)
+            distribution: Any = agent.policy.get_distribution(tensor).distribution
+        return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
+    if hasattr(agent, "exploration_rate"):
+        # DQN and its kin, QR-DQN too, which may not be installed and is no subclass of DQN.
+        epsilon = float(agent.exploration_rate)
+        greedy = policy_matrix(agent, observations)
+        return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
+    raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")

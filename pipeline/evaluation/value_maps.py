@@ -1,0 +1,164 @@
+"""Where on the map an agent acts well: exact values and actions in every state, and the best ones.
+
+A value means the same for tables and networks: the expected return, with the whole time limit
+ahead, of the agent's deterministic policy from that state on. What the agent itself believes the
+state to be worth does not enter.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from envs.layout import GridLayout
+from mdp import state_values
+from mdp.graph import reachable_states
+from mdp.policies import actions_used
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.files import replacing
+
+# Beyond this, cells are too small to see and maps too large to keep.
+MAX_STATES = 2500
+# More than a slider can tell apart.
+MAX_MAPS = 400
+SECONDS_BETWEEN_WRITES = 1.0
+
+Floats = NDArray[np.float64]
+Actions = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class ValueMap:
+    """An agent's policy in every state of a grid world, beside the optimal ones.
+
+    Attributes:
+        layout: where the states lie on the map.
+        matters: the states in which the agent may have to act, bool of shape (S,); what the other
+            attributes say of the rest means nothing.
+        initial: probabilities of the starting states, shape (S,).
+        values: the expected return of the agent from each state on, shape (S,).
+        actions: what the agent does there at the first step, shape (S,).
+        visited: the states that it comes to from the start, bool of shape (S,).
+        optimal_values: the highest expected return from each state on, shape (S,).
+        optimal_actions: the actions that may begin it, bool of shape (S, A).
+        optimal_visited: the states that optimal actions lead to, bool of shape (S,).
+    """
+
+    layout: GridLayout
+    matters: Mask
+    initial: Floats
+    values: Floats
+    actions: Actions
+    visited: Mask
+    optimal_values: Floats
+    optimal_actions: Mask
+    optimal_visited: Mask
+
+    @property
+    def differs(self) -> Mask:
+        """The states where the agent's action is not among the optimal ones, bool (S,)."""
+        chosen = self.optimal_actions[np.arange(len(self.actions)), self.actions]
+        return self.matters & ~chosen
+
+
+def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | None:
+    """The map of an agent as it is.
+
+    Returns:
+        The map, or None where there is none: on what is no grid world or has more than 2500
+        states, and of agents that have no one action in each state.
+    """
+    policy = _deterministic_policy(evaluator, agent)
+    if policy is None or evaluator.layout is None:
+        return None
+    model = evaluator.model
+    optimal_values, optimal_actions = evaluator.optimum
+    return ValueMap(
+        layout=evaluator.layout,
+        matters=model.reachable,
+        initial=model.initial,
+        values=state_values(model, policy, evaluator.horizon),
+        actions=policy[0],
+        visited=reachable_states(model, actions_used(model, policy)),
+        optimal_values=optimal_values,
+        optimal_actions=optimal_actions,
+        optimal_visited=reachable_states(model, optimal_actions),
+    )
+
+
+def _deterministic_policy(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Actions | None:
+    """What the agent does at each step in each state, shape (1 or horizon, S)."""
+    if evaluator.layout is None or evaluator.model.n_states > MAX_STATES:
+        return None
+    policy = evaluator.policy(agent, deterministic=True)
+    if np.issubdtype(policy.dtype, np.integer):
+        return policy.astype(np.int64)
+    return policy.argmax(axis=1)[None] if (policy.max(axis=1) == 1).all() else None
+
+
+class ValueMapRecorder:
+    """Keeps the maps of an agent over its training, in a file that is never half-written.
+
+    The file holds `timesteps` (T,), `values` (T, S), `actions` (T, S), `optimal_values` (S,) and
+    `optimal_actions` (S, A), as in `ValueMap`. Of very many maps every second, fourth, ... is kept.
+
+    Args:
+        path: the file; it is written once there is a map.
+        evaluator: of the environment that the agent is judged on.
+    """
+
+    def __init__(self, path: Path, evaluator: ExactEvaluator) -> None:
+        self.path = path
+        self.evaluator = evaluator
+        self._maps: list[tuple[int, Floats, Actions]] = []
+        self._calls = 0
+        self._stride = 1
+        self._last_write = time.monotonic()
+
+    def record(self, agent: BaseAlgorithm, timesteps: int) -> None:
+        """Keep the map of the agent as it is after so many steps."""
+        if len(self._maps) >= MAX_MAPS:
+            self._maps = self._maps[1::2]
+            self._stride *= 2
+        self._calls += 1
+        if self._calls % self._stride:
+            return
+        self._append(agent, timesteps)
+        # Forcing a file onto the disk takes longer than an evaluation.
+        if time.monotonic() - self._last_write > SECONDS_BETWEEN_WRITES:
+            self._write()
+
+    def finish(self, agent: BaseAlgorithm, timesteps: int) -> None:
+        """Keep the map of the agent as it is at the end, and write what is not written yet."""
+        if not self._maps or self._maps[-1][0] != timesteps:
+            self._append(agent, timesteps)
+        self._write()
+
+    def _append(self, agent: BaseAlgorithm, timesteps: int) -> None:
+        policy = _deterministic_policy(self.evaluator, agent)
+        if policy is not None:
+            values = state_values(self.evaluator.model, policy, self.evaluator.horizon)
+            self._maps.append((timesteps, values, policy[0]))
+
+    def _write(self) -> None:
+        if not self._maps:
+            return
+        timesteps, values, actions = zip(*self._maps, strict=True)
+        optimal_values, optimal_actions = self.evaluator.optimum
+        arrays: dict[str, Any] = {
+            "timesteps": timesteps,
+            "values": values,
+            "actions": np.array(actions, np.min_scalar_type(optimal_actions.shape[1] - 1)),
+            "optimal_values": optimal_values,
+            "optimal_actions": optimal_actions,
+        }
+        with replacing(self.path) as draft, draft.open("wb") as file:
+            np.savez(file, **arrays)
+        self._last_write = time.monotonic()

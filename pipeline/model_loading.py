@@ -1,0 +1,85 @@
+"""From a run folder, or a path, to an agent."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agents import ALGORITHMS, load_algorithm
+from pipeline.errors import UserError, one_line
+from pipeline.run_folder import Run
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
+
+
+def check_model_file(path: Path) -> None:
+    """Make sure that ``path`` is a whole zip of an agent, without reading any agent from it.
+
+    Raises:
+        UserError: if it is missing, unreadable, damaged, or something else.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+            names = archive.namelist()
+    except FileNotFoundError:
+        raise UserError(f"no such model file: {path}") from None
+    except (OSError, zipfile.BadZipFile) as error:
+        raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
+    if damaged is not None:
+        raise UserError(f"{path} is damaged: its part {damaged} does not match its checksum")
+    if "data" not in names or not any(name.endswith(".pth") for name in names):
+        raise UserError(f"{path} is no whole zip of an agent: it lacks parts that one has")
+
+
+def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) -> BaseAlgorithm:
+    """Load an agent from its zip.
+
+    A zip of one of the library's agents is unpickled, which can run code: load those that you
+    trust.
+
+    Args:
+        algo: name of the agent.
+        path: the zip.
+        env: environment to go on with, or None.
+        kwargs: attributes to change.
+
+    Raises:
+        UserError: if the file is not a zip of such an agent, or does not fit ``env``.
+    """
+    check_model_file(path)
+    algorithm = load_algorithm(algo)
+    try:
+        return algorithm.load(path, env=env, **kwargs)
+    except UserError:
+        raise
+    except Exception as error:  # a file of another agent can fail anywhere in the library
+        raise UserError(f"{path} cannot be loaded as a {algo} agent: {one_line(error)}") from error
+
+
+def run_of(path: Path) -> Run | None:
+    """The run folder that a model file lies in, or None if it lies elsewhere."""
+    folder = path.resolve().parent
+    try:
+        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
+        env_name = str(info["env_name"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return Run(folder, env_name)
+
+
+def hand_written_algorithm(path: Path) -> str | None:
+    """The name of the hand-written agent that a zip says it holds, or None for the library's.
+
+    Reads plain JSON and nothing else.
+    """
+    with zipfile.ZipFile(path) as archive:
+        class_name = json.loads(archive.read("data")).get("algorithm")
+    for name, entry in ALGORITHMS.items():
+        if isinstance(class_name, str) and entry.entry_point.endswith(f":{class_name}"):
+            return name
+    return None

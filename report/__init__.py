@@ -1,0 +1,1 @@
+"""What a study has shown: sentences, tables, figures, films, and a page."""

@@ -1,0 +1,132 @@
+"""``compare.py --logged``: policies on a log as a table, and what it says in words."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from commands.study_output import WIDTH_WITHOUT_TERMINAL
+from experiments.off_policy.estimators import mean_reward
+from experiments.off_policy.logged_policies import (
+    Comparison,
+    Judged,
+    compare_policies,
+    read_logged,
+    read_policy,
+)
+from pipeline.errors import UserError
+from verdicts import Estimate, paired_difference
+
+# Where an estimate rests on fewer pulls, its interval is hardly one.
+FEW_PULLS = 100
+SHORT, MOST_DECIMALS = 3, 6
+
+
+def compare_on_log(args: argparse.Namespace) -> int:
+    """Judge the policies of ``--policy`` on the log of ``--logged``; the exit code.
+
+    Raises:
+        UserError: if one of them cannot be read, or they do not go together.
+    """
+    if not (args.logged and args.policy):
+        raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
+    if args.study or args.env or args.algos:
+        raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
+    data = read_logged(args.logged)
+    policies = [read_policy(Path(path), args.trust) for path in args.policy]
+    names = [policy.name for policy in policies]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UserError(f"--policy names {twice} twice")
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=WIDTH_WITHOUT_TERMINAL)
+    print_comparison(console, compare_policies(data, policies))
+    return 0
+
+
+def print_comparison(console: Console, comparison: Comparison) -> None:
+    """Print the table, what it says in sentences, and the notes."""
+    console.print(_table(comparison))
+    for sentence in [*sentences(comparison), *comparison.notes]:
+        console.print(f"  {sentence}", markup=False)
+
+
+def _table(comparison: Comparison) -> Table:
+    data = comparison.data
+    table = Table(
+        title=f"{data.source}: {len(data):,} pulls, {data.n_arms} arms",
+        caption="mean reward a pull, ± half the 95 % interval; effective: pulls of its own that "
+        "the log is worth",
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("policy", overflow="fold", min_width=12)
+    for heading in ("IPS", "self-normalised", "direct", "doubly robust", "effective"):
+        table.add_column(heading, justify="right")
+    for row in comparison.rows:
+        terms = row.terms
+        columns = (terms.ips, terms.snips, terms.direct, terms.doubly_robust)
+        cells = [shown(mean_reward(column)) for column in columns]
+        table.add_row(row.name, *cells, f"{terms.effective:,.0f}")
+    return table
+
+
+def sentences(comparison: Comparison) -> list[str]:
+    """Doubly robust: each policy asked about against the best alternative, and among themselves."""
+    given = [row for row in comparison.rows if row.is_given]
+    alternative = max((row for row in comparison.rows if not row.is_given), key=_value)
+    leader = max(given, key=_value)
+    pairs = [(row, alternative) for row in given]
+    pairs += [(leader, row) for row in given if row is not leader]
+    result = [_difference(*pair) for pair in pairs]
+    result += [
+        f"{row.name} rests on {row.terms.effective:.0f} effective pulls: too few to rely on its "
+        "intervals"
+        for row in given
+        if row.terms.effective < FEW_PULLS
+    ]
+    return result
+
+
+def _difference(first: Judged, second: Judged) -> str:
+    difference = paired_difference(first.terms.doubly_robust, second.terms.doubly_robust)
+    if difference.low == difference.high == 0:
+        return f"{first.name} and {second.name} do the same on this log"
+    decimals = _decimals(difference)
+    point, low, high = (
+        f"{value:+.{decimals}f}" for value in (difference.point, difference.low, difference.high)
+    )
+    return (
+        f"{first.name} against {second.name}: {point} [{low}, {high}] a pull, {verdict(difference)}"
+    )
+
+
+def verdict(difference: Estimate) -> str:
+    """What the interval of a difference says."""
+    if difference.low > 0:
+        return "better"
+    return "worse" if difference.high < 0 else "undecided"
+
+
+def shown(estimate: Estimate) -> str:
+    """A figure and half its interval, which is symmetric."""
+    decimals = _decimals(estimate)
+    half = (estimate.high - estimate.low) / 2
+    return f"{estimate.point:.{decimals}f} ± {half:.{decimals}f}"
+
+
+def _decimals(estimate: Estimate) -> int:
+    """As many as give half the interval two significant digits."""
+    half = (estimate.high - estimate.low) / 2
+    if not half > 0:
+        return SHORT
+    return min(max(1 - math.floor(math.log10(half)), 0), MOST_DECIMALS)
+
+
+def _value(row: Judged) -> float:
+    return float(row.terms.doubly_robust.mean())

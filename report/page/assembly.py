@@ -1,0 +1,113 @@
+"""The page: which sections it has, in which order, and how they become one file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from experiments.analysis import StudyAnalysis
+from pipeline.files import write_text
+from report.page import (
+    bandit_section,
+    comparison_section,
+    curve_section,
+    film_section,
+    overall_section,
+    policy_section,
+    ranking_section,
+    settings_section,
+    verdict_section,
+)
+from report.page.markup import inline_script, plain, script_hash, template_file, templates
+from report.page.palette import agent_marks
+from report.page.sections import Report, Section
+
+# A new kind of section is a module with such a function, named here.
+SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
+    verdict_section.section,
+    ranking_section.section,
+    curve_section.section,
+    bandit_section.section,
+    comparison_section.section,
+    overall_section.section,
+    policy_section.section,
+    film_section.section,
+    settings_section.section,
+)
+
+
+def write_report(analysis: StudyAnalysis, path: Path, command: str) -> None:
+    """Write the page of a study, one file that needs nothing else and no network.
+
+    Args:
+        analysis: the study.
+        path: the file, which is replaced.
+        command: the command that reproduces the study.
+    """
+    report = Report(analysis, command)
+    sections = [section for make in SECTIONS if (section := make(report)) is not None]
+    write_text(path, render(report, sections))
+
+
+def render(report: Report, sections: list[Section]) -> str:
+    """The page as HTML."""
+    from plotly.offline import get_plotlyjs
+
+    environment = templates()
+    study = report.analysis.study
+    marks = agent_marks(study)
+    bodies = {
+        section.name: Markup(  # noqa: S704  # a template's output, escaped already
+            environment.get_template(f"{section.name}.html").render(
+                {
+                    **section.context,
+                    "study": study,
+                    "environments": report.analysis.environments,
+                    "marks": {mark["label"]: mark for mark in marks},
+                }
+            )
+        )
+        for section in sections
+    }
+    early = template_file("theme.js") or ""
+    scripts = [get_plotlyjs(), _own_script(sections)]
+    return environment.get_template("page.html").render(
+        study=study,
+        environments=report.analysis.environments,
+        sections=sections,
+        bodies=bodies,
+        data=_data(report, marks, sections),
+        style=Markup(template_file("page.css") or ""),  # noqa: S704  # our own file
+        scripts=[inline_script(script) for script in scripts],
+        early=inline_script(early),
+        policy=" ".join(map(script_hash, [early, *scripts])),
+    )
+
+
+def _own_script(sections: list[Section]) -> str:
+    """The scripts of the page and of its sections, as one."""
+    names = ["core.js", "figures.js", "tables.js", *(f"{section.name}.js" for section in sections)]
+    return "\n".join(text for name in names if (text := template_file(name)) is not None)
+
+
+def _data(report: Report, marks: list[dict[str, Any]], sections: list[Section]) -> dict[str, Any]:
+    """What the scripts work with, by section."""
+    page = {
+        "agents": marks,
+        "environments": [
+            {
+                "label": environment.environment,
+                "optimum": environment.optimum,
+                "blind": environment.best_blind,
+                "agents": [agent.agent for agent in environment.agents],
+            }
+            for environment in report.analysis.environments
+        ],
+    }
+    return {
+        "page": plain(page),
+        **{section.name: plain(section.data) for section in sections if section.data is not None},
+    }

@@ -1,0 +1,176 @@
+"""An episode of each agent as an animated picture inside the page."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from rich.console import Console
+
+from experiments.analysis import StudyAnalysis
+from experiments.study_plan import PlannedRun
+from pipeline.environments import MISTAKES
+from pipeline.errors import UserError
+from pipeline.evaluation.sampled import evaluation_seed
+from pipeline.files import replacing, write_json
+from pipeline.model_loading import load_model
+from pipeline.playing import ChosenModel, Watcher, play_episodes, playing_env, write_film
+from report.page.markup import data_uri
+from report.page.sections import Report, Section
+from report.sentences import number
+
+MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
+COLOURS = 128
+MAX_SIDE = 320  # pixels of a picture's longer side
+MAX_BYTES = 300_000  # of a film
+ALL_BYTES = 6_000_000  # of the films of a page, a third more as text
+
+
+@dataclass(frozen=True)
+class Film:
+    """A greedy episode of an agent.
+
+    Attributes:
+        agent: its label.
+        still: the first frame as a data URI.
+        film: all frames, likewise.
+        width, height: in pixels.
+        caption: how the episode went.
+    """
+
+    agent: str
+    still: str
+    film: str
+    width: int
+    height: int
+    caption: str
+
+
+def section(report: Report) -> Section | None:
+    """The films of each environment; None where nothing can be drawn."""
+    films: list[list[Film]] = []
+    room = ALL_BYTES
+    for runs in _runs_to_film(report.analysis):
+        films.append([])
+        for run in runs:
+            path = film_of(run)
+            if path is not None and path.stat().st_size <= room:
+                room -= path.stat().st_size
+                films[-1].append(_film(run.agent, path))
+    if not any(films):
+        return None
+    return Section("films", "Episodes", {"films": films}, by_environment=True)
+
+
+def _runs_to_film(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
+    """The first run of each agent that has finished, for each environment.
+
+    A batch leaves no agent.
+    """
+    first: dict[tuple[str, str], PlannedRun] = {}
+    for run in analysis.results.planned:
+        is_new = (run.agent, run.environment) not in first
+        if is_new and run.is_finished and not run.is_batch:
+            first[run.agent, run.environment] = run
+    return [
+        [
+            first[agent.agent, environment.environment]
+            for agent in environment.agents
+            if (agent.agent, environment.environment) in first
+        ]
+        for environment in analysis.environments
+    ]
+
+
+def film_of(planned: PlannedRun) -> Path | None:
+    """The film of a run's final agent, kept in the run folder for the next page.
+
+    Returns:
+        A GIF, which has how the episode went beside it in a JSON file; None where the environment
+        cannot be drawn.
+    """
+    path = planned.path / "episode.gif"
+    if not path.with_suffix(".json").exists():
+        try:
+            frames, episode = _play(planned)
+        except (UserError, *MISTAKES):
+            return None
+        film = _encoded(frames)
+        kept = min(len(frames), max(len(frames) * MAX_BYTES // len(film), 1))
+        if kept < len(frames):
+            film = _encoded(frames[:kept])
+        with replacing(path) as draft:
+            draft.write_bytes(film)
+        write_json(path.with_suffix(".json"), {**episode, "frames": kept})
+    return path
+
+
+def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
+    """The frames of an episode, and how it went."""
+    import torch as th
+
+    # Pictures alone: no display is needed, nor looked for.
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    th.set_num_threads(planned.spec.num_threads)
+    env = playing_env(ChosenModel(planned.run.model_path, planned.spec, planned.run), "rgb_array")
+    try:
+        model = load_model(planned.spec.algo, planned.run.model_path, env)
+        env.seed(evaluation_seed(planned.seed, 3))
+        watcher = Watcher(env, "rgb_array", Console(quiet=True))
+        limits = argparse.Namespace(n_episodes=1, n_timesteps=MAX_STEPS, stochastic=False)
+        ended = list(play_episodes(model, env, limits, watcher.show))
+    finally:
+        env.close()
+    total_return, length = ended[0] if ended else (None, None)
+    return _shrunk(watcher.frames), {"return": total_return, "steps": length}
+
+
+def _shrunk(frames: list[Any]) -> list[Any]:
+    """The frames, small and in few colours that they share.
+
+    What does not move then looks the same in all of them, and takes no room in the film.
+    """
+    factor = -(-max(frames[0].shape[:2]) // MAX_SIDE)
+    pictures = [Image.fromarray(frame).reduce(factor) for frame in frames]
+    samples = [pictures[0], pictures[len(pictures) // 2], pictures[-1]]
+    palette = Image.fromarray(np.hstack([np.asarray(p) for p in samples])).quantize(COLOURS)
+    few = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
+    return [np.asarray(picture.convert("RGB")) for picture in few]
+
+
+def _encoded(frames: list[Any]) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "film.gif"
+        write_film(path, frames)
+        return path.read_bytes()
+
+
+def _film(agent: str, path: Path) -> Film:
+    still = io.BytesIO()
+    with Image.open(path) as picture:
+        width, height = picture.size
+        picture.convert("RGB").quantize(64).save(still, "PNG", optimize=True)
+    return Film(
+        agent,
+        data_uri("image/png", still.getvalue()),
+        data_uri("image/gif", path.read_bytes()),
+        width,
+        height,
+        _caption(json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))),
+    )
+
+
+def _caption(episode: dict[str, Any]) -> str:
+    shown, steps = episode["frames"] - 1, episode["steps"]
+    if steps is None:
+        return f"the first {shown} steps"
+    result = f"return {number(episode['return'])} in {steps} step{'s' if steps > 1 else ''}"
+    return result if shown >= steps else f"{result}, of which these are the first {shown}"

@@ -1,0 +1,109 @@
+"""From data to text that a browser can be handed: templates, JSON, inline scripts."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from report.sentences import number
+from verdicts import Estimate
+
+SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
+
+
+def templates() -> Environment:
+    """The templates; whatever they are filled with is escaped."""
+    environment = Environment(
+        loader=PackageLoader("report.page"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+    )
+    # Agents stay in their order.
+    environment.policies["json.dumps_kwargs"] = {"sort_keys": False, "separators": (",", ":")}
+    environment.filters.update(number=number, interval=interval_alone, p_value=p_value, bar=bar)
+    return environment
+
+
+def template_file(name: str) -> str | None:
+    """The text of a file beside the templates, or None where there is none."""
+    file = files("report.page") / "templates" / name
+    return file.read_text(encoding="utf-8") if file.is_file() else None
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON knows it: rounded, and None in place of what is not finite."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        return float(f"{value:.{SIGNIFICANT}g}") if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value
+
+
+def data_uri(kind: str, content: bytes) -> str:
+    """A file inside the page.
+
+    Args:
+        kind: its MIME type.
+        content: its bytes.
+    """
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def inline_script(text: str) -> Markup:
+    """A script as the content of its element.
+
+    Raises:
+        ValueError: if the text would end the element.
+    """
+    if "</script" in text.lower() or "<!--" in text:
+        raise ValueError("a script that is put into a page may not hold </script or <!--")
+    return Markup(text)  # noqa: S704  # ours or the library's, and checked above
+
+
+def script_hash(text: str) -> str:
+    """How a content security policy names an inline script."""
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def interval_alone(estimate: Estimate) -> str:
+    """The interval of a figure, empty where it has none."""
+    if math.isnan(estimate.low) or estimate.low == estimate.high:
+        return ""
+    return f"{number(estimate.low)} to {number(estimate.high)}"
+
+
+def bar(score: Estimate) -> tuple[float, float, float]:
+    """Low end, point and high end of a score, cut to what lies between 0 and 1."""
+    low, high = (score.low, score.high) if score.has_interval else (score.point, score.point)
+    return (_share(low), _share(score.point), _share(high))
+
+
+def _share(value: float) -> float:
+    return 0.0 if math.isnan(value) else round(min(max(value, 0.0), 1.0), 4)
+
+
+def p_value(value: float) -> str:
+    """A p-value with as many digits as mean something."""
+    if math.isnan(value):
+        return "-"
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def setting(value: Any) -> str:
+    """A hyperparameter as its YAML file has it."""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)

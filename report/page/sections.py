@@ -1,0 +1,48 @@
+"""What the page and its sections have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from experiments.analysis import StudyAnalysis
+from verdicts import Estimate
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a page is made from.
+
+    Attributes:
+        analysis: the study.
+        command: the command that reproduces it.
+    """
+
+    analysis: StudyAnalysis
+    command: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the page.
+
+    Attributes:
+        name: that of its template and script, and its anchor.
+        title: its heading.
+        context: what its template is filled with.
+        data: what its script works with, to be written as JSON; None where it has no script.
+        by_environment: whether it shows the environment that is chosen at the top of the page.
+            Its template marks what belongs to environment i by ``data-environment="i"``.
+    """
+
+    name: str
+    title: str
+    context: Mapping[str, Any] = field(default_factory=dict)
+    data: Any = None
+    by_environment: bool = False
+
+
+def estimate_data(estimate: Estimate) -> dict[str, float]:
+    """A figure and its interval, for scripts."""
+    return {"point": estimate.point, "low": estimate.low, "high": estimate.high}

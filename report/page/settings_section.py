@@ -1,0 +1,109 @@
+"""What a reader needs to do the study again: settings as run, seeds, versions, and failures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from experiments.execution import failure_log
+from experiments.results import StudyResults
+from experiments.study_plan import PlannedRun
+from report.page.markup import setting
+from report.page.sections import Report, Section
+
+ABSENT = "-"
+
+
+@dataclass(frozen=True)
+class MissingRuns:
+    """Runs of an agent on an environment that are not there, all for one reason.
+
+    Attributes:
+        agent, environment: whose.
+        seeds: which.
+        reason: the last line of what they left, or that they have not been done.
+        details: all that the last of them left.
+    """
+
+    agent: str
+    environment: str
+    seeds: list[int]
+    reason: str
+    details: str
+
+
+@dataclass(frozen=True)
+class SettingsTable:
+    """The settings of an environment's runs.
+
+    Attributes:
+        agents: the columns.
+        rows: by name of the setting, its value for each agent, and whether they differ.
+    """
+
+    agents: list[str]
+    rows: dict[str, tuple[list[str], bool]]
+
+
+def section(report: Report) -> Section | None:
+    """Settings by environment, and what holds for the whole study."""
+    results = report.analysis.results
+    infos = {i: run.run.read_info() for i, run in enumerate(results.planned) if run.is_finished}
+    done = [(results.planned[i], info) for i, info in infos.items()]
+    missing = [run for i, run in enumerate(results.planned) if i not in infos]
+    context = {
+        "command": report.command,
+        "absent": ABSENT,
+        "tables": [
+            _settings_table([(r, info) for r, info in done if r.environment == e.environment])
+            for e in report.analysis.environments
+        ],
+        "versions": _versions(info for _, info in done),
+        "missing": _missing_runs(results, missing),
+    }
+    return Section("settings", "Settings", context, by_environment=True)
+
+
+def _settings_table(runs: list[tuple[PlannedRun, Mapping[str, Any]]]) -> SettingsTable:
+    columns: dict[str, dict[str, str]] = {}
+    for agent in dict.fromkeys(run.agent for run, _ in runs):
+        columns[agent] = _column([info for run, info in runs if run.agent == agent])
+    names = dict.fromkeys(name for column in columns.values() for name in column)
+    rows = {}
+    for name in names:
+        values = [column.get(name, ABSENT) for column in columns.values()]
+        rows[name] = (values, len({*values} - {ABSENT}) > 1)
+    return SettingsTable(list(columns), rows)
+
+
+def _column(infos: list[Mapping[str, Any]]) -> dict[str, str]:
+    """The settings of an agent, which its seeds share, and how long its runs were."""
+    spec = infos[0]["spec"]
+    steps = sorted(info["n_timesteps"] for info in infos)
+    lengths = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
+    column = {"agent": spec["algo"], "steps run": lengths}
+    if infos[0].get("engine"):
+        column["engine"] = str(infos[0]["engine"])
+    return column | {name: setting(value) for name, value in spec["hyperparams"].items()}
+
+
+def _versions(infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """The versions that the runs were done with; several of a package where they differ."""
+    versions: dict[str, set[str]] = {}
+    for info in infos:
+        for package, version in info.get("versions", {}).items():
+            versions.setdefault(package, set()).add(version)
+    return {package: ", ".join(sorted(found)) for package, found in versions.items()}
+
+
+def _missing_runs(results: StudyResults, missing: Iterable[PlannedRun]) -> list[MissingRuns]:
+    groups: dict[tuple[str, str, str], MissingRuns] = {}
+    for run in missing:
+        log = failure_log(results.root, run)
+        details = log.read_text(encoding="utf-8").strip() if log.exists() else ""
+        reason = details.splitlines()[-1] if details else "not done yet"
+        key = (run.agent, run.environment, reason)
+        seeds = groups[key].seeds if key in groups else []
+        groups[key] = MissingRuns(*key[:2], [*seeds, run.seed], reason, details)
+    return list(groups.values())

@@ -1,0 +1,405 @@
+"""train.py and enjoy.py as a user types them."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+import enjoy
+import train
+from commands.parsing import run_command
+from pipeline import files
+from pipeline.playing import FRAMES_PER_SECOND
+
+ROOT = Path(train.__file__).parent
+QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
+COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main}
+
+
+@pytest.fixture
+def type_command(monkeypatch, capsys, tmp_path):
+    """Run a command line in this process, inside an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+        with pytest.raises(SystemExit) as stop:
+            run_command(COMMANDS[words[0]])
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+def contents(folder):
+    return sorted(path.name for path in folder.rglob("*"))
+
+
+def test_a_run_folder_is_whole(type_command, tmp_path):
+    code, out, err = type_command("train.py", *QUICK, "--save-freq", "200")
+    assert (code, err) == (0, "")
+    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    assert contents(run) == sorted(
+        [
+            "0.monitor.csv",
+            "FrozenLake-v1",
+            "FrozenLake-v1.zip",
+            "args.yml",
+            "best_model.zip",
+            "command.txt",
+            "config.yml",
+            "evaluations.npz",
+            "learning_curve.png",
+            "rl_model_200_steps.zip",
+            "rl_model_400_steps.zip",
+            "run.json",
+            "value_map.png",
+            "value_maps.npz",
+        ]
+    )
+    info = json.loads((run / "run.json").read_text())
+    assert info["state"] == "finished"
+    assert info["n_timesteps"] == 500
+    assert info["final"]["exact"]
+    assert info["final"]["optimum"] == pytest.approx(0.7442, abs=1e-4)
+    assert info["engine"] == "compiled"
+    assert f"return {info['final']['mean_return']:.2f} (exact)" in out
+    assert "logs/qlearning/FrozenLake-v1_1" in out
+    config = yaml.safe_load((run / "FrozenLake-v1" / "config.yml").read_text())
+    assert config["n_timesteps"] == 500
+    assert "--seed 0" in (run / "FrozenLake-v1" / "command.txt").read_text()
+    with np.load(run / "evaluations.npz") as evaluations:
+        assert evaluations["results"].shape == (20, 2)
+        assert evaluations["timesteps"][-1] == 500
+
+
+def test_sampled_evaluation_where_the_model_is_not_known(type_command, tmp_path):
+    code, out, _ = type_command("train.py", "--algo", "angle", "--env", "CartPole-v1", "-n", "1000")
+    assert code == 0
+    assert "over 100 episodes" in out
+    run = tmp_path / "logs" / "angle" / "CartPole-v1_1"
+    final = json.loads((run / "run.json").read_text())["final"]
+    assert (final["exact"], final["n_episodes"]) == (False, 100)
+    assert np.load(run / "evaluations.npz")["results"].shape == (20, 20)
+
+
+def test_the_same_seed_gives_the_same_run(type_command, tmp_path):
+    for _ in range(2):
+        assert type_command("train.py", *QUICK)[0] == 0
+    runs = [tmp_path / "logs" / "qlearning" / f"FrozenLake-v1_{n}" for n in (1, 2)]
+    rows = [(run / "0.monitor.csv").read_text().splitlines()[2:] for run in runs]
+    without_time = [[row.rsplit(",", 1)[0] for row in table] for table in rows]
+    assert without_time[0] == without_time[1]
+    data = [zipfile.ZipFile(run / "FrozenLake-v1.zip").read("policy.pth") for run in runs]
+    assert data[0] == data[1]
+
+
+def test_playing_the_newest_the_best_and_a_path(type_command, tmp_path):
+    type_command("train.py", *QUICK, "--save-freq", "200")
+    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    choices = [
+        ["--algo", "qlearning", "--env", "FrozenLake-v1"],
+        ["--algo", "qlearning", "--env", "FrozenLake-v1", "--load-best"],
+        ["--algo", "qlearning", "--env", "FrozenLake-v1", "--load-checkpoint", "200"],
+        ["--algo", "qlearning", "--env", "FrozenLake-v1", "--load-last-checkpoint"],
+        [run / "rl_model_400_steps.zip"],
+    ]
+    for choice in choices:
+        code, out, err = type_command("enjoy.py", *choice, "--render", "none", "--n-episodes", "3")
+        assert (code, err) == (0, "")
+        assert re.search(r"return \d\.\d\d ± \d\.\d\d over 3 episodes", out)
+    assert out.count("episode ") == 3
+
+
+def test_watching_in_the_terminal_shows_the_last_frame(type_command):
+    type_command("train.py", "--algo", "random", "--env", "Warehouse-v0", "-n", "300")
+    code, out, _ = type_command(
+        "enjoy.py", "--algo", "random", "--env", "Warehouse-v0", "--render", "ansi", "-n", "5"
+    )
+    assert code == 0
+    # The first frame and one for each of the five steps, ten rows of shelves each.
+    assert out.count("#") > 6 * 30
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_filming(type_command, tmp_path, suffix):
+    from PIL import Image
+
+    type_command("train.py", "--algo", "random", "--env", "Warehouse-v0", "-n", "300")
+    code, _, err = type_command(
+        *("enjoy.py", "--algo", "random", "--env", "Warehouse-v0"),
+        *("--record", f"film.{suffix}", "-n", "7"),
+    )
+    assert (code, err) == (0, "")
+    film = tmp_path / f"film.{suffix}"
+    if suffix == "gif":
+        # Equal frames in a row become one that is shown for longer.
+        with Image.open(film) as picture:
+            durations = []
+            for frame in range(picture.n_frames):
+                picture.seek(frame)
+                durations.append(picture.info["duration"])
+        assert sum(durations) == 8 * 1000 // FRAMES_PER_SECOND
+    else:
+        assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_going_on_with_a_trained_agent(type_command, tmp_path):
+    type_command("train.py", *QUICK)
+    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    assert type_command("train.py", *QUICK, "-i", run / "FrozenLake-v1.zip")[0] == 0
+    info = json.loads((run.with_name("FrozenLake-v1_2") / "run.json").read_text())
+    assert info["n_timesteps"] == 1000
+
+
+def test_a_budget_in_episodes(type_command, tmp_path):
+    arguments = ["--algo", "sarsa", "--env", "FrozenLake-v1", "--seed", "0", "--n-episodes", "70"]
+    assert type_command("train.py", *arguments, "-params", "n_envs:3")[0] == 0
+    run = tmp_path / "logs" / "sarsa" / "FrozenLake-v1_1"
+    rows = sum(len(path.read_text().splitlines()) - 2 for path in run.glob("*.monitor.csv"))
+    # The last step may end an episode in several environments.
+    assert 70 <= rows <= 72
+    assert (run / "best_model.zip").exists()
+    # Every four episodes, which is at most twenty times; two may end at once.
+    with np.load(run / "evaluations.npz") as evaluations:
+        assert 15 <= len(evaluations["timesteps"]) <= 70 // 4
+
+
+def test_environment_arguments_reach_training_and_evaluation(type_command, tmp_path):
+    code, _, _ = type_command(
+        *("train.py", "--algo", "random", "--env", "Warehouse-v0", "-n", "1000", "--seed", "0"),
+        *("--env-kwargs", "shelf_reward:-1", "max_episode_steps:50"),
+        *("--eval-env-kwargs", "max_episode_steps:20"),
+    )
+    assert code == 0
+    run = tmp_path / "logs" / "random" / "Warehouse-v0_1"
+    info = json.loads((run / "run.json").read_text())
+    assert info["final"]["mean_length"] <= 20
+    assert info["final"]["mean_return"] >= -20
+    rows = [line.split(",") for line in (run / "0.monitor.csv").read_text().splitlines()[2:]]
+    assert {int(float(row[1])) for row in rows} == {50}
+    assert min(float(row[0]) for row in rows) == -50
+
+
+MISTAKES = {
+    "environment": (["--env", "Warehose-v0"], "unknown environment 'Warehose-v0': did you mean"),
+    "agent": (["--algo", "qlerning"], "unknown agent 'qlerning': did you mean 'qlearning'?"),
+    "flag": (["--evn", "X"], "unknown argument --evn"),
+    "value of a flag": (["-n", "many"], "invalid int value: 'many'"),
+    "hyperparameter": (["-params", "learning_rat:0.1"], "did you mean 'learning_rate'?"),
+    "type": (["-params", "gamma:high"], "gamma"),
+    "range": (["-params", "gamma:1.5"], "gamma"),
+    "choice": (["-params", "exploration:greedy"], "exploration"),
+    "spaces": (
+        ["--algo", "qlearning", "--env", "MountainCarContinuous-v0"],
+        "fitting agents: ppo, a2c, random",
+    ),
+    "missing file": (["--conf-file", "nowhere.yml"], "nowhere.yml"),
+    "environment argument": (["--env-kwargs", "slipery:True"], "slipery"),
+    "agent to go on with": (["-i", "nowhere.zip"], "no such model file: nowhere.zip"),
+    "module": (["--gym-packages", "no_such_module"], "cannot import no_such_module"),
+    "form of an assignment": (["-params", "learning_rate"], "learning_rate"),
+    "two budgets": (["-params", "n_episodes:5"], "not both"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_ends_in_one_line_and_leaves_nothing(type_command, tmp_path, mistake):
+    arguments, complaint = MISTAKES[mistake]
+    given = [] if "--env" in arguments or "--algo" in arguments else QUICK
+    code, out, err = type_command("train.py", *given, *arguments)
+    assert code == 2
+    assert err.count("\n") == 1
+    assert err.startswith("train.py: error: ")
+    assert complaint in err
+    assert out == ""
+    assert contents(tmp_path) == []
+
+
+def test_a_broken_map_names_row_and_column(type_command, tmp_path):
+    (tmp_path / "map.txt").write_text("S..\n.x.\n..G\n")
+    code, _, err = type_command(
+        "train.py", "--algo", "qlearning", "--env", "Warehouse-v0", "--env-kwargs", "desc:map.txt"
+    )
+    assert code == 2
+    assert "row 1" in err
+    assert "column 1" in err
+    assert contents(tmp_path) == ["map.txt"]
+
+
+def test_broken_yaml_names_the_line(type_command, tmp_path):
+    (tmp_path / "broken.yml").write_text("FrozenLake-v1:\n  gamma: [1\n  policy: x\n")
+    code, _, err = type_command("train.py", *QUICK, "--conf-file", "broken.yml")
+    assert code == 2
+    assert re.search(r"broken\.yml:\d+:\d+: ", err)
+    assert contents(tmp_path) == ["broken.yml"]
+
+
+def test_settings_that_the_library_refuses_leave_no_folder(type_command, tmp_path):
+    code, _, err = type_command(
+        "train.py", "--algo", "ppo", "--env", "CartPole-v1", "-params", "n_steps:1", "n_envs:1"
+    )
+    assert code == 2
+    assert err.count("\n") == 1
+    assert contents(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        ([*QUICK, "-params", "engine:compiled", "--vec-env", "subproc"], "is not DummyVecEnv"),
+        (
+            ["--algo", "optimal", "--env", "CliffWalking-v1", "--conf-file", "plain.yml"],
+            "needs a time limit",
+        ),
+    ],
+)
+def test_what_an_agent_cannot_work_with_leaves_nothing(
+    type_command, tmp_path, arguments, complaint
+):
+    plain = tmp_path / "plain.yml"
+    plain.write_text("CliffWalking-v1: {n_timesteps: 10, policy: ActionTablePolicy}\n")
+    code, _, err = type_command("train.py", *arguments)
+    assert (code, err.count("\n")) == (2, 1)
+    assert complaint in err
+    assert contents(tmp_path) == ["plain.yml"]
+
+
+def damaged_zips(folder, whole):
+    (folder / "truncated.zip").write_bytes(whole.read_bytes()[:-200])
+    (folder / "text.zip").write_text("not a zip")
+    with zipfile.ZipFile(folder / "other.zip", "w") as archive:
+        archive.writestr("readme.txt", "hello")
+    return {
+        "truncated.zip": "no whole zip of an agent",
+        "text.zip": "no whole zip of an agent",
+        "other.zip": "no whole zip of an agent",
+        "missing.zip": "no such model file",
+    }
+
+
+def test_wrong_model_files(type_command, tmp_path):
+    type_command("train.py", *QUICK)
+    whole = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1" / "FrozenLake-v1.zip"
+    for name, complaint in damaged_zips(tmp_path, whole).items():
+        code, _, err = type_command("enjoy.py", name, "--algo", "qlearning", "--render", "none")
+        assert (code, err.count("\n")) == (2, 1)
+        assert complaint in err
+    code, _, err = type_command("enjoy.py", whole, "--algo", "sarsa", "--render", "none")
+    assert code == 2
+    assert "cannot be loaded as a sarsa agent" in err
+    code, _, err = type_command("train.py", "--algo", "sarsa", *QUICK[2:], "-i", whole)
+    assert code == 2
+    assert "cannot be loaded as a sarsa agent" in err
+    assert not (tmp_path / "logs" / "sarsa" / "FrozenLake-v1_1").exists()
+
+
+def test_nothing_to_play(type_command):
+    code, _, err = type_command("enjoy.py", "--algo", "dqn", "--env", "CartPole-v1")
+    assert code == 2
+    assert "train one with: python train.py --algo dqn --env CartPole-v1" in err
+    code, _, err = type_command("enjoy.py", "--record", "film.avi")
+    assert code == 2
+    assert ".gif or .mp4" in err
+
+
+def test_a_library_zip_from_elsewhere_wants_trust(type_command, tmp_path):
+    from stable_baselines3 import PPO
+
+    path = tmp_path / "foreign.zip"
+    PPO("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8).save(path)
+    words = ["enjoy.py", path, "--algo", "ppo", "--env", "CartPole-v1", "--render", "none"]
+    code, _, err = type_command(*words)
+    assert code == 2
+    assert "--trust" in err
+    code, out, _ = type_command(*words, "--trust", "--n-episodes", "2")
+    assert code == 0
+    assert "over 2 episodes" in out
+
+
+def test_a_log_folder_that_cannot_be_written(type_command, tmp_path):
+    (tmp_path / "logs").write_text("a file is in the way")
+    code, _, err = type_command("train.py", *QUICK)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "cannot make a run folder in logs/qlearning" in err
+
+
+def test_a_full_disk(type_command, tmp_path, monkeypatch):
+    def no_space(_):
+        raise OSError(28, "No space left on device", "run.json")
+
+    monkeypatch.setattr(files.os, "fsync", no_space)
+    code, _, err = type_command("train.py", *QUICK)
+    assert (code, err.count("\n")) == (2, 1)
+    assert "No space left on device" in err
+    assert contents(tmp_path) == []
+
+
+def test_ctrl_c_saves_what_was_learnt(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, str(ROOT / "train.py"), *QUICK[:-1], "100000000"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if (run / "0.monitor.csv").exists() and (run / "0.monitor.csv").stat().st_size > 2000:
+            break
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "")
+    assert "interrupted" in out
+    assert str(run.relative_to(tmp_path)) in out
+    assert json.loads((run / "run.json").read_text())["state"] == "interrupted"
+    assert (run / "FrozenLake-v1.zip").exists()
+
+
+HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy")
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["train.py", "--help"], 0),
+        (["train.py", "--list"], 0),
+        (["enjoy.py", "--help"], 0),
+        (["train.py", "--env", "Warehose-v0"], 2),
+        (["train.py", "--algo", "pppo"], 2),
+        (["train.py", "--nonsense"], 2),
+        (["train.py", "--conf-file", "missing.yml"], 2),
+        (["enjoy.py", "missing.zip"], 2),
+        (["enjoy.py", "--algo", "ppo", "--env", "CartPole-v1"], 2),
+    ],
+)
+def test_answers_without_loading_anything_heavy(words, code, tmp_path):
+    program = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r}); import {words[0][:-3]} as command; "
+        + (
+            "from commands.parsing import run_command\n"
+            "try: run_command(command.main)\n"
+            "finally: print([name for name in sys.modules if name in {heavy}], file=sys.stderr)"
+        ).replace("{heavy}", repr(HEAVY))
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program, *words[1:]],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+    assert result.returncode == code
+    assert result.stderr.splitlines()[-1] == "[]"

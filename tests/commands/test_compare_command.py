@@ -1,0 +1,435 @@
+"""compare.py as a user types it: what is run, what is skipped, and what survives."""
+
+import contextlib
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import compare
+from commands.parsing import run_command
+
+ROOT = Path(compare.__file__).parent
+LAKE = ["--env", "FrozenLake-v1", "--no-report", "-f", "studies"]
+PAIR = [*LAKE, "--algos", "qlearning", "sarsa", "--n-episodes", "60"]
+
+# Environments of a user's own, which the command imports.
+FRAGILE = '''
+import os
+import signal
+import time
+from pathlib import Path
+
+import gymnasium as gym
+
+
+class Walk(gym.Env):
+    """Five places in a row; the goal is the last."""
+
+    observation_space = gym.spaces.Discrete(5)
+    action_space = gym.spaces.Discrete(2)
+    steps = 0
+    seed = None
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.seed = 0, self.seed if seed is None else seed
+        return 0, {}
+
+    def step(self, action):
+        self.steps += 1
+        self.act()
+        self.place = min(max(self.place + 2 * int(action) - 1, 0), 4)
+        return self.place, float(self.place == 4), self.place == 4, False, {}
+
+
+class Fragile(Walk):
+    """Raises on the 50th step of the training with seed 1."""
+
+    def act(self):
+        if self.seed == 1 and self.steps == 50:
+            raise RuntimeError("thin ice")
+
+
+class Killed(Walk):
+    """Kills its process on the 30th step, the first time that it comes so far."""
+
+    def act(self):
+        mark = Path(os.environ["FRAGILE_MARK"])
+        if self.steps == 30 and not mark.exists():
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+class Slow(Walk):
+    """Takes its time while there is no file that says it may hurry."""
+
+    def act(self):
+        if not Path(os.environ["FRAGILE_MARK"]).exists():
+            time.sleep(0.05)
+
+
+for kind in (Fragile, Killed, Slow):
+    gym.register(f"{kind.__name__}-v0", entry_point=kind, max_episode_steps=20)
+'''
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    (tmp_path / "fragile_walks.py").write_text(FRAGILE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("FRAGILE_MARK", str(tmp_path / "mark"))
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
+    return tmp_path
+
+
+@pytest.fixture
+def type_command(folder, monkeypatch, capfd):
+    """Run a command line in this process, inside a folder of its own."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["compare.py", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            run_command(compare.main)
+        captured = capfd.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+def start(*words):
+    return subprocess.Popen(
+        [sys.executable, str(ROOT / "compare.py"), *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def finish(*words):
+    process = start(*words)
+    out, err = process.communicate(timeout=120)
+    return process.returncode, out, err
+
+
+def wait_for(condition, seconds=60):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
+def records(study):
+    """When each run was written down, by agent and number."""
+    return {
+        (path.parent.parent.name, path.parent.name): path.stat().st_mtime_ns
+        for path in study.glob("runs/*/*/run.json")
+    }
+
+
+def rows(study):
+    return pd.read_csv(study / "summary.csv")
+
+
+def test_what_is_there_is_not_run_again(type_command, folder):
+    study = folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
+    code, out, err = type_command(*PAIR, "--seeds", 2)
+    assert (code, err) == (0, "")
+    assert "4 runs, 0 of them there already" in out
+    first = records(study)
+    assert sorted(first) == [
+        (agent, f"FrozenLake-v1_{n}") for agent in ("qlearning", "sarsa") for n in (1, 2)
+    ]
+    assert sorted(path.name for path in study.iterdir()) == ["curves.csv.gz", "runs", "summary.csv"]
+    before = (study / "summary.csv").read_text()
+
+    code, out, _ = type_command(*PAIR, "--seeds", 2)
+    assert code == 0
+    assert "4 runs, 4 of them there already" in out
+    assert records(study) == first
+    assert (study / "summary.csv").read_text() == before
+
+    code, out, _ = type_command(*PAIR, "--seeds", 3)
+    assert "6 runs, 4 of them there already" in out
+    extended = records(study)
+    assert len(extended) == 6
+    assert first.items() <= extended.items()
+    assert sorted(rows(study)["seed"]) == [0, 0, 1, 1, 2, 2]
+
+    code, out, _ = type_command(*PAIR, "--seeds", 3, "-params", "gamma:0.9")
+    assert (code, "6 runs, 0 of them there already" in out) == (0, True)
+    assert set(records(study)) == set(extended)
+    assert not set(records(study).values()) & set(extended.values())
+
+
+def test_the_same_seed_gives_the_same_run_as_train_py(type_command, folder, monkeypatch):
+    import train
+
+    assert type_command(*PAIR, "--seeds", 1)[0] == 0
+    words = "train.py --algo sarsa --env FrozenLake-v1 --seed 0 --n-episodes 60 --verbose 0"
+    monkeypatch.setattr(sys, "argv", words.split())
+    assert train.main() == 0
+    theirs = folder / "logs" / "sarsa" / "FrozenLake-v1_1" / "0.monitor.csv"
+    ours = folder.glob("studies/*/runs/sarsa/FrozenLake-v1_1/0.monitor.csv")
+    tables = [pd.read_csv(path, skiprows=1)[["r", "l"]] for path in (theirs, next(ours))]
+    assert tables[0].equals(tables[1])
+
+
+def test_a_study_file(type_command, folder):
+    (folder / "steps.yml").write_text(
+        "title: How fast [should] it learn?\n"
+        "seeds: 2\nn_episodes: 40\nepisodes_table: 20\nmetric: training\n"
+        "agents: {qlearning: {sweep: {learning_rate: [0.1, 0.9]}}}\n"
+        "environments: {the lake: {id: FrozenLake-v1, env_kwargs: {is_slippery: false}}}\n"
+    )
+    code, out, err = type_command("steps.yml", "--no-report", "-f", "studies", "-j", 1)
+    assert (code, err) == (0, "")
+    assert "How fast [should] it learn?" in out
+    assert "the lake: return per 20 episodes" in out
+    study = folder / "studies" / "steps"
+    assert set(rows(study)["agent"]) == {
+        "qlearning learning_rate=0.1",
+        "qlearning learning_rate=0.9",
+    }
+    assert set(rows(study)["n_episodes"]) == {40}
+    run = study / "runs" / "qlearning_learning_rate=0.9" / "the_lake_2"
+    spec = json.loads((run / "run.json").read_text())["spec"]
+    assert (spec["seed"], spec["hyperparams"]["learning_rate"]) == (1, 0.9)
+
+    code, out, _ = type_command("steps.yml", "--no-report", "-f", "studies", "--quick", "-j", 1)
+    assert code == 0
+    assert set(rows(folder / "studies" / "steps-quick")["n_episodes"]) == {4}
+
+
+def test_a_run_that_fails_does_not_stop_the_others(folder):
+    words = ["--env", "Fragile-v0", "--gym-packages", "fragile_walks", "--no-report"]
+    words += ["--algos", "qlearning", "random", "--seeds", 3, "-n", 2000, "-j", 2, "-f", "studies"]
+    code, out, err = finish(*words)
+    assert (code, err) == (1, "")
+    assert "qlearning on Fragile-v0, seed 1: thin ice" in out
+    assert "1 of 3 runs of qlearning is missing" in " ".join(out.split())
+    study = folder / "studies" / "Fragile-v0_qlearning-random"
+    log = study / "failures" / "qlearning@Fragile-v0_2.txt"
+    assert str(log.relative_to(folder)) in out
+    assert "RuntimeError: thin ice" in log.read_text()
+    summary = rows(study)
+    assert len(summary) == len(records(study)) == 4
+    assert sorted(summary[summary["agent"] == "random"]["seed"]) == [0, 2]
+    assert not (study / ".drafts").exists()
+
+
+def test_a_killed_worker_costs_nothing(folder):
+    words = ["--env", "Killed-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+    code, out, err = finish(*words, "--seeds", 3, "-n", 500, "--no-report", "-f", "studies")
+    assert (code, err) == (0, "")
+    assert (folder / "mark").exists()
+    assert "failed" not in out
+    study = folder / "studies" / "Killed-v0_qlearning"
+    assert sorted(rows(study)["seed"]) == [0, 1, 2]
+    assert not (study / ".drafts").exists()
+    assert not (study / "failures").exists()
+
+
+def is_alive(pid):
+    """Whether the process runs, and is not only remembered for its parent."""
+    with contextlib.suppress(OSError):
+        status = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2]
+        return status.split()[0] != "Z"
+    return False
+
+
+def session_of(leader):
+    """The processes that a command has started, itself included."""
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = path.read_text().rpartition(")")[2].split()
+            if int(fields[3]) == leader:
+                found.add(int(path.parent.name))
+    return found
+
+
+SLOW = ["--env", "Slow-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"]
+
+
+def begin_slowly(folder):
+    """A study in the middle of its runs."""
+    process = start(*SLOW)
+    study = folder / "studies" / "Slow-v0_qlearning"
+    wait_for(lambda: len(list(study.glob(".drafts/*/0.monitor.csv"))) == 2)
+    return process, study
+
+
+def test_a_killed_driver_leaves_no_orphans_and_no_drafts(folder):
+    process, study = begin_slowly(folder)
+    started = session_of(process.pid)
+    assert len(started) >= 4
+    process.kill()
+    process.communicate()
+    wait_for(lambda: not any(map(is_alive, started)))
+    wait_for(lambda: not study.exists())
+
+
+def test_ctrl_c_ends_with_130_and_goes_on_afterwards(folder):
+    process, study = begin_slowly(folder)
+    started = session_of(process.pid)
+    os.killpg(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err == "compare.py: interrupted\n"
+    assert "0 of 2 runs" in out
+    assert "the same command goes on" in out
+    wait_for(lambda: not any(map(is_alive, started)))
+    assert not study.exists()
+    (folder / "mark").touch()
+    code, out, _ = finish(*SLOW)
+    assert (code, "2 runs, 0 of them there already" in out) == (0, True)
+    assert len(records(study)) == 2
+
+
+def test_ctrl_c_while_the_libraries_load(folder):
+    process = start(*SLOW)
+    wait_for(lambda: len(session_of(process.pid)) > 1)
+    time.sleep(0.3)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err == "compare.py: interrupted\n"
+    assert not (folder / "studies" / "Slow-v0_qlearning" / "runs").exists()
+
+
+STUDY = "agents: {qlearning: {gamma: 2}}\nenvironments: [FrozenLake-v1]\nn_timesteps: 9\n"
+MISTAKES = {
+    "nothing": ([], "what to compare? give --env and --algos, or a study file"),
+    "no agents": (["--env", "Taxi-v4"], "give --env and --algos"),
+    "both": (["bad.yml", "--env", "Taxi-v4"], "not both"),
+    "environment": (["--env", "Taxy-v4", "--algos", "dqn"], "did you mean 'Taxi-v4'"),
+    "agent": (["--env", "Taxi-v4", "--algos", "dqnn"], "did you mean 'dqn'?"),
+    "agent twice": (["--env", "Taxi-v4", "--algos", "dqn", "dqn"], "--algos names one of them"),
+    "seeds": ([*PAIR, "--seeds", "0"], "--seeds must be at least 1, not 0"),
+    "steps": ([*PAIR, "-n", "-5"], "--n-timesteps must be at least 1, not -5"),
+    "jobs": ([*PAIR, "-j", "-1"], "--jobs must be at least 0"),
+    "metric": ([*PAIR, "--metric", "finl"], "did you mean 'final'?"),
+    "margin": ([*PAIR, "--margin", "-1"], "--margin must be at least 0, not -1"),
+    "width": ([*PAIR, "--episodes-table", "0"], "--episodes-table must be at least 1"),
+    "module": ([*PAIR, "--gym-packages", "no_such"], "cannot import no_such"),
+    "file": (["nowhere.yml"], "nowhere.yml: cannot be read"),
+    "setting": ([*PAIR, "-params", "gama:0.9"], "did you mean 'gamma'?"),
+    "setting in a file": (["bad.yml"], "bad.yml:1: qlearning: gamma"),
+    "two budgets": ([*PAIR, "-n", "5"], "not both"),
+    "misfit": (["--env", "MountainCarContinuous-v0", "--algos", "sarsa"], "does not fit"),
+    "environment's argument": ([*PAIR, "--env-kwargs", "slipery:True"], "slipery"),
+    "flag": ([*PAIR, "--seds", "3"], "did you mean '--seeds'?"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_ends_in_one_line_and_leaves_nothing(type_command, folder, mistake):
+    (folder / "bad.yml").write_text(STUDY)
+    before = sorted(folder.rglob("*"))
+    words, complaint = MISTAKES[mistake]
+    code, out, err = type_command(*words)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("compare.py: error: ")
+    assert complaint in err
+    assert [p for p in sorted(folder.rglob("*")) if "__pycache__" not in str(p)] == before
+
+
+def test_tensorboard_logs_have_a_folder_for_each_run(type_command, folder):
+    words = [*LAKE, "--algos", "qlearning", "ppo", "-n", 256, "--seeds", 2, "-tb"]
+    assert type_command(*words, "--name", "logged")[0] == 0
+    study = folder / "studies" / "logged"
+    logs = sorted(study.glob("tensorboard/**/events.out.tfevents.*"))
+    assert [path.relative_to(study).parts[1:3] for path in logs] == [
+        (agent, f"FrozenLake-v1_{n}") for agent in ("ppo", "qlearning") for n in (1, 2)
+    ]
+    assert all(path.stat().st_size > 100 for path in logs)
+
+
+def test_films_of_training(type_command, folder):
+    from PIL import Image
+
+    words = [*PAIR, "--seeds", 2]
+    assert type_command(*words)[0] == 0
+    study = folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
+    before = records(study)
+    code, out, err = type_command(*words, "--render-every", 20)
+    assert (code, err) == (0, "")
+    # The first run of each agent is done again, this time with checkpoints.
+    assert "4 runs, 2 of them there already" in out
+    films = sorted(study.glob("films/*"))
+    assert [path.name for path in films] == [
+        f"{agent}_FrozenLake-v1_{n}.gif" for agent in ("qlearning", "sarsa") for n in (20, 40, 60)
+    ]
+    for path in films:
+        with Image.open(path) as film:
+            assert film.n_frames > 1
+            assert film.info["duration"] % 100 == 0
+    after = records(study)
+    assert [key for key in before if before[key] == after[key]] == [
+        ("qlearning", "FrozenLake-v1_2"),
+        ("sarsa", "FrozenLake-v1_2"),
+    ]
+    times = [path.stat().st_mtime_ns for path in films]
+    code, out, _ = type_command(*words, "--render-every", 20)
+    assert "4 runs, 4 of them there already" in out
+    assert [path.stat().st_mtime_ns for path in films] == times
+    # Training is the same with checkpoints as without.
+    assert type_command(*words, "--name", "plain", "-j", 1)[0] == 0
+    pair = [rows(folder / "studies" / name) for name in (study.name, "plain")]
+    pair = [table.drop(columns=["path", "seconds"]) for table in pair]
+    assert pair[0].equals(pair[1])
+
+
+HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib")
+
+
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (["--help"], 0),
+        (["--nonsense"], 2),
+        (["--env", "Taxy-v4", "--algos", "dqn"], 2),
+        (["--env", "Taxi-v4", "--algos", "dqnn"], 2),
+        (["--env", "MountainCarContinuous-v0", "--algos", "sarsa"], 2),
+        (["missing.yml"], 2),
+    ],
+)
+def test_answers_without_loading_anything_heavy(folder, words, code):
+    program = (
+        f"import sys, resource; sys.path.insert(0, {str(ROOT)!r}); import compare\n"
+        "from commands.parsing import run_command\n"
+        "try: run_command(compare.main)\n"
+        f"finally: print([name for name in sys.modules if name in {HEAVY}], file=sys.stderr)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", program, *words], capture_output=True, text=True, check=False
+    )
+    assert result.returncode == code
+    assert result.stderr.splitlines()[-1] == "[]"
+
+
+def test_help_is_instant(folder):
+    program = (
+        "import resource, subprocess, sys\n"
+        f"subprocess.run([sys.executable, {str(ROOT / 'compare.py')!r}, '--help'], check=True)\n"
+        "usage = resource.getrusage(resource.RUSAGE_CHILDREN)\n"
+        "print('CPU', usage.ru_utime + usage.ru_stime)\n"
+    )
+    seconds = []
+    for _ in range(3):
+        out = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True
+        )
+        seconds.append(float(re.search(r"CPU ([\d.e-]+)", out.stdout)[1]))
+        assert "--render-every" in out.stdout
+    assert min(seconds) < 0.3

@@ -1,0 +1,251 @@
+"""compare.py --logged: trained agents judged on logged pulls, as a user types it."""
+
+import csv
+import json
+import re
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import compare
+import envs  # noqa: F401
+from agents import load_algorithm
+from commands.parsing import run_command
+from envs.bandits import log_uniformly, read_log
+from experiments.off_policy.estimators import mean_reward
+from experiments.off_policy.logged_policies import compare_policies, probabilities, read_policy
+from pipeline.errors import UserError
+from report.off_policy_table import sentences, shown, verdict
+from verdicts import Estimate, paired_difference
+
+NAMES = {"0": "core", "1": "casual"}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two logs of the same A/B test, agents trained on the first one, and logs of other kinds."""
+    folder = tmp_path_factory.mktemp("logged")
+    env = gym.make("SegmentBandit-v0")
+    for seed, name in enumerate(("first.csv", "second.csv")):
+        log_uniformly(env, 1500, seed, folder / name)
+        named(folder / name, folder / f"named_{name}", NAMES)
+    env.close()
+    with gym.make("LinearBandit-v0", arm_parameters=[[1, 0], [0, 1]]) as linear:
+        log_uniformly(linear, 300, 0, folder / "vectors.csv")
+    train(folder, "linucb", "first.csv", "logs/linucb/ReplayBandit-v0_1")
+    train(folder, "linucb", "named_first.csv", "logs/linucb/ReplayBandit-v0_2")
+    train(folder, "linucb", "vectors.csv", "logs/linucb/ReplayBandit-v0_3")
+    train(folder, "thompson", "first.csv", "logs/thompson/ReplayBandit-v0_1", ignore_context=True)
+    train(folder, "ppo", "first.csv", "logs/ppo/ReplayBandit-v0_1", policy="MlpPolicy", n_steps=64)
+    return folder
+
+
+def rows_of(path):
+    return list(csv.reader(path.read_text().splitlines()))
+
+
+def named(source, target, names):
+    """A copy of a log whose contexts are words."""
+    rows = rows_of(source)
+    with target.open("w", newline="") as file:
+        csv.writer(file).writerows([rows[0], *([names[row[0]], *row[1:]] for row in rows[1:])])
+
+
+def train(folder, algo, log, run, **kwargs):
+    """An agent in a run folder such as training leaves behind."""
+    env = gym.make("ReplayBandit-v0", log=folder / log)
+    agent = load_algorithm(algo)(env=env, seed=0, **kwargs)
+    agent.learn(200 if algo == "ppo" else 1500)
+    (folder / run).mkdir(parents=True)
+    agent.save(folder / run / "ReplayBandit-v0.zip")
+    env.close()
+    spec = {"algo": algo, "env_id": "ReplayBandit-v0", "hyperparams": {"env_kwargs": {"log": log}}}
+    info = {"env_name": "ReplayBandit-v0", "spec": spec}
+    (folder / run / "run.json").write_text(json.dumps(info))
+
+
+@pytest.fixture
+def type_command(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["compare.py", *words])
+        with pytest.raises(SystemExit) as stop:
+            run_command(compare.main)
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+RUN = "logs/linucb/ReplayBandit-v0_1"
+
+
+def test_a_table_with_alternatives_and_a_verdict(type_command):
+    code, out, err = type_command(
+        "--logged", "second.csv", "--policy", RUN, f"{RUN}/ReplayBandit-v0.zip"
+    )
+    assert (code, err) == (0, "")
+    assert "second.csv: 1,500 pulls, 3 arms" in out
+    rows = [line.split("│")[1:-1] for line in out.splitlines() if line.startswith("│")]
+    names = [row[0].strip() for row in rows]
+    assert names[0] == RUN
+    assert names[-4:] == ["always arm 0", "always arm 1", "always arm 2", "as logged"]
+    assert all(re.fullmatch(r"[\d.]+ ± [\d.]+", cell.strip()) for cell in rows[0][1:5])
+    assert re.search(rf"{RUN} against always arm \d: \+0\S+ \[\S+, \S+\] a pull, \w+", out)
+    assert f"{RUN} and {RUN}/ReplayBandit-v0.zip do the same on this log" in out
+
+
+def test_figures_are_those_of_the_estimators(folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    data = read_log("second.csv")
+    policy = read_policy(folder / RUN)
+    comparison = compare_policies(data, [policy])
+    chosen = probabilities(policy, data).argmax(axis=1)
+    matched = chosen == data.arms
+    given, *always, logged = comparison.rows
+    assert given.terms.snips.mean() == pytest.approx(data.rewards[matched].mean())
+    assert given.terms.ips.mean() == pytest.approx(3 * (data.rewards * matched).mean())
+    for arm, row in enumerate(always):
+        assert row.terms.snips.mean() == pytest.approx(data.rewards[data.arms == arm].mean())
+        assert row.terms.effective == pytest.approx((data.arms == arm).sum())
+    assert mean_reward(logged.terms.ips).point == pytest.approx(data.rewards.mean())
+
+
+def test_library_agents_and_blind_ones_are_judged_too(type_command):
+    runs = ["logs/ppo/ReplayBandit-v0_1", "logs/thompson/ReplayBandit-v0_1"]
+    code, out, _ = type_command("--logged", "second.csv", "--policy", *runs)
+    assert code == 0
+    # A blind agent shows everybody the same arm.
+    assert re.search(
+        r"thompson/ReplayBandit-v0_1 and always arm \d do the same|against always", out
+    )
+
+
+def test_it_says_what_flatters_and_how_text_was_numbered(type_command):
+    code, out, _ = type_command("--logged", "first.csv", "--policy", RUN)
+    assert code == 0
+    assert f"{RUN} was trained on this log: its figures flatter it" in out
+    run = "logs/linucb/ReplayBandit-v0_2"
+    code, out, _ = type_command("--logged", "named_second.csv", "--policy", run)
+    assert code == 0
+    assert "context was read as 0 casual, 1 core" in out
+    assert "flatter" not in out
+
+
+def test_regressions_judge_a_policy_on_vectors(type_command):
+    run = "logs/linucb/ReplayBandit-v0_3"
+    code, out, _ = type_command("--logged", "vectors.csv", "--policy", run)
+    assert code == 0
+    assert f"{run} against " in out
+
+
+@pytest.fixture
+def damaged(folder):
+    """Logs with one thing wrong."""
+    rows = rows_of(folder / "second.csv")
+    logs = {
+        "none": [row[:3] for row in rows],
+        "zero": [rows[0], *([*row[:3], "0"] for row in rows[1:])],
+        "one_arm": [rows[0], *(row for row in rows[1:] if row[1] == "2")],
+        "halved": [rows[0], *([*row[:3], str(float(row[3]) / 2)] for row in rows[1:])],
+        "other": [rows[0], *([["new", "old"][int(row[0])], *row[1:]] for row in rows[1:])],
+    }
+    for name, content in logs.items():
+        with (folder / f"{name}.csv").open("w", newline="") as file:
+            csv.writer(file).writerows(content)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--logged", "second.csv"], "--logged LOG.csv and --policy RUN go together"),
+        (["--policy", RUN], "go together"),
+        (["--logged", "second.csv", "--policy", RUN, "--env", "X"], "not both"),
+        (["--logged", "absent.csv", "--policy", RUN], "cannot read absent.csv"),
+        (["--logged", "second.csv", "--policy", "absent"], "no such model file: absent"),
+        (["--logged", "second.csv", "--policy", "logs"], "logs is no run folder"),
+        (["--logged", "second.csv", "--policy", "first.csv"], "first.csv is no whole zip"),
+        (["--logged", "second.csv", "--policy", RUN, RUN], f"--policy names {RUN} twice"),
+        (["--logged", "none.csv", "--policy", RUN], "none.csv has no column 'propensity'"),
+        (["--logged", "zero.csv", "--policy", RUN], "line 2: propensity is '0', it must be a prob"),
+        (["--logged", "one_arm.csv", "--policy", RUN], "was never logged, and the policy chooses"),
+        (["--logged", "halved.csv", "--policy", RUN], "the propensities are too small"),
+        (["--logged", "vectors.csv", "--policy", RUN], "the agent observes one column of whole"),
+        (
+            ["--logged", "other.csv", "--policy", "logs/linucb/ReplayBandit-v0_2"],
+            "was trained on named_first.csv, whose contexts are casual, core; those of other.csv",
+        ),
+    ],
+)
+def test_mistakes_are_one_line(type_command, damaged, words, message):
+    code, out, err = type_command(*words)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert message in err
+
+
+def test_a_library_zip_from_elsewhere_needs_trust(type_command, folder, tmp_path):
+    run = tmp_path / "elsewhere"
+    run.mkdir()
+    for name in ("run.json", "ReplayBandit-v0.zip"):
+        (run / name).write_bytes((folder / "logs/ppo/ReplayBandit-v0_1" / name).read_bytes())
+    code, _, err = type_command("--logged", "second.csv", "--policy", str(run))
+    assert code == 2
+    assert "add --trust" in err
+    assert type_command("--logged", "second.csv", "--policy", str(run), "--trust")[0] == 0
+    (run / "run.json").unlink()
+    code, _, err = type_command(
+        "--logged", "second.csv", "--policy", str(run / "ReplayBandit-v0.zip")
+    )
+    assert code == 2
+    assert "lies in no run folder: what agent it holds is not known" in err
+
+
+def test_agents_that_observe_something_else_are_refused(folder, tmp_path):
+    run = folder / "logs/linucb/stacked_1"
+    run.mkdir()
+    zip_path = run / "ReplayBandit-v0.zip"
+    zip_path.write_bytes((folder / RUN / "ReplayBandit-v0.zip").read_bytes())
+    spec = {"algo": "linucb", "env_id": "ReplayBandit-v0", "hyperparams": {"frame_stack": 2}}
+    (run / "run.json").write_text(json.dumps({"env_name": "ReplayBandit-v0", "spec": spec}))
+    with pytest.raises(UserError, match="was trained with frame_stack"):
+        read_policy(run)
+
+
+def test_words():
+    assert verdict(Estimate(0.2, 0.1, 0.3, 9)) == "better"
+    assert verdict(Estimate(-0.2, -0.3, -0.1, 9)) == "worse"
+    assert verdict(Estimate(0.2, -0.1, 0.5, 9)) == "undecided"
+    assert shown(Estimate(0.16449, 0.14649, 0.18249, 9)) == "0.164 ± 0.018"
+    assert shown(Estimate(1234.5, 1000, 1469, 9)) == "1234 ± 234"
+    assert shown(Estimate(0.5, 0.5, 0.5, 9)) == "0.500 ± 0.000"
+
+
+def test_few_effective_pulls_are_said(folder, tmp_path, monkeypatch):
+    monkeypatch.chdir(folder)
+    lines = (folder / "second.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "short.csv").write_text("".join(lines[:150]))
+    comparison = compare_policies(read_log(tmp_path / "short.csv"), [read_policy(folder / RUN)])
+    assert any("effective pulls: too few" in sentence for sentence in sentences(comparison))
+    assert np.isclose(comparison.rows[-1].terms.effective, 149)
+
+
+def test_the_python_of_the_page_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    page = Path(compare.__file__).parent / "docs" / "bandits.md"
+    draw, decide = re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)
+    names = {}
+    exec(draw, names)  # noqa: S102
+    exec(decide, names)  # noqa: S102
+    names["env"].close()
+    printed = capsys.readouterr().out
+    # What the page quotes: +0.036 [+0.021, +0.051] against arm 1.
+    assert printed.startswith("always arm 1 Estimate(point=0.036")
+    estimate = paired_difference(
+        names["linucb"].terms.doubly_robust, names["best"].terms.doubly_robust
+    )
+    assert (estimate.low, estimate.high) == pytest.approx((0.021, 0.051), abs=6e-4)

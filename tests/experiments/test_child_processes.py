@@ -1,0 +1,168 @@
+"""Work in child processes: what comes back, what is tried again, and what is left behind."""
+
+import os
+import signal
+import sys
+import time
+from functools import partial
+
+import pytest
+
+from experiments.child_processes import (
+    StoppedError,
+    WorkFailedError,
+    local_executor,
+    stop_all,
+    supervise,
+)
+
+# What the children are to do; they import it by its name.
+CHORES = """
+import os, signal, time
+from pathlib import Path
+
+def add(first, second):
+    return first + second, os.getpid()
+
+def fail(folder, words):
+    (Path(folder) / f"try_{os.getpid()}").touch()
+    raise ValueError(words)
+
+def die(folder, times):
+    tries = len(list(Path(folder).glob("try_*")))
+    (Path(folder) / f"try_{os.getpid()}").touch()
+    if tries < times:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return tries
+
+def leave(code):
+    os._exit(code)
+
+def wait(folder):
+    (Path(folder) / f"waiting_{os.getpid()}").touch()
+    time.sleep(600)
+
+def threads():
+    return os.environ["OMP_NUM_THREADS"]
+
+def clean_up(folder):
+    with (Path(folder) / "cleaned").open("a") as file:
+        file.write(".")
+"""
+
+
+@pytest.fixture
+def chores(tmp_path, monkeypatch):
+    (tmp_path / "study_chores.py").write_text(CHORES)
+    monkeypatch.syspath_prepend(tmp_path)
+    import study_chores
+
+    yield study_chores
+    monkeypatch.delitem(sys.modules, "study_chores")
+
+
+def nothing():
+    pass
+
+
+def test_the_value_comes_back_from_another_process(chores):
+    with local_executor(2) as executor:
+        futures = [executor.submit(supervise, chores.add, n, 1, clean_up=nothing) for n in range(4)]
+        answers = [future.result() for future in futures]
+    assert [value for value, _ in answers] == [1, 2, 3, 4]
+    assert len({pid for _, pid in answers} | {os.getpid()}) == 5
+
+
+def test_one_thread_in_each_process(chores):
+    with local_executor(1) as executor:
+        assert executor.submit(supervise, chores.threads, clean_up=nothing).result() == "1"
+
+
+def test_an_exception_is_not_tried_again_and_its_traceback_is_kept(chores, tmp_path):
+    clean_up = partial(chores.clean_up, str(tmp_path))
+    with pytest.raises(WorkFailedError) as error:
+        supervise(chores.fail, str(tmp_path), "too\n  hot", clean_up=clean_up, tries=3)
+    assert str(error.value) == "too hot"
+    assert "Traceback" in error.value.details
+    assert "in fail" in error.value.details
+    assert error.value.details.endswith("ValueError: too\n  hot\n")
+    assert len(list(tmp_path.glob("try_*"))) == 1
+    assert (tmp_path / "cleaned").read_text() == "."
+
+
+def test_a_process_that_is_killed_costs_one_retry(chores, tmp_path):
+    clean_up = partial(chores.clean_up, str(tmp_path))
+    assert supervise(chores.die, str(tmp_path), 1, clean_up=clean_up) == 1
+    assert len(list(tmp_path.glob("try_*"))) == 2
+    assert (tmp_path / "cleaned").read_text() == ".."
+
+
+def test_a_process_that_always_dies_fails_with_the_signals_name(chores, tmp_path):
+    with pytest.raises(WorkFailedError, match=r"^its process died 2 times \(SIGKILL\)$"):
+        supervise(chores.die, str(tmp_path), 9, clean_up=nothing)
+    assert len(list(tmp_path.glob("try_*"))) == 2
+    with pytest.raises(WorkFailedError, match=r"^its process died 1 times \(exit code 3\)$"):
+        supervise(chores.leave, 3, clean_up=nothing, tries=1)
+
+
+def is_alive(pid):
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def wait_for(condition, seconds=30):
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_leaving_early_ends_the_children(chores, tmp_path):
+    clean_up = partial(chores.clean_up, str(tmp_path))
+
+    def run_and_leave():
+        with local_executor(2) as executor:
+            futures = [
+                executor.submit(supervise, chores.wait, str(tmp_path), clean_up=clean_up)
+                for _ in range(3)
+            ]
+            wait_for(lambda: len(list(tmp_path.glob("waiting_*"))) == 2)
+            outcomes.extend(futures)
+            raise KeyboardInterrupt
+
+    outcomes = []
+    with pytest.raises(KeyboardInterrupt):
+        run_and_leave()
+    pids = [int(path.name.partition("_")[2]) for path in tmp_path.glob("waiting_*")]
+    assert not any(map(is_alive, pids))
+    assert (tmp_path / "cleaned").read_text() == ".."
+    assert [type(future.exception()) for future in outcomes[:2]] == [StoppedError] * 2
+    assert outcomes[2].cancelled()
+    # The next block starts afresh.
+    with local_executor(1) as executor:
+        assert executor.submit(supervise, chores.add, 1, 1, clean_up=nothing).result()[0] == 2
+
+
+def test_nothing_is_started_after_the_end(chores):
+    with local_executor(1) as executor:
+        stop_all()
+        future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)
+        assert isinstance(future.exception(), StoppedError)
+
+
+def test_ctrl_c_does_not_reach_the_children(chores, tmp_path):
+    """The terminal sends it to the whole group; what it means is decided above."""
+    with local_executor(1) as executor:
+        waiting = executor.submit(supervise, chores.wait, str(tmp_path), clean_up=nothing)
+        wait_for(lambda: list(tmp_path.glob("waiting_*")))
+        (path,) = tmp_path.glob("waiting_*")
+        pid = int(path.name.partition("_")[2])
+        os.kill(pid, signal.SIGINT)
+        time.sleep(0.2)
+        assert is_alive(pid)
+        assert not waiting.done()
+        stop_all()
+        assert isinstance(waiting.exception(), StoppedError)

@@ -1,0 +1,449 @@
+"""From run folders to tables, judgements, sentences and figures, on runs written by hand."""
+
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+from rich.console import Console
+
+from experiments.analysis import analyse, mean_curve, values_over_seeds
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, read_results
+from experiments.study_plan import plan
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.run_folder import FINISHED
+from report.figures.study_figures import write_figures
+from report.sentences import enumeration, interval, number, sentences
+from report.tables import (
+    episodes_table,
+    print_analysis,
+    print_episodes_table,
+    write_tables,
+)
+
+OPTIMUM, BLIND = 100.0, 0.0
+ENVIRONMENT = EnvironmentSpec("Warehouse-v0", "Warehouse-v0", {"n_timesteps": 100})
+UNKNOWN = EnvironmentSpec("CartPole-v1", "CartPole-v1", {"n_timesteps": 100})
+
+
+def study_of(n_seeds=4, environments=(ENVIRONMENT,), agents=("qlearning", "sarsa"), **fields):
+    specs = tuple(AgentSpec(name, name) for name in agents)
+    return StudySpec("study", "A study", specs, tuple(environments), n_seeds, **fields)
+
+
+def write_run(planned, evaluations, episodes=((10, 1.0),) * 10, known=True, **info):
+    """A run folder: evaluations as (step, return), episodes as (length, return)."""
+    run = planned.run
+    run.params_path.mkdir(parents=True)
+    rows = [f"{r},{length},{n + 1}.0" for n, (length, r) in enumerate(episodes)]
+    text = "\n".join(['#{"t_start": 0, "env_id": "x"}', "r,l,t", *rows, ""])
+    (run.path / "0.monitor.csv").write_text(text)
+    final = None
+    if evaluations:
+        steps, values = zip(*evaluations, strict=True)
+        results = np.array(values, dtype=float)[:, None]
+        np.savez(run.evaluations_path, timesteps=steps, results=results, ep_lengths=results)
+        final = {"mean_return": values[-1], "std_return": 0.0, "mean_length": 10.0}
+        final |= {"success_rate": 1.0, "exact": known}
+        if known:
+            final |= {"optimum": OPTIMUM, "best_blind": BLIND}
+            final |= {"gap": OPTIMUM - values[-1], "score": values[-1] / OPTIMUM}
+    record = {
+        "state": FINISHED,
+        "spec": planned.spec.as_data(),
+        "final": final,
+        "best_mean_return": max(v for _, v in evaluations) if evaluations else None,
+        "best_timesteps": 50 if evaluations else 0,
+        "n_timesteps": 100,
+        "seconds": 2.5,
+        "engine": "compiled",
+    }
+    run.info_path.write_text(json.dumps(record | info))
+
+
+def results_of(study, root, finals, **options):
+    """A study whose runs end as ``finals`` says by agent and seed; None for one that is missing."""
+    planned = plan(study, root)
+    for run in planned:
+        final = finals[run.agent][run.seed]
+        if final is not None:
+            known = run.spec.env_id == ENVIRONMENT.env_id
+            write_run(run, [(50, final / 2), (100, final)], known=known, **options)
+    return read_results(study, planned, root)
+
+
+def said(results):
+    return " ".join(sentences(analyse(results)))
+
+
+def test_a_row_for_each_run(tmp_path):
+    study = study_of(n_seeds=1, agents=("qlearning",))
+    (planned,) = plan(study, tmp_path)
+    episodes = [(10, 1.0)] * 5 + [(25, 3.0)] * 2
+    write_run(planned, [(20, 10.0), (60, 96.0), (100, 90.0)], episodes)
+    results = read_results(study, [planned], tmp_path)
+    assert list(results.summary.columns) == list(RUN_COLUMNS)
+    row = results.summary.iloc[0]
+    assert (row["agent"], row["environment"], row["seed"]) == ("qlearning", "Warehouse-v0", 0)
+    assert (row["final"], row["gap"], row["score"]) == (90.0, 10.0, 0.9)
+    assert (row["optimum"], row["best_blind"], row["best"]) == (OPTIMUM, BLIND, 96.0)
+    # 0.95 of the way from 0 to 100, reached at the second evaluation; 6 episodes were over then.
+    assert (row["threshold"], row["steps_to_threshold"]) == (95.0, 60.0)
+    assert row["episodes_to_threshold"] == 5
+    # Two trapezoids of width 40, of mean heights 53 and 93.
+    assert row["area"] == pytest.approx(73.0)
+    assert row["training"] == pytest.approx(11 / 7)
+    assert (row["n_episodes"], row["n_timesteps"], row["seconds"]) == (7, 100, 2.5)
+    assert row["path"] == str(planned.path)
+
+
+def test_learning_curves_by_step_episode_and_time(tmp_path):
+    study = study_of(n_seeds=1, agents=("qlearning",))
+    (planned,) = plan(study, tmp_path)
+    write_run(planned, [(20, 10.0), (60, 96.0)], [(10, float(n)) for n in range(6)])
+    curves = read_results(study, [planned], tmp_path).curves
+    assert list(curves.columns) == list(CURVE_COLUMNS)
+    evaluations = curves[curves["kind"] == "evaluation"]
+    assert evaluations[["step", "episode", "seconds", "value"]].to_numpy().tolist() == [
+        [20, 2, 2, 10],
+        [60, 6, 6, 96],
+    ]
+    training = curves[curves["kind"] == "training"]
+    assert training["step"].tolist() == [10, 20, 30, 40, 50, 60]
+    assert training["value"].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_training_is_summed_up_in_blocks_of_episodes(tmp_path):
+    study = study_of(n_seeds=1, agents=("qlearning",))
+    (planned,) = plan(study, tmp_path)
+    write_run(planned, [(20, 1.0)], [(1, float(n)) for n in range(250)])
+    curves = read_results(study, [planned], tmp_path).curves
+    training = curves[curves["kind"] == "training"]
+    assert len(training) == 84
+    assert training["value"].iloc[[0, 1, -1]].tolist() == [1.0, 4.0, 249.0]
+    assert training["episode"].iloc[[0, 1, -1]].tolist() == [3, 6, 250]
+
+
+@pytest.mark.parametrize(
+    ("environment", "stated", "expected"),
+    [(ENVIRONMENT, None, 95.0), (UNKNOWN, None, 475.0), (ENVIRONMENT, 7.0, 7.0)],
+)
+def test_what_counts_as_solved(tmp_path, environment, stated, expected):
+    study = study_of(environments=[environment], threshold=stated)
+    results = results_of(study, tmp_path, {"qlearning": [90] * 4, "sarsa": [5] * 4})
+    assert set(results.summary["threshold"]) == {expected}
+    reached = set(results.summary["steps_to_threshold"])
+    assert reached == ({50.0, math.inf} if stated else {math.inf})
+
+
+def test_ranks_estimates_and_pairs(tmp_path):
+    finals = {"qlearning": [10, 11, 12, 13], "sarsa": [90, 91, 92, 91]}
+    results = results_of(study_of(), tmp_path, finals)
+    (environment,) = analyse(results).environments
+    assert [agent.agent for agent in environment.agents] == ["sarsa", "qlearning"]
+    assert (environment.optimum, environment.best_blind, environment.exact) == (100, 0, True)
+    assert environment.margin == pytest.approx(2.0)
+    best = environment.agents[0]
+    assert best.metric.mean.point == pytest.approx(91.0)
+    assert best.score.mean.point == pytest.approx(0.91)
+    assert best.area.point == pytest.approx(0.75 * 91)
+    assert best.success_rate.point == 1.0
+    assert best.seconds.point == 2.5
+    (pair,) = environment.pairs
+    assert (pair.first, pair.second, pair.verdict) == ("sarsa", "qlearning", "better")
+    assert pair.difference.point == pytest.approx(79.5)
+    assert values_over_seeds(results, "Warehouse-v0", "final")["qlearning"].tolist() == [
+        *(10, 11, 12, 13)
+    ]
+
+
+VERDICTS = {
+    "better": (
+        {"qlearning": [10, 11, 12, 13], "sarsa": [90, 91, 92, 91]},
+        "On Warehouse-v0, sarsa is better than qlearning (by 79.5 [",
+    ),
+    "equivalent": (
+        {"qlearning": [90, 91, 90, 91], "sarsa": [90.1, 91, 90, 91]},
+        "sarsa and qlearning are equivalent within 2.",
+    ),
+    "undecided": (
+        {"qlearning": [10, 80, 40, 60], "sarsa": [70, 30, 90, 40]},
+        "sarsa and qlearning are not distinguishable with 4 seeds (difference 10 [",
+    ),
+    "the optimum": (
+        {"qlearning": [100] * 4, "sarsa": [50, 51, 52, 53]},
+        "qlearning has the highest return of the final policy: 100, the optimum.",
+    ),
+    "all the best": (
+        {"qlearning": [90] * 4, "sarsa": [90] * 4},
+        "qlearning and sarsa have the highest return of the final policy: 90, a score of 0.9;",
+    ),
+    "a missing run": (
+        {"qlearning": [90, None, 90, 91], "sarsa": [50, 51, 52, 53]},
+        "On Warehouse-v0, 1 of 4 runs of qlearning is missing.",
+    ),
+    "two missing runs": (
+        {"qlearning": [90, None, None, 91], "sarsa": [50, 51, 52, 53]},
+        "On Warehouse-v0, 2 of 4 runs of qlearning are missing.",
+    ),
+    "no run": (
+        {"qlearning": [None] * 4, "sarsa": [50, 51, 52, 53]},
+        "On Warehouse-v0, no run of qlearning has finished.",
+    ),
+    "speed": (
+        {"qlearning": [100] * 4, "sarsa": [195] * 4},
+        "sarsa reaches a score of 0.95 after 50 steps; qlearning needs 2 times the steps (",
+    ),
+    "too slow": (
+        {"qlearning": [100] * 4, "sarsa": [5] * 4},
+        "qlearning reaches a score of 0.95 after 100 steps; sarsa did not in half of the runs",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", VERDICTS)
+def test_sentences(tmp_path, case):
+    finals, sentence = VERDICTS[case]
+    results = results_of(study_of(), tmp_path, finals)
+    assert sentence in said(results)
+
+
+def test_more_seeds_are_asked_for_where_they_would_help(tmp_path):
+    results = results_of(study_of(), tmp_path, VERDICTS["undecided"][0])
+    assert re.search(r"; [\d,]+ seeds would probably tell\.", said(results))
+
+
+def test_agents_of_which_every_two_are_equivalent_make_one_sentence(tmp_path):
+    agents = ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")
+    # The margin is 2: the first and the last lie further apart than that, all others do not.
+    finals = dict(zip(agents, ([90.0] * 4, [91.5] * 4, [91.5] * 4, [93.0] * 4), strict=True))
+    text = said(results_of(study_of(agents=agents), tmp_path, finals))
+    assert "double_qlearning, sarsa and expected_sarsa are equivalent within 2." in text
+    assert "sarsa, expected_sarsa and qlearning are equivalent within 2." in text
+    assert text.count("equivalent") == 2
+    assert "double_qlearning is better than qlearning (by 3)" in text
+
+
+def test_an_environment_without_a_known_optimum(tmp_path):
+    study = study_of(environments=[UNKNOWN])
+    results = results_of(study, tmp_path, {"qlearning": [480] * 4, "sarsa": [100, 120, 99, 98]})
+    text = said(results)
+    assert "qlearning has the highest return of the final policy: 480." in text
+    assert "optimum" not in text
+    assert "qlearning reaches a return of 475 after 100 steps" in text
+    (environment,) = analyse(results).environments
+    assert (environment.optimum, environment.margin, environment.exact) == (None, 0.0, False)
+    assert environment.agents[0].score is None
+
+
+def test_scores_over_environments(tmp_path):
+    second = replace(ENVIRONMENT, label="again")
+    study = study_of(environments=[ENVIRONMENT, second])
+    finals = {"qlearning": [10, 11, 12, 13], "sarsa": [90, 91, 92, 91]}
+    overall = analyse(results_of(study, tmp_path, finals)).overall
+    assert list(overall.scores) == ["sarsa", "qlearning"]
+    assert overall.improvement["sarsa", "qlearning"].point == 1.0
+    assert overall.improvement["qlearning", "sarsa"].point == 0.0
+    profile = overall.profiles["sarsa"].point
+    assert (profile[0], profile[50], profile[100]) == (1.0, 1.0, 0.0)
+
+
+def everything(results, tmp_path):
+    """All that is made of results; the text in the terminal."""
+    analysis = analyse(results)
+    console = Console(record=True, width=300, quiet=False, file=(tmp_path / "out").open("w"))
+    print_analysis(console, analysis)
+    blocks = episodes_table(results, 4)
+    print_episodes_table(console, blocks, 4)
+    write_tables(results)
+    write_figures(analysis, blocks)
+    console.file.close()
+    return console.export_text()
+
+
+MISFORTUNES = {
+    "an agent without a run": (UNKNOWN, {"qlearning": [None] * 2, "sarsa": [5, 6]}),
+    "one run in all": (UNKNOWN, {"qlearning": [None] * 2, "sarsa": [5, None]}),
+    "no shared seed": (ENVIRONMENT, {"qlearning": [None, 4], "sarsa": [5, None]}),
+}
+
+
+@pytest.mark.parametrize("case", MISFORTUNES)
+def test_failures_do_not_stop_the_analysis(tmp_path, case):
+    environment, finals = MISFORTUNES[case]
+    study = study_of(n_seeds=2, environments=[environment])
+    text = everything(results_of(study, tmp_path, finals), tmp_path)
+    assert environment.label in text
+    assert "no run of qlearning" in text or "is missing" in text
+
+
+def test_an_environment_without_a_run_is_named(tmp_path):
+    study = study_of(n_seeds=2, environments=[ENVIRONMENT, UNKNOWN])
+    planned = plan(study, tmp_path)
+    for run in planned:
+        if run.environment == ENVIRONMENT.label:
+            write_run(run, [(50, 3.0), (100, 4.0)])
+    results = read_results(study, planned, tmp_path)
+    everything(results, tmp_path)
+    assert said(results).endswith("On CartPole-v1, no run has finished.")
+    assert analyse(results).overall is None
+
+
+def test_a_study_without_a_run(tmp_path):
+    study = study_of()
+    results = read_results(study, plan(study, tmp_path), tmp_path)
+    assert len(results.summary) == len(results.curves) == 0
+    assert analyse(results).environments == ()
+
+
+def test_one_seed_decides_nothing(tmp_path):
+    study = study_of(n_seeds=1)
+    text = everything(results_of(study, tmp_path, {"qlearning": [9], "sarsa": [80]}), tmp_path)
+    assert "over 1 seed, sarsa has the highest" in text
+    assert "better" not in text
+    assert "not distinguishable" in text
+
+
+def test_runs_without_evaluations(tmp_path):
+    study = study_of(n_seeds=2)
+    planned = plan(study, tmp_path)
+    for run in planned:
+        write_run(run, [])
+    results = read_results(study, planned, tmp_path)
+    text = everything(results, tmp_path)
+    assert "no run has a figure for the return of the final policy" in text
+    trained = replace(results, study=replace(study, metric="training"))
+    assert "have the highest mean return of all training episodes: 1." in said(trained)
+
+
+def test_runs_without_an_episode(tmp_path):
+    study = study_of(n_seeds=2)
+    planned = plan(study, tmp_path)
+    for run in planned:
+        write_run(run, [(50, 1.0), (100, 3.0)], episodes=())
+    results = read_results(study, planned, tmp_path)
+    everything(results, tmp_path)
+    assert results.summary["n_episodes"].tolist() == [0] * 4
+    assert results.summary["final"].tolist() == [3.0] * 4
+
+
+def test_curves_that_share_no_point_are_left_out(tmp_path):
+    """One run ended after 2 episodes; the other is summed up in blocks of 3."""
+    study = study_of(n_seeds=2, agents=("qlearning",))
+    planned = plan(study, tmp_path)
+    write_run(planned[0], [(50, 1.0), (100, 3.0)], [(50, 1.0)] * 2)
+    write_run(planned[1], [(50, 1.0), (100, 3.0)], [(1, 1.0)] * 250)
+    results = read_results(study, planned, tmp_path)
+    arguments = (results, "Warehouse-v0", "qlearning")
+    assert mean_curve(*arguments, "training", "episode") is None
+    points, band = mean_curve(*arguments, "evaluation", "step")
+    assert (points.tolist(), band.point.tolist()) == ([50, 100], [1, 3])
+    everything(results, tmp_path)
+
+
+def test_the_mean_curve_of_runs(tmp_path):
+    results = results_of(study_of(n_seeds=2), tmp_path, {"qlearning": [10, 20], "sarsa": [5, None]})
+    points, band = mean_curve(results, "Warehouse-v0", "qlearning", "evaluation", "step")
+    assert points.tolist() == [50, 100]
+    assert band.point.tolist() == [7.5, 15.0]
+    assert (band.low <= band.point).all()
+    assert (band.point <= band.high).all()
+
+
+def test_files_of_comma_separated_values(tmp_path):
+    results = results_of(study_of(), tmp_path, VERDICTS["too slow"][0])
+    summary, curves = write_tables(results)
+    table = pd.read_csv(summary)
+    assert list(table.columns) == list(RUN_COLUMNS)
+    assert len(table) == 8
+    assert table["steps_to_threshold"].tolist() == [100, math.inf] * 4
+    assert table["exact"].tolist() == [True] * 8
+    table = pd.read_csv(curves)
+    assert list(table.columns) == list(CURVE_COLUMNS)
+    assert table["kind"].value_counts().to_dict() == {"training": 80, "evaluation": 16}
+
+
+def test_the_documented_columns_are_those_written():
+    text = (Path(__file__).parents[2] / "docs" / "compare.md").read_text()
+    table = text.partition("columns of `summary.csv`")[2].partition("\n\n`")[0]
+    rows = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    assert re.findall(r"`(\w+)`", " ".join(rows)) == list(RUN_COLUMNS)
+
+
+def test_the_table_per_block_of_episodes(tmp_path):
+    study = study_of(n_seeds=2, agents=("qlearning",))
+    planned = plan(study, tmp_path)
+    write_run(planned[0], [(100, 1.0)], [(1, r) for r in (1.0, 2.0, 3.0, 4.0)])
+    write_run(planned[1], [(100, 1.0)], [(1, r) for r in (5.0, 6.0, 7.0)])
+    table = episodes_table(read_results(study, planned, tmp_path), 2)
+    assert table.to_dict("list") == {
+        "environment": ["Warehouse-v0"] * 2,
+        "agent": ["qlearning"] * 2,
+        "episode": [2, 4],
+        "average": [3.5, pytest.approx(14 / 3)],
+        "minimum": [1.0, 3.0],
+        "maximum": [6.0, 7.0],
+    }
+
+
+def test_figures_as_png_and_svg_whose_text_is_text(tmp_path):
+    results = results_of(study_of(), tmp_path, VERDICTS["better"][0])
+    paths = write_figures(analyse(results), episodes_table(results, 5))
+    names = ["episodes", "intervals", "learning_curves"]
+    assert sorted(path.name for path in paths) == sorted(
+        f"Warehouse-v0_{name}.{suffix}" for name in names for suffix in ("png", "svg")
+    )
+    for path in paths:
+        if path.suffix == ".png":
+            with Image.open(path) as picture:
+                assert min(picture.size) > 500
+            continue
+        texts = re.findall(r"<text [^>]*>([^<]*)</text>", path.read_text())
+        assert "qlearning" in " ".join(texts)
+        if "curves" in path.name:
+            assert {"optimum", "best blind policy", "environment steps", "return"} <= set(texts)
+
+
+def test_labels_with_brackets_stay_as_they_are(tmp_path):
+    agents = tuple(AgentSpec(f"[{word}]", "qlearning") for word in ("red", "/b"))
+    study = replace(study_of(n_seeds=2), agents=agents)
+    results = results_of(study, tmp_path, {"[red]": [1, 2], "[/b]": [2, 3]})
+    text = everything(results, tmp_path)
+    rows = [line for line in text.splitlines() if "│" in line or "┃" in line]
+    assert any("[red]" in row and "[/b]" in row for row in rows)
+    assert sum("[red]" in row for row in rows) == sum("[/b]" in row for row in rows) == 2
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.74423, "0.7442"),
+        (79.0, "79"),
+        (-27427.4, "-27,427"),
+        (999.96, "1000"),
+        (0.00001, "0"),
+        (-0.00001, "0"),
+        (math.inf, "never"),
+        (math.nan, "-"),
+        (None, "-"),
+    ],
+)
+def test_numbers(value, text):
+    assert number(value) == text
+
+
+def test_enumerations_and_intervals():
+    from verdicts import Estimate
+
+    assert enumeration(["a"]) == "a"
+    assert enumeration(["a", "b"]) == "a and b"
+    assert enumeration(["a", "b", "c"]) == "a, b and c"
+    assert interval(Estimate(1.0, 0.5, 1.5, 3)) == "1 [0.5, 1.5]"
+    assert interval(Estimate(1.0, 1.0, 1.0, 3)) == "1"
+    assert interval(Estimate(1.0, math.nan, math.nan, 1)) == "1"

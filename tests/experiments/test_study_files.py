@@ -1,0 +1,281 @@
+"""Study files: what they may say, and how each mistake is told."""
+
+import re
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agents import ALGORITHMS
+from experiments.study_files import read_study, swept
+from experiments.study_spec import METRICS, AgentSpec, QuickSpec, file_name, layered
+from pipeline.errors import UserError
+
+
+@pytest.fixture
+def read(tmp_path):
+    def read_text(text):
+        path = tmp_path / "lakes.yml"
+        path.write_text(text)
+        return read_study(path)
+
+    return read_text
+
+
+BASE = "agents: [qlearning]\nenvironments: [FrozenLake-v1]\n"
+
+MISTAKES = {
+    "unknown key": (BASE + "seed: 3\n", 3, "unknown key 'seed': did you mean 'seeds'?"),
+    "unknown agent": (
+        "agents: [sarsa, qlerning]\nenvironments: [FrozenLake-v1]\n",
+        1,
+        "unknown agent 'qlerning': did you mean 'qlearning'?",
+    ),
+    "unknown agent in a mapping": (
+        "environments: [FrozenLake-v1]\nagents:\n  mine:\n    gamma: 0.9\n    algo: saarsa\n",
+        5,
+        "unknown agent 'saarsa': did you mean 'sarsa'?",
+    ),
+    "agent that is a list": (
+        "environments: [FrozenLake-v1]\nagents:\n  mine:\n    algo: [dqn]\n",
+        4,
+        "unknown agent",
+    ),
+    "unknown environment": (
+        "agents: [sarsa]\nenvironments:\n  lake: {id: FrozenLake-v1}\n  ice: {id: FrozenLak-v1}\n",
+        4,
+        "unknown environment 'FrozenLak-v1': did you mean 'FrozenLake-v1'",
+    ),
+    "no number": (BASE + "\nseeds: many\n", 4, "seeds must be a whole number, not 'many'"),
+    "no seeds": (BASE + "seeds: 0\n", 3, "seeds must be at least 1, not 0"),
+    "metric": (BASE + "metric: finl\n", 3, "did you mean 'final'?"),
+    "negative margin": (BASE + "margin: -0.1\n", 3, "margin must be at least 0, not -0.1"),
+    "two budgets": (
+        BASE + "n_timesteps: 5\nn_episodes: 5\n",
+        4,
+        "give n_timesteps or n_episodes, not both",
+    ),
+    "two budgets of an agent": (
+        "agents:\n  sarsa:\n    n_timesteps: 5\n    n_episodes: 5\nenvironments: [Taxi-v4]\n",
+        4,
+        "not both",
+    ),
+    "agent twice": (
+        "environments: [Taxi-v4]\nagents: [dqn, dqn]\n",
+        2,
+        "agents names one of them twice",
+    ),
+    "key twice": (BASE + "seeds: 1\nseeds: 2\n", 4, "key 'seeds' appears twice"),
+    "no agents": ("agents: []\nenvironments: [Taxi-v4]\n", 1, "at least one name"),
+    "agents left empty": ("agents:\nenvironments: [Taxi-v4]\n", 1, "at least one name"),
+    "no environments": ("agents: [dqn]\n", 1, "environments must list at least one name"),
+    "list of mappings": (
+        "agents:\n  - algo: dqn\nenvironments: [Taxi-v4]\n",
+        1,
+        "agents must list names, or map them to settings",
+    ),
+    "agent that is a number": (
+        "environments: [Taxi-v4]\nagents:\n  dqn: 3\n",
+        3,
+        "dqn must map names to values",
+    ),
+    "empty sweep": (BASE + "sweep:\n  gamma: []\n", 4, "gamma must be a list of values, not []"),
+    "sweep of one": (BASE + "sweep:\n  gamma: 0.9\n", 4, "must be a list of values, not 0.9"),
+    "sweep that is a list": (BASE + "sweep: [0.9]\n", 3, "sweep must map names to values"),
+    "quick": (BASE + "quick: {seed: 1}\n", 3, "unknown key 'seed'"),
+    "quick budget": (BASE + "quick:\n  budget: 0\n", 4, "above 0 and up to 1"),
+    "environment id": ("agents: [dqn]\nenvironments:\n  lake: {id: 3}\n", 3, "id must be a text"),
+    "settings": (BASE + "settings: 3\n", 3, "settings must map names to values"),
+    "no mapping": ("- qlearning\n", 1, "a study must map names to values"),
+    "no YAML": (BASE + "title: [\n", 4, ""),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_one_line_with_file_and_line(read, mistake):
+    text, line, complaint = MISTAKES[mistake]
+    with pytest.raises(UserError) as error:
+        read(text)
+    message = str(error.value)
+    assert "\n" not in message
+    assert re.match(rf".*lakes\.yml:{line}:", message)
+    assert complaint in message
+
+
+def test_an_empty_or_missing_file(read, tmp_path):
+    with pytest.raises(UserError, match=r"lakes\.yml:1: a study must map names to values"):
+        read("")
+    with pytest.raises(UserError, match=r"nowhere\.yml: cannot be read"):
+        read_study(tmp_path / "nowhere.yml")
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+        lambda inner: (
+            st.lists(inner, max_size=3)
+            | st.dictionaries(
+                st.sampled_from(
+                    ["agents", "environments", "sweep", "quick", "algo", "id", "seeds", "dqn"]
+                ),
+                inner,
+                max_size=4,
+            )
+        ),
+        max_leaves=12,
+    )
+)
+def test_whatever_stands_in_a_file_is_a_study_or_a_mistake(tmp_path_factory, data):
+    path = tmp_path_factory.getbasetemp() / "any.yml"
+    path.write_text(yaml.safe_dump(data))
+    try:
+        study = read_study(path)
+    except UserError as error:
+        mistake = str(error)
+    else:
+        mistake = None
+        assert study.agents
+        assert study.environments
+    assert mistake is None or "any.yml" in mistake
+
+
+def test_a_list_is_short_for_a_mapping(read):
+    short = read("agents: [qlearning, sarsa]\nenvironments: [Taxi-v4]\n")
+    long = read(
+        "agents: {qlearning: , sarsa: {algo: sarsa}}\nenvironments: {Taxi-v4: {id: Taxi-v4}}\n"
+    )
+    assert (short.agents, short.environments) == (long.agents, long.environments)
+    assert short.name == short.title == "lakes"
+    assert short.n_seeds == 10
+
+
+def test_what_a_study_says(read):
+    study = read(
+        "title: Which?\ndescription: Two lakes.\nseeds: 3\nn_episodes: 50\ntuned: false\n"
+        "eval_freq: 20\neval_episodes: 4\nmetric: area\nmargin: 0.5\nthreshold: 0.7\n"
+        "episodes_table: 10\nquick: {seeds: 1, budget: 0.5}\n"
+        "agents:\n"
+        "  slow: {algo: qlearning, learning_rate: 0.01, summary: creeps}\n"
+        "  sarsa: {tuned: true}\n"
+        "environments:\n"
+        "  slippery: {id: FrozenLake-v1}\n"
+        "  dry: {id: FrozenLake-v1, env_kwargs: {is_slippery: false}}\n"
+    )
+    assert (study.title, study.description, study.n_seeds) == ("Which?", "Two lakes.", 3)
+    assert (study.eval_freq, study.eval_episodes, study.metric) == (20, 4, "area")
+    assert (study.margin, study.threshold, study.episodes_table) == (0.5, 0.7, 10)
+    assert study.quick == QuickSpec(1, 0.5)
+    slow, sarsa = study.agents
+    assert (slow.label, slow.algo, slow.tuned, slow.summary) == (
+        "slow",
+        "qlearning",
+        False,
+        "creeps",
+    )
+    assert slow.settings == {"learning_rate": 0.01}
+    assert (sarsa.algo, sarsa.tuned) == ("sarsa", True)
+    assert slow.where.endswith("lakes.yml:14")
+    slippery, dry = study.environments
+    assert (slippery.env_id, slippery.settings) == ("FrozenLake-v1", {"n_episodes": 50})
+    assert dry.settings == {"n_episodes": 50, "env_kwargs": {"is_slippery": False}}
+
+
+def test_settings_of_an_environment_go_over_those_of_the_file(read):
+    study = read(
+        "agents: [qlearning]\nn_timesteps: 500\n"
+        "settings: {gamma: 0.9, env_kwargs: {is_slippery: false, map_name: 4x4}}\n"
+        "environments:\n"
+        "  small: {id: FrozenLake-v1}\n"
+        "  large: {id: FrozenLake-v1, n_episodes: 7, gamma: 0.8, env_kwargs: {map_name: 8x8}}\n"
+    )
+    small, large = study.environments
+    assert small.settings == {
+        "n_timesteps": 500,
+        "gamma": 0.9,
+        "env_kwargs": {"is_slippery": False, "map_name": "4x4"},
+    }
+    # One budget replaces the other, and arguments of the environment are put over one by one.
+    assert large.settings == {
+        "n_episodes": 7,
+        "gamma": 0.8,
+        "env_kwargs": {"is_slippery": False, "map_name": "8x8"},
+    }
+
+
+def test_sweeps_multiply(read):
+    study = read(
+        "environments: [Taxi-v4]\n"
+        "sweep: {gamma: [0.9, 0.99], learning_rate: [0.1, 0.5]}\n"
+        "agents:\n  qlearning:\n  sarsa:\n    sweep: {gamma: [0.5]}\n"
+    )
+    assert [agent.label for agent in study.agents] == [
+        "qlearning gamma=0.9, learning_rate=0.1",
+        "qlearning gamma=0.9, learning_rate=0.5",
+        "qlearning gamma=0.99, learning_rate=0.1",
+        "qlearning gamma=0.99, learning_rate=0.5",
+        "sarsa gamma=0.5, learning_rate=0.1",
+        "sarsa gamma=0.5, learning_rate=0.5",
+    ]
+    assert study.agents[2].settings == {"gamma": 0.99, "learning_rate": 0.1}
+
+
+NAMES = st.text("abcdef_", min_size=1, max_size=6)
+VALUES = st.integers() | st.floats(allow_nan=False) | st.booleans()
+
+
+@given(st.dictionaries(NAMES, st.lists(VALUES, min_size=1, max_size=3), max_size=3))
+def test_a_sweep_has_each_combination_once(sweep):
+    agents = swept(AgentSpec("one", "qlearning", {"kept": 1}), sweep)
+    size = 1
+    for values in sweep.values():
+        size *= len(values)
+    assert len(agents) == size
+    for agent in agents:
+        assert agent.settings["kept"] == 1
+        assert all(agent.settings[name] in values for name, values in sweep.items())
+        assert all(f"{name}={agent.settings[name]}" in agent.label for name in sweep)
+
+
+def test_a_swept_budget_replaces_the_other():
+    agent = AgentSpec("one", "qlearning", {"n_timesteps": 500})
+    assert [a.settings for a in swept(agent, {"n_episodes": [5, 9]})] == [
+        {"n_episodes": 5},
+        {"n_episodes": 9},
+    ]
+
+
+@given(
+    st.dictionaries(st.sampled_from(["gamma", "n_timesteps", "n_episodes"]), VALUES),
+    st.dictionaries(st.sampled_from(["gamma", "n_timesteps", "n_episodes"]), VALUES),
+    st.dictionaries(NAMES, VALUES),
+    st.dictionaries(NAMES, VALUES),
+)
+def test_later_settings_win(settings, changes, kwargs, changed_kwargs):
+    result = layered({**settings, "env_kwargs": kwargs}, {**changes, "env_kwargs": changed_kwargs})
+    assert {key: result[key] for key in changes} == changes
+    assert result["env_kwargs"] == {**kwargs, **changed_kwargs}
+    if {"n_timesteps", "n_episodes"} & set(changes):
+        assert {"n_timesteps", "n_episodes"} & set(result) <= set(changes)
+
+
+def test_quick_has_fewer_seeds_and_a_folder_of_its_own(read):
+    study = read(BASE + "seeds: 30\nquick: {seeds: 4}\n")
+    quick = study.quickened()
+    assert (quick.name, quick.n_seeds, quick.is_quick) == ("lakes-quick", 4, True)
+    assert read(BASE + "seeds: 1\n").quickened().n_seeds == 1
+
+
+def test_every_metric_and_every_agent_is_known(read):
+    for metric in METRICS:
+        assert read(BASE + f"metric: {metric}\n").metric == metric
+    names = ", ".join(ALGORITHMS)
+    assert len(read(f"agents: [{names}]\nenvironments: [Taxi-v4]\n").agents) == len(ALGORITHMS)
+
+
+@given(st.text())
+def test_a_label_makes_a_plain_file_name(label):
+    name = file_name(label)
+    assert name == file_name(name)
+    assert re.fullmatch(r"[\w.=+,-]+", name)
+    assert name not in (".", "..")

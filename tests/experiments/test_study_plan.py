@@ -1,0 +1,190 @@
+"""From a study to its runs: folders, seeds, settings, and what makes a run the same run."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from experiments.study_plan import check_settings, plan
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
+from pipeline.run_folder import FAILED, FINISHED
+
+LAKE = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1", {"n_timesteps": 100})
+
+
+def study_of(*agents, environments=(LAKE,), **fields):
+    agents = tuple(AgentSpec(agent, agent) if isinstance(agent, str) else agent for agent in agents)
+    return StudySpec("lakes", "Lakes", agents, tuple(environments), **fields)
+
+
+def only(study, root=Path("nowhere")):
+    (planned,) = plan(replace(study, n_seeds=1), root)
+    return planned
+
+
+def test_every_agent_on_every_environment_with_every_seed(tmp_path):
+    dry = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_episodes": 9})
+    planned = plan(study_of("qlearning", "sarsa", environments=(LAKE, dry), n_seeds=3), tmp_path)
+    assert [(run.seed, run.agent, run.environment) for run in planned] == [
+        (seed, agent, environment)
+        for seed in range(3)
+        for environment in ("FrozenLake-v1", "dry lake")
+        for agent in ("qlearning", "sarsa")
+    ]
+    assert all(run.spec.seed == run.seed for run in planned)
+    assert {run.spec.env_id for run in planned} == {"FrozenLake-v1"}
+    assert len({run.path for run in planned}) == len(planned)
+    # Numbers begin at 1, as those of single runs do.
+    assert planned[-1].path == tmp_path / "runs" / "sarsa" / "dry_lake_3"
+    assert planned[-1].run.env_name == "FrozenLake-v1"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_labels_become_names_of_folders(tmp_path):
+    agent = AgentSpec("a/b: gamma=0.9 (mine)", "qlearning")
+    assert only(study_of(agent), tmp_path).path.parent.name == "a_b_gamma=0.9_mine"
+
+
+@pytest.mark.parametrize("labels", [("a b", "a/b"), ("Mine", "mine"), ("same", "same")])
+def test_labels_that_would_share_a_folder(labels):
+    agents = [AgentSpec(label, "qlearning") for label in labels]
+    with pytest.raises(UserError, match=r"agents: .* would share the folder"):
+        plan(study_of(*agents), Path())
+    environments = [replace(LAKE, label=label) for label in labels]
+    with pytest.raises(UserError, match=r"environments: .* would share the folder"):
+        plan(study_of("sarsa", environments=environments), Path())
+
+
+def test_the_agents_settings_go_over_the_environments_and_those_over_the_file():
+    environment = EnvironmentSpec(
+        "lake",
+        "FrozenLake-v1",
+        {"gamma": 0.5, "learning_rate": 0.5, "env_kwargs": {"is_slippery": False}},
+    )
+    agent = AgentSpec(
+        "mine",
+        "qlearning",
+        {"learning_rate": 0.25, "n_episodes": 7, "env_kwargs": {"map_name": "8x8"}},
+    )
+    special = only(study_of(agent, environments=(environment,))).spec.hyperparams
+    assert special.algorithm["gamma"] == 0.5
+    assert special.algorithm["learning_rate"] == 0.25
+    assert special.env_kwargs == {"is_slippery": False, "map_name": "8x8"}
+    assert (special.n_episodes, special.n_timesteps) == (7, None)
+    file = only(study_of("qlearning")).spec.saved_hyperparams
+    # What neither of them mentions comes from the file.
+    untouched = set(file) - {"gamma", "learning_rate", "env_kwargs", "n_timesteps"}
+    assert untouched
+    assert all(special.algorithm[key] == file[key] for key in untouched)
+
+
+def test_untuned_agents_begin_with_their_defaults():
+    agent = AgentSpec("plain", "qlearning", {"gamma": 0.9}, tuned=False)
+    assert only(study_of(agent)).spec.saved_hyperparams == {"gamma": 0.9, "n_timesteps": 100}
+
+
+def test_a_quick_study_has_a_share_of_the_budget():
+    study = study_of("qlearning", AgentSpec("short", "sarsa", {"n_episodes": 4})).quickened()
+    long, short = plan(replace(study, n_seeds=1), Path())
+    assert long.spec.hyperparams.n_timesteps == 10
+    assert short.spec.hyperparams.n_episodes == 1
+
+
+@pytest.mark.parametrize(
+    ("agent", "complaint"),
+    [
+        (AgentSpec("a", "qlearning", {"n_timesteps": None}), "how long to train"),
+        (AgentSpec("a", "linucb"), "does not fit FrozenLake-v1"),
+        (AgentSpec("a", "qlearning", {"n_envs": 0}), "n_envs"),
+        (AgentSpec("a", "qlearning", {"n_timesteps": 0}), "n_timesteps"),
+        (AgentSpec("a", "qlearning", {"env_kwargs": {"slipery": True}}), "slipery"),
+        (AgentSpec("a", "qlearning", {"env_wrapper": "no.such.Wrapper"}), "no.such.Wrapper"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused_beforehand(tmp_path, agent, complaint):
+    with pytest.raises(UserError, match=complaint) as error:
+        plan(study_of("sarsa", replace(agent, where="lakes.yml:7")), tmp_path)
+    assert str(error.value).startswith("lakes.yml:7: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"learning_rat": 0.1}, "did you mean 'learning_rate'?"),
+        ({"gamma": 1.5}, "gamma"),
+        ({"callback": "pipeline.callbacks.NoSuchCallback"}, "NoSuchCallback"),
+    ],
+)
+def test_settings_that_the_agent_refuses_are_found_beforehand(tmp_path, settings, complaint):
+    study = study_of(AgentSpec("mine", "qlearning", settings, where="lakes.yml:3"))
+    with pytest.raises(UserError, match=rf"^lakes\.yml:3: .*{complaint}".replace("?", r"\?")):
+        check_settings(study, plan(study, tmp_path))
+    check_settings(study_of("qlearning"), plan(study_of("qlearning"), tmp_path))
+
+
+def record(planned, **fields):
+    """What a run that has come to its end leaves."""
+    planned.path.mkdir(parents=True, exist_ok=True)
+    info = {"state": FINISHED, "spec": planned.spec.as_data(), **fields}
+    planned.run.info_path.write_text(json.dumps(info))
+
+
+def test_a_run_is_finished_where_its_folder_says_so(tmp_path):
+    study = study_of("qlearning")
+    planned = only(study, tmp_path)
+    assert not planned.is_finished
+    record(planned, state=FAILED)
+    assert not planned.is_finished
+    record(planned)
+    assert planned.is_finished
+    assert only(study, tmp_path).is_finished
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [
+        study_of(AgentSpec("qlearning", "qlearning", {"gamma": 0.123})),
+        study_of(AgentSpec("qlearning", "sarsa")),
+        study_of("qlearning", environments=(replace(LAKE, settings={"n_timesteps": 101}),)),
+        study_of("qlearning", environments=(replace(LAKE, env_id="FrozenLake8x8-v1"),)),
+        study_of("qlearning", eval_freq=50),
+        study_of("qlearning", eval_episodes=3),
+    ],
+)
+def test_a_run_of_other_settings_does_not_count(tmp_path, changed):
+    record(only(study_of("qlearning"), tmp_path))
+    assert not only(changed, tmp_path).is_finished
+
+
+def test_what_is_shown_meanwhile_is_no_part_of_a_run(tmp_path):
+    planned = only(study_of("qlearning"), tmp_path)
+    loud = replace(planned.spec, verbose=2, progress=True, log_interval=7, pictures=True)
+    record(replace(planned, spec=loud))
+    assert planned.is_finished
+    logged = only(study_of("qlearning", tensorboard=True), tmp_path)
+    assert logged.is_finished
+    folder = tmp_path / "tensorboard" / "qlearning" / "FrozenLake-v1_1"
+    assert logged.spec.tensorboard_log == folder
+
+
+def test_checkpoints_are_asked_of_the_first_seed_alone(tmp_path):
+    record(only(study_of("qlearning"), tmp_path))
+    first, second = plan(study_of("qlearning", render_every=5, n_seeds=2), tmp_path)
+    assert (first.spec.save_every_n_episodes, second.spec.save_every_n_episodes) == (5, -1)
+    assert not first.is_finished
+    record(first)
+    assert first.is_finished
+    # Without films, a run that has checkpoints is as good as one without.
+    assert only(study_of("qlearning"), tmp_path).is_finished
+    assert not only(study_of("qlearning", render_every=6), tmp_path).is_finished
+
+
+def test_a_damaged_record_is_named(tmp_path):
+    planned = only(study_of("qlearning"), tmp_path)
+    record(planned)
+    planned.run.info_path.write_text("{")
+    with pytest.raises(UserError, match=r"run\.json is damaged"):
+        _ = planned.is_finished

@@ -1,0 +1,239 @@
+"""What is read for a picture, and the picture."""
+
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as npst
+from PIL import Image
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.monitor import load_results
+
+from agents import load_algorithm
+from pipeline.evaluation.sampled import Yardstick
+from pipeline.pictures import learning_curve
+from pipeline.pictures.learning_curve import draw_learning_curve, moving_average, read_monitors
+from pipeline.run_folder import Run
+
+
+def write_monitor(folder, name, rows, start=1000.0):
+    header = json.dumps({"t_start": start, "env_id": "FrozenLake-v1"})
+    lines = [f"#{header}", "r,l,t", *(",".join(map(str, row)) for row in rows)]
+    (folder / f"{name}.monitor.csv").write_text("\n".join(lines) + "\n")
+
+
+# --- reading -------------------------------------------------------------------------------------
+
+
+def test_the_episodes_of_one_environment(tmp_path):
+    write_monitor(tmp_path, 0, [(1.5, 10, 0.1), (-2.0, 5, 0.2), (0.0, 1, 0.3)])
+    steps, returns = read_monitors(tmp_path)
+    assert steps.tolist() == [10, 15, 16]
+    assert returns.tolist() == [1.5, -2.0, 0.0]
+
+
+def test_the_episodes_of_several_environments_in_the_order_in_which_they_ended(tmp_path):
+    # Three environments step together: the second one's first episode ends after 3 x 4 steps.
+    write_monitor(tmp_path, 0, [(1, 10, 9.0), (2, 5, 9.5)])
+    # Clocks do not count: processes start when they can.
+    write_monitor(tmp_path, 1, [(3, 4, 0.1), (4, 8, 0.2)], start=2000.0)
+    write_monitor(tmp_path, 2, [(5, 11, 50.0)], start=500.0)
+    steps, returns = read_monitors(tmp_path)
+    assert steps.tolist() == [12, 30, 33, 36, 45]
+    assert returns.tolist() == [3, 1, 5, 4, 2]
+
+
+def test_an_environment_without_an_ended_episode_has_stepped_all_the_same(tmp_path):
+    write_monitor(tmp_path, 0, [(1, 10, 0.1)])
+    write_monitor(tmp_path, 1, [])
+    steps, returns = read_monitors(tmp_path)
+    assert (steps.tolist(), returns.tolist()) == ([20], [1])
+
+
+@pytest.mark.parametrize("n_monitors", [0, 2])
+def test_no_episode_yet(tmp_path, n_monitors):
+    for n in range(n_monitors):
+        write_monitor(tmp_path, n, [])
+    steps, returns = read_monitors(tmp_path)
+    assert steps.shape == returns.shape == (0,)
+
+
+def test_further_columns_are_passed_over(tmp_path):
+    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 1}\nr,l,t,note\n1.0,3,0.1,hello\n')
+    steps, returns = read_monitors(tmp_path)
+    assert (steps.tolist(), returns.tolist()) == ([3], [1.0])
+
+
+@pytest.mark.parametrize("n_envs", [1, 3, 11])
+def test_the_monitors_of_a_real_run(tmp_path, n_envs):
+    """The steps are those that the algorithm counts; the rows are those that the library reads."""
+    ended = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            for done, info in zip(self.locals["dones"], self.locals["infos"], strict=True):
+                if done:
+                    ended.append((self.num_timesteps, info["episode"]["r"]))
+            return True
+
+    env = make_vec_env("CartPole-v1", n_envs, seed=0, monitor_dir=str(tmp_path))
+    load_algorithm("random")("RandomPolicy", env, seed=0).learn(1500, callback=Watch())
+    env.close()
+    steps, returns = read_monitors(tmp_path)
+    # Episodes that end in the same step have no order.
+    assert sorted(zip(steps, returns, strict=True)) == sorted(ended)
+    assert (np.diff(steps) >= 0).all()
+    assert sorted(returns) == sorted(load_results(str(tmp_path))["r"])
+
+
+# --- moving averages -----------------------------------------------------------------------------
+
+
+def test_a_moving_average_worked_by_hand():
+    values = np.array([1.0, 3.0, 5.0, 7.0])
+    assert moving_average(values, 2).tolist() == [1, 2, 4, 6]
+    assert moving_average(values, 1).tolist() == [1, 3, 5, 7]
+    assert moving_average(values, 9).tolist() == [1, 2, 3, 4]
+    assert moving_average(np.empty(0), 3).shape == (0,)
+
+
+@given(
+    npst.arrays(np.float64, st.integers(1, 50), elements=st.floats(-1000, 1000)),
+    st.integers(1, 60),
+)
+def test_a_moving_average_is_a_convolution(values, width):
+    averages = moving_average(values, width)
+    assert averages.shape == values.shape
+    # Where there are fewer values, it is the mean of all.
+    counts = np.minimum(np.arange(1, len(values) + 1), width)
+    expected = np.convolve(values, np.ones(width))[: len(values)] / counts
+    np.testing.assert_allclose(averages, expected, rtol=1e-9, atol=1e-9)
+
+
+# --- the picture ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def run(tmp_path):
+    return Run.claim(tmp_path, "qlearning", "FrozenLake-v1")
+
+
+def picture(run, title="qlearning on FrozenLake-v1, seed 0"):
+    draw_learning_curve(run, title)
+    with Image.open(run.curve_path) as image:
+        image.load()
+        assert image.format == "PNG"
+        return image.size, np.asarray(image.convert("RGB")).reshape(-1, 3)
+
+
+def has_colour(pixels, colour):
+    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return bool((pixels == wanted).all(axis=1).any())
+
+
+def write_evaluations(run, results):
+    results = np.array(results, dtype=np.float64)
+    steps = 1000 * np.arange(1, len(results) + 1)
+    np.savez(run.evaluations_path, timesteps=steps, results=results, ep_lengths=results)
+
+
+def test_the_picture_of_a_run(run):
+    rng = np.random.default_rng(0)
+    write_monitor(run.path, 0, [(r, 10, i) for i, r in enumerate(rng.random(300))])
+    write_evaluations(run, rng.random((5, 3)))
+    size, pixels = picture(run)
+    assert size == (960, 540)
+    assert has_colour(pixels, learning_curve.ORANGE)
+    assert has_colour(pixels, learning_curve.BLUE)
+    assert sorted(path.name for path in run.path.iterdir()) == [
+        "0.monitor.csv",
+        "FrozenLake-v1",
+        "evaluations.npz",
+        "learning_curve.png",
+    ]
+
+
+def test_training_alone_and_evaluation_alone(run):
+    write_evaluations(run, [[1.0]])
+    _, pixels = picture(run)
+    assert has_colour(pixels, learning_curve.BLUE)
+    assert not has_colour(pixels, learning_curve.ORANGE)
+    run.evaluations_path.unlink()
+    write_monitor(run.path, 0, [(float(i), 10, i) for i in range(50)])
+    _, pixels = picture(run)
+    assert has_colour(pixels, learning_curve.ORANGE)
+    assert not has_colour(pixels, learning_curve.BLUE)
+
+
+@pytest.mark.parametrize("rows", [None, [], [(1.0, 3, 0.1)]])
+def test_a_run_with_little_to_show_is_drawn_without_warnings(run, rows):
+    if rows is not None:
+        write_monitor(run.path, 0, rows)
+    size, pixels = picture(run)
+    assert size == (960, 540)
+    assert not has_colour(pixels, learning_curve.BLUE)
+
+
+def test_the_legend_covers_nothing(run, monkeypatch):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, draft, **_: drawn.append(figure))
+    write_monitor(run.path, 0, [(float(i), 10, i) for i in range(50)])
+    write_evaluations(run, [[1.0], [2.0]])
+    with pytest.raises(FileNotFoundError):
+        # The picture was not written.
+        draw_learning_curve(run, "title", yardstick=Yardstick(optimum=50, blind=0))
+    (figure,) = drawn
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    texts = [text.get_text() for text in legend.get_texts()]
+    assert texts[2:] == ["optimum", "best blind policy"]
+    box, (axes,) = legend.get_window_extent(), figure.axes
+    assert not box.overlaps(axes.get_tightbbox())
+    assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
+    assert figure.bbox.y0 <= box.y0
+
+
+def scale_of(returns):
+    from matplotlib.figure import Figure
+
+    axes = Figure().subplots()
+    learning_curve._compress_outliers(axes, np.array(returns, dtype=np.float64))
+    return axes.get_yscale()
+
+
+@pytest.mark.parametrize(
+    ("returns", "scale"),
+    [
+        ([], "linear"),
+        ([0.0], "linear"),
+        ([1.0, 500.0], "linear"),
+        ([-790.0, 79.0, 79.0, 79.0], "linear"),
+        ([-791.0, 79.0, 79.0, 79.0], "symlog"),
+        ([0.0] * 8, "linear"),
+        ([11.0, 0.0, 0.0, 0.0], "symlog"),
+    ],
+)
+def test_early_returns_that_dwarf_the_last_are_compressed(returns, scale):
+    assert scale_of(returns) == scale
+
+
+def test_long_runs_are_thinned_out(run, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(learning_curve, "MAX_POINTS", 10)
+    from matplotlib.axes import Axes
+
+    plot = Axes.plot
+
+    def note(self, x, *args, **kwargs):
+        drawn.append(len(x))
+        return plot(self, x, *args, **kwargs)
+
+    monkeypatch.setattr(Axes, "plot", note)
+    write_monitor(run.path, 0, [(float(i), 10, i) for i in range(100)])
+    picture(run)
+    assert drawn == [10, 10]

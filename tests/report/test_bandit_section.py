@@ -1,0 +1,189 @@
+"""Studies on bandits as pictures and as a page."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import integrate
+
+from experiments.analysis import analyse
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from report.figures.posteriors import density, grid, is_normal, truth
+from report.figures.study_figures import write_figures
+from report.page import bandit_section, write_report
+from report.page.sections import Report
+
+PLACES = (
+    EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 400}),
+    EnvironmentSpec("segments", "SegmentBandit-v0", {"n_timesteps": 400}),
+    EnvironmentSpec("testbed", "GaussianBandit-v0", {"n_timesteps": 400}),
+)
+AGENTS = (
+    AgentSpec("<b>Thompson</b>", "thompson", tuned=False),
+    AgentSpec("blind", "thompson", {"ignore_context": True}, tuned=False),
+    AgentSpec("normal", "thompson", {"likelihood": "gaussian"}, tuned=False),
+    AgentSpec("eager", "epsilon_greedy", {"exploration_initial_eps": 1.0}, tuned=False),
+)
+
+
+@pytest.fixture(scope="module")
+def analysis(tmp_path_factory, do_study):
+    """Agents for clicks on two bandits; the third knows one of them alone."""
+    study = StudySpec("s", "S", AGENTS, PLACES[:2], n_seeds=4, metric="regret")
+    return analyse(do_study(study, tmp_path_factory.mktemp("study")))
+
+
+@pytest.fixture(scope="module")
+def page(analysis):
+    path = analysis.results.root / "report.html"
+    write_report(analysis, path, "compare.py s.yml")
+    return path.read_text(encoding="utf-8")
+
+
+def data_of(page, name):
+    found = re.search(f'<script type="application/json" id="data-{name}">(.*?)</script>', page)
+    return None if found is None else json.loads(found[1])
+
+
+def test_the_page_has_pulls_and_no_empty_curves(page):
+    anchors = re.findall(r'<section id="(\w+)"', page)
+    assert anchors == ["verdict", "ranking", "bandits", "comparison", "settings"]
+    assert data_of(page, "curves") is None
+    # A batch's agents are gone: there is nobody to film, and no return of a final policy.
+    assert "Final returns are" not in page
+    assert 'aria-sort="ascending"' in page
+    assert "a lower regret of a run is better" in page
+    assert "<b>Thompson" not in page
+
+
+def test_the_data_are_the_statistics(analysis, page):
+    data = data_of(page, "bandits")
+    for item, environment in zip(data, analysis.environments, strict=True):
+        assert list(item["curves"]) == [agent.agent for agent in environment.agents]
+        for label, curves in item["curves"].items():
+            statistics = analysis.results.pulls[label, environment.environment]
+            assert curves["x"] == statistics.pulls.tolist()
+            regret = curves["regret"]
+            assert regret["mean"]["y"] == pytest.approx(statistics.cumulative_regret, rel=1e-4)
+            reach = 1.96 * statistics.cumulative_regret_sem
+            high = statistics.cumulative_regret + reach
+            assert regret["mean"]["high"] == pytest.approx(high, rel=1e-4)
+            assert regret["runs"]["y"] == pytest.approx(
+                statistics.cumulative_regret_quantiles[2], rel=1e-4
+            )
+            assert curves["simple"] == pytest.approx(statistics.simple_regret, rel=1e-4)
+    coins, segments = data
+    assert coins["best"] == 0.75
+    assert segments["best"] == pytest.approx(0.159)
+    assert segments["bounds"] is None
+    assert coins["bounds"]["auer"][-1] == pytest.approx(46.545 * np.log(400) + 3.432, rel=1e-3)
+    assert coins["bounds"]["lai_robbins"][0] == 0
+
+
+def test_the_table_by_context(analysis):
+    segments = analysis.results.pulls["blind", "segments"]
+    tables = bandit_section.context_tables({"blind": segments})
+    assert [table.name for table in tables] == ["context 0", "context 1"]
+    core, casual = tables
+    assert [row.mean for row in core.rows] == [0.10, 0.25, 0.05]
+    assert [row.regret for row in casual.rows] == pytest.approx([0, 0.06, 0.07])
+    for context, table in enumerate(tables):
+        shares = [row.shares["blind"] for row in table.rows]
+        assert shares == pytest.approx(segments.shares[context])
+        gaps = [row.regret for row in table.rows]
+        assert table.regrets["blind"] == pytest.approx(np.dot(shares, gaps))
+        # The same as what was summed up pull by pull.
+        known = np.nan_to_num(segments.context_regret[context])
+        assert table.regrets["blind"] == pytest.approx(segments.shares[context] @ known)
+    (alone,) = bandit_section.context_tables({"it": analysis.results.pulls["normal", "coins"]})
+    assert alone.name == ""
+
+
+def test_beliefs(analysis):
+    results = analysis.results
+    assert [is_normal(results, agent.label) for agent in AGENTS] == [False, False, True, False]
+    normal, beta = (results.pulls[a.label, "coins"] for a in (AGENTS[2], AGENTS[0]))
+    for statistics, is_bell in ((normal, True), (beta, False)):
+        points = grid(statistics.true_means, is_normal=is_bell)
+        for parameters in statistics.posteriors[0, 0]:
+            y = density(parameters, points, is_normal=is_bell)
+            assert integrate.trapezoid(y, points) == pytest.approx(1, abs=0.02)
+        assert truth(statistics, 0, 2) == 0.75
+    # What an agent believes of an arm over all contexts has no one true mean here.
+    assert truth(results.pulls["blind", "segments"], 0, 1) is None
+    assert truth(results.pulls[AGENTS[0].label, "segments"], 0, 1) == 0.25
+
+
+def test_posteriors_on_the_page(page):
+    coins, segments = data_of(page, "bandits")
+    assert {item["agent"] for item in coins["posteriors"]} == {a.label for a in AGENTS[:3]}
+    by_agent = {item["agent"]: item for item in segments["posteriors"]}
+    item = by_agent[AGENTS[0].label]
+    assert item["moments"] == [10, 100, 400]
+    assert np.shape(item["densities"]) == (3, 2, 3, len(item["x"]))
+    assert item["truth"] == [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]
+    assert np.shape(by_agent["blind"]["densities"])[1] == 1
+    assert by_agent["blind"]["truth"] == [[None] * 3]
+
+
+def test_figures(analysis):
+    study = replace(analysis.study, environments=PLACES[1:2])
+    analysis = replace(
+        analysis,
+        results=replace(analysis.results, study=study),
+        environments=analysis.environments[1:],
+    )
+    names = {path.name for path in write_figures(analysis, None) if path.suffix == ".png"}
+    assert names == {
+        *(f"segments_{kind}.png" for kind in ("pulls", "regret", "arms")),
+        *(f"segments_{agent}_posteriors.png" for agent in ("b_Thompson_b", "blind", "normal")),
+    }
+
+
+def test_bandits_whose_arms_are_drawn_anew(tmp_path, do_study):
+    """There are no arms to tell apart over runs, and no bounds; curves there are."""
+    agents = (AGENTS[2], AGENTS[3])
+    study = StudySpec("s", "S", agents, PLACES[2:], n_seeds=3, metric="regret")
+    analysis = analyse(do_study(study, tmp_path))
+    (item,) = bandit_section.section(Report(analysis, "")).data
+    assert item["best"] == pytest.approx(1.5388, abs=1e-4)
+    assert (item["bounds"], item["arms"], item["posteriors"]) == (None, None, [])
+    assert set(item["curves"]) == {"normal", "eager"}
+    names = {path.stem for path in write_figures(analysis, None)}
+    assert names == {"testbed_pulls", "testbed_regret"}
+
+
+def test_a_parameter_is_drawn_by_its_values(tmp_path, do_study):
+    agents = tuple(
+        AgentSpec(
+            f"epsilon={value}",
+            "epsilon_greedy",
+            {"exploration_initial_eps": value},
+            tuned=False,
+            group="epsilon-greedy",
+            swept={"exploration_initial_eps": value},
+        )
+        for value in (0.05, 0.1, 0.2)
+    )
+    study = StudySpec("s", "S", agents, PLACES[:1], n_seeds=2, metric="training")
+    names = {path.stem for path in write_figures(analyse(do_study(study, tmp_path)), None)}
+    assert "coins_sweep" in names
+
+
+def test_a_study_of_both_kinds(tmp_path, do_study):
+    """Curves by step where there is no bandit, curves by pull where there is."""
+    lake = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 200})
+    coins = replace(PLACES[0], settings={"n_timesteps": 60})
+    agents = (AgentSpec("qlearning", "qlearning", tuned=False),)
+    study = StudySpec("s", "S", agents, (lake, coins), n_seeds=2)
+    analysis = analyse(do_study(study, tmp_path))
+    path = tmp_path / "report.html"
+    write_report(analysis, path, "")
+    page = path.read_text(encoding="utf-8")
+    by_step, by_pull = data_of(page, "curves"), data_of(page, "bandits")
+    assert [item is None for item in by_step] == [False, True]
+    assert [item is None for item in by_pull] == [True, False]
+    assert "This environment is a bandit" in page
+    assert "This environment is no bandit" in page

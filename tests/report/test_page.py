@@ -1,0 +1,337 @@
+"""The page of a study: what is on it, and that nothing can be put into it or drawn from outside."""
+
+import base64
+import hashlib
+import json
+import math
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from report.figures.study_figures import COLOURS, agent_style
+from report.page import write_report
+from report.page.assembly import SECTIONS
+from report.page.comparison_section import improvement_matrix
+from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
+from report.page.markup import bar, inline_script, interval_alone, p_value, plain, setting
+from report.page.scales import linear_up_to
+from report.sentences import sentences
+from verdicts import Estimate
+
+HOSTILE = "</script><script>document.title='taken'</script>"
+
+# Attributes that make a browser fetch something.
+LOADING = {"src", "srcset", "data", "poster", "action", "formaction", "background", "ping"}
+SECTION_NAMES = [
+    "verdict",
+    "ranking",
+    "curves",
+    "comparison",
+    "overall",
+    "policies",
+    "films",
+    "settings",
+]
+
+
+class Page(HTMLParser):
+    """What a page holds: its elements with their attributes, and the text inside each."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements, self.texts, self._open = [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.elements.append((tag, dict(attrs)))
+        self.texts.append("")
+        self._open.append(len(self.texts) - 1)
+        if tag in {"meta", "link", "img", "input", "br"}:
+            self._open.pop()
+
+    def handle_endtag(self, tag):
+        while self._open and self.elements[self._open.pop()][0] != tag:
+            pass
+
+    def handle_data(self, data):
+        for place in self._open:
+            self.texts[place] += data
+
+    def all(self, tag):
+        """Attributes and text of each such element."""
+        return [
+            (attributes, text)
+            for (name, attributes), text in zip(self.elements, self.texts, strict=True)
+            if name == tag
+        ]
+
+
+@pytest.fixture(scope="module")
+def text(report_study):
+    return report_study.page.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def page(text):
+    return Page(text)
+
+
+def data_names(page):
+    return [a["id"] for a, _ in page.all("script") if a.get("type") == "application/json"]
+
+
+def data_of(page, name):
+    found = [text for attributes, text in page.all("script") if attributes.get("id") == name]
+    assert len(found) == 1
+    return json.loads(found[0])
+
+
+# --- structure -----------------------------------------------------------------------------------
+
+
+def test_the_sections_in_their_order(page):
+    assert [attributes["id"] for attributes, _ in page.all("section")] == SECTION_NAMES
+    assert len(SECTIONS) >= len(SECTION_NAMES)
+
+
+def test_a_language_a_title_one_main_heading_and_a_heading_for_each_section(page):
+    assert page.all("html")[0][0]["lang"] == "en"
+    assert page.all("title")[0][1] == "Small & <b>bold</b>"
+    assert [text for _, text in page.all("h1")] == ["Small & <b>bold</b>"]
+    assert len(page.all("h2")) == len(SECTION_NAMES)
+    labelled = {attributes["aria-labelledby"] for attributes, _ in page.all("section")}
+    assert labelled == {attributes["id"] for attributes, _ in page.all("h2")}
+
+
+def test_no_id_is_given_twice_and_all_links_lead_somewhere(page):
+    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    assert {attributes["href"][1:] for attributes, _ in page.all("a")} <= set(ids)
+
+
+def test_the_verdict_comes_first_and_says_all_that_the_study_has_shown(page, report_study):
+    verdict = page.all("section")[0][1]
+    expected = sentences(report_study.analysis)
+    assert len(expected) > 3
+    assert [sentence for sentence in expected if sentence not in verdict] == []
+
+
+def test_the_ranking_holds_every_agent_of_every_environment_best_first(page, report_study):
+    tables = page.all("table")
+    rankings = [text for attributes, text in tables if attributes.get("class") == "sortable"]
+    for environment, table in zip(report_study.analysis.environments, rankings, strict=False):
+        places = [table.index(agent.agent) for agent in environment.agents]
+        assert places == sorted(places)
+        assert len(places) == 3
+
+
+def test_sorted_columns_say_so(page):
+    sorted_headings = [a["aria-sort"] for a, _ in page.all("th") if "aria-sort" in a]
+    assert sorted_headings == ["descending"] * 2  # the ranking of each environment
+
+
+def test_every_figure_has_a_caption_and_every_plot_a_description(page):
+    assert len(page.all("figcaption")) == len(page.all("figure"))
+    plots = [a for a, _ in page.all("div") if "plot" in a.get("class", "").split()]
+    assert len(plots) >= 6
+    assert all(a["role"] == "img" and len(a["aria-label"]) > 20 for a in plots)
+
+
+def test_settings_command_versions_and_failures(page, report_study):
+    settings = page.all("section")[-1][1]
+    assert "python compare.py 'a & b.yml'" in settings
+    assert "Seeds: 0 to 1." in settings
+    assert "2,000" in settings  # steps run
+    assert "gamma" in settings
+    assert report_study.planned[0].run.read_info()["versions"]["numpy"] in settings
+    assert re.search(r"on Warehouse-v0, seed 1:\s+ValueError: <the> disk & all is full", settings)
+
+
+def test_a_study_on_one_environment_compares_nothing_over_environments(one_environment, tmp_path):
+    write_report(one_environment, tmp_path / "page.html", "python compare.py x.yml")
+    page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
+    names = [attributes["id"] for attributes, _ in page.all("section")]
+    assert names == [name for name in SECTION_NAMES if name != "overall"]
+    assert not [a for a, _ in page.all("select") if a.get("id") == "environment"]
+
+
+# --- data of the figures -------------------------------------------------------------------------
+
+
+def test_the_curves_end_with_the_final_evaluations(page, report_study):
+    curves = data_of(page, "data-curves")[0]["evaluation"]["step"]
+    summary = report_study.analysis.results.curves
+    for agent in ("Q-learning & co", "sarsa"):
+        rows = summary[
+            (summary["agent"] == agent)
+            & (summary["environment"] == "FrozenLake-v1")
+            & (summary["kind"] == "evaluation")
+        ]
+        last = rows.groupby("seed")["value"].last().mean()
+        assert curves[agent]["y"][-1] == pytest.approx(last, rel=1e-4)
+        assert curves[agent]["x"][-1] == 2000
+
+
+def test_the_curves_stand_in_a_table_too(page):
+    tables = [text for _, text in page.all("details") if "as a table" in text]
+    assert len(tables) == 2
+    for place, table in enumerate(tables):
+        assert re.findall(r"\d+ %", table) == ["10 %", "25 %", "50 %", "100 %"]
+        for agent, curve in data_of(page, "data-curves")[place]["evaluation"]["step"].items():
+            row = table[table.index(agent) + len(agent) :].replace(",", "")
+            cells = re.findall(r"(\S+)\s+(?:\S+ to \S+ )?(\d+) steps", row)[:4]
+            means, steps = np.array(cells, dtype=float).T
+            assert steps.tolist() == [200, 500, 1000, 2000]
+            assert means == pytest.approx(
+                np.interp(steps, curve["x"], curve["y"]), rel=1e-3, abs=1e-4
+            )
+
+
+def test_an_agent_has_the_colour_of_the_printed_figures(page, report_study):
+    marks = data_of(page, "data-page")["agents"]
+    assert [COLOURS[mark["colour"]] for mark in marks] == [
+        agent_style(report_study.study, mark["label"])["color"] for mark in marks
+    ]
+
+
+def test_the_matrix_of_improvement_is_the_pairs_seen_from_both_sides(report_study):
+    environment = report_study.analysis.environments[0]
+    matrix = improvement_matrix(environment)
+    assert [matrix[i][i] for i in range(3)] == [None] * 3
+    first = environment.pairs[0]
+    assert matrix[0][1] == first.probability_of_improvement.point
+    assert matrix[1][0] == 1 - matrix[0][1]
+
+
+def test_the_maps_are_those_of_the_run_folders(page, report_study):
+    data = data_of(page, "data-policies")[0]
+    assert data["rows"] == ["S...", ".X.X", "...X", "X..G"]
+    run = next(r for r in data["runs"] if (r["agent"], r["seed"]) == ("sarsa", 0))
+    folder = next(r for r in report_study.planned if r.agent == "sarsa" and r.seed == 0)
+    with np.load(folder.run.value_maps_path) as maps:
+        assert run["steps"] == maps["timesteps"].tolist()
+        assert run["values"][-1] == pytest.approx(maps["values"][-1].tolist(), rel=1e-4)
+        assert [int(digit) for digit in run["actions"][-1]] == maps["actions"][-1].tolist()
+        best = [
+            [bool(bits >> action & 1) for action in range(4)] for bits in data["optimum"]["actions"]
+        ]
+        assert best == maps["optimal_actions"].tolist()
+    # Holes and the goal end the episode: nothing is done there.
+    assert data["matters"] == "1111101011100110"
+
+
+def test_a_film_is_small_and_made_once(report_study):
+    run = report_study.planned[0]
+    film = film_of(run)
+    assert film is not None
+    before = film.stat().st_mtime_ns
+    assert film_of(run) == film
+    assert film.stat().st_mtime_ns == before
+    assert film.stat().st_size <= 2 * MAX_BYTES
+    from PIL import Image
+
+    with Image.open(film) as picture:
+        assert max(picture.size) <= MAX_SIDE
+        assert picture.n_frames > 1
+
+
+# --- nothing gets in, nothing gets out -----------------------------------------------------------
+
+
+def test_labels_stay_text(page, text):
+    assert HOSTILE in page.all("section")[1][1]
+    scripts = [script for _, script in page.all("script")]
+    assert not [script for script in scripts if script.startswith("document.title")]
+    assert len(scripts) == len(data_names(page)) + 3
+    assert "<b>bold" not in text.split("</head>")[1].split("<script")[0]
+
+
+def test_the_policy_allows_the_scripts_of_the_page_and_nothing_from_outside(page):
+    policies = [
+        a["content"]
+        for a, _ in page.all("meta")
+        if a.get("http-equiv") == "Content-Security-Policy"
+    ]
+    assert len(policies) == 1
+    directives = dict(part.strip().split(" ", 1) for part in policies[0].split(";"))
+    assert directives["default-src"] == "'none'"
+    assert directives["img-src"] == "data: blob:"
+    running = [s for a, s in page.all("script") if a.get("type") != "application/json"]
+    hashes = {
+        f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'"
+        for s in running
+    }
+    assert set(directives["script-src"].split()) == hashes
+    assert len(hashes) == 3
+
+
+def test_nothing_is_loaded(page):
+    for tag, attributes in page.elements:
+        for name, value in attributes.items():
+            assert not name.startswith("on"), (tag, name)
+            if name in LOADING or (tag == "link" and name == "href"):
+                assert value.startswith("data:"), (tag, name, value[:80])
+        assert tag not in {"iframe", "object", "embed", "base"}
+    for _, style in page.all("style"):
+        assert "@import" not in style
+        assert "url(" not in style
+
+
+def test_the_page_is_not_too_heavy(report_study):
+    plotly = 4_900_000
+    assert report_study.page.stat().st_size < plotly + 3_000_000
+
+
+# --- pieces --------------------------------------------------------------------------------------
+
+
+def test_plain_data_is_json_rounded_and_without_what_is_not_finite():
+    value = {"a": np.array([1.23456789, np.nan]), 2: (np.int64(3), np.float64(np.inf), "x", True)}
+    assert plain(value) == {"a": [1.2346, None], "2": [3, None, "x", True]}
+
+
+@pytest.mark.parametrize("text", ["a</script>", "b</SCRIPT >", "<!-- c"])
+def test_a_script_that_would_end_its_element_is_refused(text):
+    with pytest.raises(ValueError, match="may not hold"):
+        inline_script(text)
+
+
+def test_words_for_figures():
+    assert interval_alone(Estimate(1.0, 0.5, 1.5, 4)) == "0.5 to 1.5"
+    assert interval_alone(Estimate(1.0, 1.0, 1.0, 4)) == ""
+    assert interval_alone(Estimate(1.0, math.nan, math.nan, 1)) == ""
+    assert [p_value(p) for p in (0.0004, 0.0314, 1.0, math.nan)] == [
+        "< 0.001",
+        "0.031",
+        "1.000",
+        "-",
+    ]
+    assert [setting(v) for v in (True, None, "lin_0.1", {"a": [1]})] == [
+        "true",
+        "null",
+        "lin_0.1",
+        '{"a": [1]}',
+    ]
+
+
+def test_a_bar_stays_between_the_blind_policy_and_the_optimum():
+    assert bar(Estimate(-3.0, -4.0, 0.25, 4)) == (0, 0, 0.25)
+    assert bar(Estimate(0.5, math.nan, math.nan, 1)) == (0.5, 0.5, 0.5)
+    assert bar(Estimate(math.nan, math.nan, math.nan, 0)) == (0, 0, 0)
+
+
+@pytest.mark.parametrize(
+    ("curves", "optimum", "expected"),
+    [
+        ([[-5000.0, -50.0, 70.0]], 79.0, 79.0),  # early returns dwarf the optimum
+        ([[-500.0, -50.0, 70.0]], 79.0, None),
+        ([[-300.0, 1.0, 2.0, 2.0]], None, 2.0),  # the end of the curve stands for the optimum
+        ([[np.nan, 1.0], [np.nan]], None, None),
+        ([], 79.0, None),
+        ([[-9.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below ten
+    ],
+)
+def test_where_an_axis_ceases_to_be_linear(curves, optimum, expected):
+    assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected

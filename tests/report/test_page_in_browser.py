@@ -1,0 +1,411 @@
+"""The page in a browser: it draws, moves, sorts, and asks nobody for anything."""
+
+import contextlib
+import json
+import os
+import shutil
+import time
+
+import pytest
+from selenium import webdriver
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import Select, WebDriverWait
+
+from experiments.analysis import analyse
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from report.page import write_report
+
+BROWSER, DRIVER = (
+    shutil.which("chromium") or shutil.which("google-chrome"),
+    shutil.which("chromedriver"),
+)
+# A missing browser would leave the page untested unseen, so that in CI it is a failure.
+pytestmark = pytest.mark.skipif(
+    "CI" not in os.environ and not (BROWSER and DRIVER),
+    reason="needs Chromium and its chromedriver",
+)
+
+FLAGS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+PATIENCE = 30  # seconds
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    assert BROWSER is not None, "the report has to be tested in Chromium: install it"
+    assert DRIVER is not None, "the report has to be tested in Chromium: install its chromedriver"
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
+
+
+@pytest.fixture
+def page(browser, report_study):
+    """The page, freshly loaded in a wide window."""
+    resize(browser, 1280)
+    browser.get(report_study.page.as_uri())
+    with contextlib.suppress(Exception):
+        browser.execute_script("localStorage.clear()")
+    wait(browser, lambda: plots(browser) >= 5)
+    return browser
+
+
+@pytest.fixture(scope="module")
+def bandit_study(do_study, tmp_path_factory):
+    """The page of a study on two bandits, one of them with contexts."""
+    places = tuple(
+        EnvironmentSpec(name, name, {"n_timesteps": 300})
+        for name in ("BernoulliBandit-v0", "SegmentBandit-v0")
+    )
+    agents = tuple(AgentSpec(name, name, tuned=False) for name in ("thompson", "epsilon_greedy"))
+    root = tmp_path_factory.mktemp("bandits")
+    study = StudySpec("b", "Bandits", agents, places, n_seeds=3, metric="regret")
+    path = root / "report.html"
+    write_report(analyse(do_study(study, root)), path, "compare.py b.yml")
+    return path
+
+
+@pytest.fixture
+def bandit_page(browser, bandit_study):
+    """The page on bandits, freshly loaded in a wide window, with nothing in the log."""
+    resize(browser, 1280)
+    browser.get_log("browser")
+    browser.get(bandit_study.as_uri())
+    wait(browser, lambda: plots(browser) >= 6)
+    return browser
+
+
+def resize(browser, width):
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+
+
+def wait(browser, condition):
+    WebDriverWait(browser, PATIENCE, 0.1).until(lambda _: condition())
+
+
+def plots(browser):
+    return browser.execute_script("return document.querySelectorAll('.plot .main-svg').length")
+
+
+def find(browser, css):
+    return browser.find_element(By.CSS_SELECTOR, css)
+
+
+def find_all(browser, css):
+    return browser.find_elements(By.CSS_SELECTOR, css)
+
+
+def script_click(browser, element):
+    """A click that does not care what the sticky bar lies over."""
+    browser.execute_script("arguments[0].click()", element)
+
+
+def figure(browser, css):
+    """What Plotly holds for a figure."""
+    return browser.execute_script(
+        """
+        const plot = document.querySelector(arguments[0]);
+        return {
+          x: plot.data.map((trace) => trace.x),
+          y: plot.data.map((trace) => trace.y),
+          names: plot.data.map((trace) => trace.name).filter((name) => name),
+          xTitle: plot.layout.xaxis.title?.text,
+          xType: plot.layout.xaxis.type,
+          yTitle: plot.layout.yaxis.title?.text,
+          tickText: plot.layout.yaxis.ticktext,
+          ink: plot.layout.font.color,
+          shapes: plot.layout.shapes?.length,
+        };
+        """,
+        css,
+    )
+
+
+def choose(browser, name, value):
+    script_click(browser, find(browser, f'input[name="{name}"][value="{value}"]'))
+
+
+def first_column(browser):
+    return [
+        row.find_element(By.CSS_SELECTOR, "th").text
+        for row in find_all(browser, "#ranking figure:not([hidden]) tbody tr")
+    ]
+
+
+def test_it_loads_without_an_error_and_without_the_network(page, report_study):
+    page.get_log("performance")
+    page.get_log("browser")
+    page.get(report_study.page.as_uri())
+    wait(page, lambda: plots(page) >= 5)
+    Select(find(page, "#environment")).select_by_index(1)
+    time.sleep(0.5)
+    assert page.get_log("browser") == []
+    messages = [json.loads(entry["message"])["message"] for entry in page.get_log("performance")]
+    asked = [
+        message["params"]["request"]["url"]
+        for message in messages
+        if message["method"] == "Network.requestWillBeSent"
+    ]
+    own = report_study.page.as_uri()
+    assert own in asked
+    assert [
+        url[:80] for url in asked if url != own and not url.startswith(("data:", "blob:"))
+    ] == []
+
+
+def test_a_hostile_label_is_only_text(page):
+    assert page.title == "Small & <b>bold</b>"
+    assert find_all(page, "main b") == []
+    assert "</script><script>document.title='taken'</script>" in find(page, "#ranking").text
+    labels = page.execute_script(
+        "return [...document.querySelectorAll('#intervals .ytick')].map(t => t.textContent).join()"
+    )
+    assert "document.title" in labels
+    assert "<script>" in labels
+
+
+def test_the_toggles_change_the_curves(page):
+    before = figure(page, "#curves .plot")
+    assert before["xTitle"] == "environment steps"
+    assert before["yTitle"] == "return of evaluations"
+    assert before["shapes"] == 2  # the optimum and the best blind policy
+    choose(page, "by", "episode")
+    by_episode = figure(page, "#curves .plot")
+    assert by_episode["xTitle"] == "episodes"
+    assert by_episode["x"] != before["x"]
+    choose(page, "by", "seconds")
+    assert figure(page, "#curves .plot")["xTitle"] == "wall time (s)"
+    choose(page, "kind", "training")
+    choose(page, "by", "step")
+    training = figure(page, "#curves .plot")
+    assert training["yTitle"] == "return of training episodes"
+    assert training["y"] != before["y"]
+    choose(page, "across", "log")
+    assert figure(page, "#curves .plot")["xType"] == "log"
+
+
+def test_toggles_are_reached_and_used_by_keyboard(page):
+    find(page, 'input[name="by"][value="step"]').send_keys(Keys.ARROW_RIGHT)
+    assert figure(page, "#curves .plot")["xTitle"] == "episodes"
+    find(page, "#curves .legend button").send_keys(Keys.SPACE)
+    assert len(figure(page, "#curves .plot")["names"]) == 2
+
+
+def test_an_axis_for_returns_that_dwarf_the_others(page):
+    assert not find(page, '[data-switch="scale"]').is_displayed()
+    Select(find(page, "#environment")).select_by_index(1)  # where random actions cost 27,000
+    assert find(page, '[data-switch="scale"]').is_displayed()
+    compressed = figure(page, "#curves .plot")
+    assert "-10,000" in compressed["tickText"]
+    choose(page, "scale", "linear")
+    plain = figure(page, "#curves .plot")
+    assert plain["tickText"] is None
+    assert min(v for y in plain["y"] for v in y) < -10_000
+    assert min(v for y in compressed["y"] for v in y) > -10
+
+
+def test_hiding_an_agent_in_the_legend(page):
+    names = figure(page, "#curves .plot")["names"]
+    button = find_all(page, "#curves .legend button")[0]
+    script_click(page, button)
+    assert button.get_attribute("aria-pressed") == "false"
+    assert figure(page, "#curves .plot")["names"] == names[1:]
+    script_click(page, button)
+    assert figure(page, "#curves .plot")["names"] == names
+
+
+@pytest.mark.parametrize("way", ["click", "keyboard"])
+def test_a_heading_sorts_the_ranking(page, way):
+    ranked = first_column(page)
+    heading = find(page, "#ranking figure:not([hidden]) thead th:nth-child(2)")
+    button = heading.find_element(By.CSS_SELECTOR, "button")
+
+    def press():
+        if way == "click":
+            script_click(page, button)
+        else:
+            button.send_keys(Keys.ENTER)
+
+    assert heading.get_attribute("aria-sort") == "descending"
+    press()
+    assert heading.get_attribute("aria-sort") == "ascending"
+    assert first_column(page) == ranked[::-1]
+    press()
+    assert heading.get_attribute("aria-sort") == "descending"
+    assert first_column(page) == ranked
+
+
+def test_names_sort_as_text(page):
+    heading = find(page, "#ranking figure:not([hidden]) thead th")
+    script_click(page, heading.find_element(By.CSS_SELECTOR, "button"))
+    assert [name[0] for name in first_column(page)] == ["<", "Q", "s"]
+    assert len(find_all(page, "#ranking figure:not([hidden]) th[aria-sort]")) == 1
+
+
+def test_the_environment_changes_everywhere(page):
+    Select(find(page, "#environment")).select_by_visible_text("Warehouse-v0")
+    shown = [e.text for e in find_all(page, "h2 .where") if e.is_displayed()]
+    assert set(shown) == {"Warehouse-v0"}
+    assert len(find_all(page, ".board:first-child [data-cell]")) == 100
+    names = figure(page, "#intervals")["names"]
+    assert len(names) == 3
+
+
+def test_the_slider_moves_the_map_by_keyboard_and_says_where_it_is(page):
+    slider = find(page, "#progress")
+    board = find_all(page, ".board")[1]
+    assert slider.get_attribute("aria-valuetext") == "after 2,000 steps"
+    last = board.get_attribute("innerHTML")
+    slider.send_keys(Keys.HOME)
+    label = find(page, "#policies output").text
+    assert label.startswith("after ")
+    assert label != "after 2,000 steps"
+    assert slider.get_attribute("aria-valuetext") == label
+    first = find_all(page, ".board")[1].get_attribute("innerHTML")
+    assert first != last
+    slider.send_keys(Keys.ARROW_RIGHT)
+    assert find(page, "#policies output").text != label
+    slider.send_keys(Keys.END)
+    assert find_all(page, ".board")[1].get_attribute("innerHTML") == last
+
+
+def test_the_map_marks_what_is_not_optimal_and_tells_a_cell(page):
+    boards = find_all(page, ".board")
+    assert boards[0].find_elements(By.CSS_SELECTOR, ".differs") == []
+    assert boards[0].text.startswith("optimum")
+    for board in boards[1:]:
+        marked = len(board.find_elements(By.CSS_SELECTOR, ".differs"))
+        assert f"{11 - marked} of 11 cells" in board.text
+    page.execute_script(
+        "document.querySelector('.board [data-cell=\"14\"]')"
+        ".dispatchEvent(new PointerEvent('pointerover', {bubbles: true}))"
+    )
+    told = find(page, "#policies .cell").text
+    assert told.startswith("row 4, column 3: optimum 0.924 (down)")
+
+
+def test_another_seed_has_another_map(page):
+    before = find_all(page, ".board")[1].get_attribute("innerHTML")
+    Select(find(page, "#policies .seed select")).select_by_index(1)
+    assert find_all(page, ".board")[1].get_attribute("innerHTML") != before
+
+
+def test_films_play_and_stop(page):
+    screen = find(page, ".films:not([hidden]) .screen")
+    picture = screen.find_element(By.CSS_SELECTOR, "img")
+    assert picture.get_attribute("src").startswith("data:image/gif")
+    script_click(page, screen)
+    assert screen.get_attribute("aria-pressed") == "false"
+    assert picture.get_attribute("src").startswith("data:image/png")
+    screen.send_keys(Keys.ENTER)
+    assert picture.get_attribute("src").startswith("data:image/gif")
+
+
+def test_films_stand_still_for_those_who_ask_for_less_motion(page, report_study):
+    features = [{"name": "prefers-reduced-motion", "value": "reduce"}]
+    page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    try:
+        page.get(report_study.page.as_uri())
+        wait(page, lambda: plots(page) >= 5)
+        sources = [e.get_attribute("src")[:14] for e in find_all(page, ".screen img")]
+        assert set(sources) == {"data:image/png"}
+    finally:
+        page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+def test_the_theme_follows_the_system_and_the_button(page):
+    def theme():
+        return page.execute_script("return document.documentElement.dataset.theme")
+
+    def background():
+        return page.execute_script("return getComputedStyle(document.body).backgroundColor")
+
+    assert theme() == "light"
+    light, ink = background(), figure(page, "#curves .plot")["ink"]
+    features = [{"name": "prefers-color-scheme", "value": "dark"}]
+    page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    try:
+        wait(page, lambda: theme() == "dark")
+        assert background() != light
+        assert figure(page, "#curves .plot")["ink"] != ink
+        button = find(page, "#theme")
+        script_click(page, button)
+        assert (button.text, theme(), background()) == ("Theme: light", "light", light)
+        button.send_keys(Keys.ENTER)
+        assert (button.text, theme()) == ("Theme: dark", "dark")
+    finally:
+        page.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+
+
+@pytest.mark.parametrize("width", [380, 320])
+def test_a_phone_has_nothing_beyond_its_edge(page, width):
+    resize(page, width)
+    for environment in (0, 1):
+        Select(find(page, "#environment")).select_by_index(environment)
+        time.sleep(0.3)
+        reach = page.execute_script("return document.documentElement.scrollWidth")
+        assert reach <= width
+
+
+def test_curves_by_pull_change_with_their_toggles(bandit_page):
+    regret = figure(bandit_page, "#pull-regret")
+    assert (regret["xTitle"], regret["xType"]) == ("pulls", "log")
+    assert "Auer, for UCB1" in regret["names"]
+    choose(bandit_page, "pull-axis", "linear")
+    assert figure(bandit_page, "#pull-regret")["xType"] == "linear"
+    choose(bandit_page, "pull-spread", "runs")
+    assert figure(bandit_page, "#pull-regret")["y"] != regret["y"]
+    script_click(bandit_page, find_all(bandit_page, "#bandits .legend button")[0])
+    assert len(figure(bandit_page, "#pull-optimal")["names"]) == 1
+    assert len(figure(bandit_page, "#arm-shares")["names"]) == 1
+    assert bandit_page.get_log("browser") == []
+
+
+def test_beliefs_are_chosen_by_context_and_moment(bandit_page):
+    # One context has nothing to choose from.
+    assert not find(bandit_page, ".pick.context").is_displayed()
+    Select(find(bandit_page, "#environment")).select_by_index(1)
+    last = figure(bandit_page, "#pull-posteriors")
+    assert last["names"] == ["arm 0", "arm 1", "arm 2"]
+    Select(find(bandit_page, ".pick.context select")).select_by_index(1)
+    casual = figure(bandit_page, "#pull-posteriors")
+    assert casual["y"] != last["y"]
+    Select(find(bandit_page, ".pick.moment select")).select_by_index(0)
+    first = figure(bandit_page, "#pull-posteriors")
+    # A density that knows less is lower.
+    assert max(v for y in first["y"] for v in y) < max(v for y in casual["y"] for v in y)
+    assert bandit_page.get_log("browser") == []
+
+
+def test_the_table_of_arms_is_that_of_the_environment(bandit_page):
+    def rows():
+        cells = find_all(bandit_page, "#bandits figure tbody tr th")
+        return [cell.text for cell in cells if cell.is_displayed()]
+
+    assert len(rows()) == 4
+    Select(find(bandit_page, "#environment")).select_by_index(1)
+    assert len(rows()) == 8
+    assert rows()[-1] == "context 1, regret of a pull"
+
+
+def test_a_phone_shows_bandits_within_its_edge(bandit_page):
+    resize(bandit_page, 380)
+    for environment in (0, 1):
+        Select(find(bandit_page, "#environment")).select_by_index(environment)
+        time.sleep(0.3)
+        assert bandit_page.execute_script("return document.documentElement.scrollWidth") <= 380
