@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -13,6 +14,11 @@ from experiments.execution import RunFailure, available_cores, execute
 from experiments.results import StudyResults, read_results
 from experiments.study_plan import PlannedRun, check_settings
 from experiments.study_spec import StudySpec
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from experiments.analysis import StudyAnalysis
 
 WIDTH_WITHOUT_TERMINAL = 120
 
@@ -65,14 +71,22 @@ def _do_missing(
         return execute(missing, root, command, n_workers, progress.note)
 
 
+def _draw(analysis: StudyAnalysis, blocks: pd.DataFrame | None, command: str) -> list[Path]:
+    """Figures and the page; the files."""
+    from report.figures.study_figures import write_figures
+    from report.page import write_report
+
+    page = analysis.results.root / "report.html"
+    files = write_figures(analysis, blocks)
+    write_report(analysis, page, command)
+    return [*files, page]
+
+
 def _judge(console: Console, results: StudyResults, args: argparse.Namespace, command: str) -> None:
     from experiments.analysis import analyse
-    from report.tables import (
-        episodes_table,
-        print_analysis,
-        print_episodes_table,
-        write_tables,
-    )
+    from report.result_files import write_tables
+    from report.series.episode_blocks import episodes_table
+    from report.terminal_tables import print_analysis, print_episodes_table
 
     analysis = analyse(results)
     print_analysis(console, analysis)
@@ -89,13 +103,7 @@ def _judge(console: Console, results: StudyResults, args: argparse.Namespace, co
         for reason in refused:
             console.print(f"no film: {reason}", markup=False, highlight=False)
     if not args.no_report:
-        from report.figures.study_figures import write_figures
-        from report.page import write_report
-
-        files += write_figures(analysis, blocks)
-        page = results.root / "report.html"
-        write_report(analysis, page, command)
-        files.append(page)
+        files += _draw(analysis, blocks, command)
     console.print()
     console.print(f"files: {results.root}", markup=False, highlight=False)
     for path in files:

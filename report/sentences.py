@@ -1,4 +1,4 @@
-"""What a study has shown, in sentences, and figures as a reader wants them."""
+"""What a study has shown, in sentences."""
 
 from __future__ import annotations
 
@@ -7,34 +7,8 @@ from collections.abc import Iterable, Sequence
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
-from verdicts import Estimate, PairComparison
-
-SIGNIFICANT = 4
-
-
-def number(value: float | None) -> str:
-    """A figure with four significant digits, or a dash where there is none."""
-    if value is None or math.isnan(value):
-        return "-"
-    if math.isinf(value):
-        return "never" if value > 0 else "-∞"
-    if value == 0 or abs(value) >= 10 ** (SIGNIFICANT - 1):
-        return f"{value:,.0f}"
-    digits = SIGNIFICANT - 1 - math.floor(math.log10(abs(value)))
-    text = f"{value:.{min(max(digits, 0), SIGNIFICANT)}f}".rstrip("0").rstrip(".")
-    return "0" if text == "-0" else text
-
-
-def interval(estimate: Estimate) -> str:
-    """A figure with its interval in brackets, where it has one."""
-    if math.isnan(estimate.low) or estimate.low == estimate.high:
-        return number(estimate.point)
-    return f"{number(estimate.point)} [{number(estimate.low)}, {number(estimate.high)}]"
-
-
-def enumeration(words: Sequence[str]) -> str:
-    """Words joined by commas, the last by "and"."""
-    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)
+from report.wording import enumeration, interval, number
+from verdicts import PairComparison
 
 
 def sentences(analysis: StudyAnalysis) -> list[str]:

@@ -33,7 +33,7 @@ def write_figures(analysis: StudyAnalysis, episodes_table: pd.DataFrame | None) 
 
     Args:
         analysis: the study.
-        episodes_table: from `report.tables.episodes_table`, or None for no such figure.
+        episodes_table: from `report.series.episode_blocks`, or None for no such figure.
 
     Returns:
         The files.

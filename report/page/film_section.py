@@ -25,7 +25,7 @@ from pipeline.model_loading import load_model
 from pipeline.playing import ChosenModel, Watcher, play_episodes, playing_env, write_film
 from report.page.markup import data_uri
 from report.page.sections import Report, Section
-from report.sentences import number
+from report.wording import number
 
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
 COLOURS = 128

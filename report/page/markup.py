@@ -13,8 +13,8 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from report.sentences import number
-from verdicts import Estimate
+from report.ranking_columns import bar
+from report.wording import interval_alone, number
 
 SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
 
@@ -78,23 +78,6 @@ def script_hash(text: str) -> str:
     """How a content security policy names an inline script."""
     digest = hashlib.sha256(text.encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
-
-
-def interval_alone(estimate: Estimate) -> str:
-    """The interval of a figure, empty where it has none."""
-    if math.isnan(estimate.low) or estimate.low == estimate.high:
-        return ""
-    return f"{number(estimate.low)} to {number(estimate.high)}"
-
-
-def bar(score: Estimate) -> tuple[float, float, float]:
-    """Low end, point and high end of a score, cut to what lies between 0 and 1."""
-    low, high = (score.low, score.high) if score.has_interval else (score.point, score.point)
-    return (_share(low), _share(score.point), _share(high))
-
-
-def _share(value: float) -> float:
-    return 0.0 if math.isnan(value) else round(min(max(value, 0.0), 1.0), 4)
 
 
 def p_value(value: float) -> str:

@@ -21,7 +21,7 @@ from pipeline.pull_recording import PULLS_FILE
 from pipeline.run_folder import Run
 from pipeline.training import train
 from report.sentences import sentences
-from report.tables import print_analysis
+from report.terminal_tables import print_analysis
 
 STUDIES = sorted((Path(__file__).parents[2] / "studies").glob("bandit-*.yml"))
 COINS = (0.2, 0.5, 0.75)

@@ -18,13 +18,11 @@ from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
 from report.figures.study_figures import write_figures
-from report.sentences import enumeration, interval, number, sentences
-from report.tables import (
-    episodes_table,
-    print_analysis,
-    print_episodes_table,
-    write_tables,
-)
+from report.result_files import write_tables
+from report.sentences import sentences
+from report.series.episode_blocks import episodes_table
+from report.terminal_tables import print_analysis, print_episodes_table
+from report.wording import enumeration, interval, number
 
 OPTIMUM, BLIND = 100.0, 0.0
 ENVIRONMENT = EnvironmentSpec("Warehouse-v0", "Warehouse-v0", {"n_timesteps": 100})

@@ -15,9 +15,11 @@ from report.page import write_report
 from report.page.assembly import SECTIONS
 from report.page.comparison_section import improvement_matrix
 from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
-from report.page.markup import bar, inline_script, interval_alone, p_value, plain, setting
+from report.page.markup import inline_script, p_value, plain, setting
 from report.page.scales import linear_up_to
+from report.ranking_columns import bar
 from report.sentences import sentences
+from report.wording import interval_alone
 from verdicts import Estimate
 
 HOSTILE = "</script><script>document.title='taken'</script>"

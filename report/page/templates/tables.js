@@ -1,4 +1,5 @@
-// Tables that are sorted by the button in a heading; what has no value stays last.
+// Tables that are sorted by the button in a heading, first with the best on top and then the other
+// way round; what has no value stays last.
 for (const table of document.querySelectorAll("table.sortable")) {
   const headings = [...table.tHead.rows[0].cells];
 
@@ -21,7 +22,9 @@ for (const table of document.querySelectorAll("table.sortable")) {
 
   headings.forEach((heading, column) => {
     heading.querySelector("button").addEventListener("click", () => {
-      sort(column, heading.getAttribute("aria-sort") === "ascending" ? -1 : 1);
+      const first = heading.dataset.bestFirst ?? "ascending";
+      const order = { ascending: "descending", descending: "ascending" }[heading.ariaSort] ?? first;
+      sort(column, order === "ascending" ? 1 : -1);
     });
   });
 }

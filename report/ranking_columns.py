@@ -1,0 +1,235 @@
+"""What the ranking says of an agent: one list of columns, for the terminal and for the page.
+
+A new statistic is one more entry of `COLUMNS`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, Literal, TypeVar
+
+import numpy as np
+
+from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
+from experiments.pull_statistics import QUANTILES, PullStatistics
+from experiments.study_spec import COSTS, StudySpec
+from report.wording import interval, interval_alone, number
+from verdicts import Estimate, ThresholdSummary
+
+Order = Literal["ascending", "descending"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a row of the ranking is about: an agent on an environment."""
+
+    agent: AgentAnalysis
+    environment: EnvironmentAnalysis
+
+
+@dataclass(frozen=True)
+class BanditRow(Row):
+    """An agent on a bandit, with its figures by pull."""
+
+    pulls: PullStatistics
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell.
+
+    Attributes:
+        text: the figure.
+        value: what it is sorted by; None puts it last.
+        note: what the page has below it in small print.
+        in_line: what the terminal has in place of the text, where it has something else.
+        bar: low end, point and high end, each between 0 and 1, of a bar to draw; or None.
+    """
+
+    text: str
+    value: float | None
+    note: str = ""
+    in_line: str = ""
+    bar: tuple[float, float, float] | None = None
+
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column(Generic[AnyRow]):
+    """One column. A heading that is empty leaves it out there.
+
+    Attributes:
+        cell: what it says on an agent; None where it does not apply.
+        page: its heading on the page.
+        help: what stands below that heading; ``{threshold}`` is the environment's.
+        terminal: its heading in the terminal.
+        caption: what the terminal explains below the table, likewise.
+        best_first: the order that puts the best first; None for that of the study's metric.
+    """
+
+    cell: Callable[[AnyRow], Cell | None]
+    page: str = ""
+    help: str = ""
+    terminal: str = ""
+    caption: str = ""
+    best_first: Order | None = None
+
+    def order(self, study: StudySpec) -> Order:
+        """The order that puts the best first in a study."""
+        return self.best_first or ("ascending" if study.metric in COSTS else "descending")
+
+
+def filled(
+    columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]
+) -> list[tuple[Column[AnyRow], list[Cell]]]:
+    """The columns that apply to some row, each with a cell for every row."""
+    found = [(column, [column.cell(row) for row in rows]) for column in columns]
+    return [
+        (column, [cell or Cell("-", None) for cell in cells])
+        for column, cells in found
+        if any(cell is not None for cell in cells)
+    ]
+
+
+def bar(score: Estimate) -> tuple[float, float, float]:
+    """Low end, point and high end of a score, cut to what lies between 0 and 1."""
+    low, high = (score.low, score.high) if score.has_interval else (score.point, score.point)
+    return (_share(low), _share(score.point), _share(high))
+
+
+def _share(value: float) -> float:
+    return 0.0 if math.isnan(value) else round(min(max(value, 0.0), 1.0), 4)
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _estimate(estimate: Estimate) -> Cell:
+    return Cell(
+        number(estimate.point),
+        _known(estimate.point),
+        interval_alone(estimate),
+        interval(estimate),
+    )
+
+
+def _score(row: Row) -> Cell | None:
+    if row.agent.score is None:
+        return None
+    mean = row.agent.score.mean
+    return replace(_estimate(mean), bar=None if math.isnan(mean.point) else bar(mean))
+
+
+def _gap(row: Row) -> Cell | None:
+    optimum, final = row.environment.optimum, row.agent.final
+    if optimum is None:
+        return None
+    low, high = optimum - final.high, optimum - final.low
+    return _estimate(replace(final, point=optimum - final.point, low=low, high=high))
+
+
+def _success(row: Row) -> Cell | None:
+    rate = row.agent.success_rate
+    if rate is None:
+        return None
+    if math.isnan(rate.point):
+        return Cell("-", None)
+    note = f"{rate.low:.0%} to {rate.high:.0%}" if interval_alone(rate) else ""
+    return Cell(f"{rate.point:.1%}", rate.point, note)
+
+
+def _threshold(summary: ThresholdSummary | None) -> Cell | None:
+    if summary is None:
+        return None
+    median, share = summary.median.point, summary.share_reached.point
+    note = "" if math.isnan(share) else f"{share:.0%} of runs"
+    return Cell(number(median), _known(median), note)
+
+
+def _solved(row: Row) -> Cell | None:
+    summary = row.agent.steps_to_threshold
+    if summary is None:
+        return None
+    share = summary.share_reached.point
+    return Cell("-", None) if math.isnan(share) else Cell(f"{share:.0%}", share)
+
+
+def _seconds(row: Row) -> Cell:
+    seconds = row.agent.seconds
+    return replace(_estimate(seconds), in_line=f"{number(seconds.point)} s")
+
+
+def _runs(row: Row) -> Cell:
+    missing = f"{row.agent.n_missing} missing" if row.agent.n_missing else ""
+    return Cell(f"{row.agent.n_runs}", row.agent.n_runs, missing)
+
+
+def _spread(row: BanditRow) -> Cell:
+    low, *_, high = np.quantile(row.pulls.total_regret, QUANTILES)
+    return Cell(f"{number(low)} to {number(high)}", float(high))
+
+
+def _last(values: Sequence[float]) -> Cell:
+    return Cell(number(values[-1]), _known(values[-1]))
+
+
+COLUMNS: tuple[Column[Row], ...] = (
+    Column(
+        page="Mean",
+        help="over seeds",
+        terminal="mean",
+        cell=lambda row: _estimate(row.agent.metric.mean),
+    ),
+    Column(
+        page="IQM",
+        help="middle half",
+        terminal="IQM",
+        cell=lambda row: _estimate(row.agent.metric.iqm),
+    ),
+    Column(page="Median", help="over seeds", cell=lambda row: _estimate(row.agent.metric.median)),
+    Column(
+        page="Score", help="1 is optimal", terminal="score", best_first="descending", cell=_score
+    ),
+    Column(page="Gap", help="to the optimum", best_first="ascending", cell=_gap),
+    Column(
+        terminal="training",
+        caption="return of the last 100 training episodes",
+        cell=lambda row: _estimate(row.agent.last_episodes),
+    ),
+    Column(page="Success", help="in the end", best_first="descending", cell=_success),
+    Column(
+        page="Steps",
+        help="to {threshold}",
+        terminal="steps",
+        caption="until a return of {threshold}, the median run",
+        best_first="ascending",
+        cell=lambda row: _threshold(row.agent.steps_to_threshold),
+    ),
+    Column(
+        page="Episodes",
+        help="to {threshold}",
+        best_first="ascending",
+        cell=lambda row: _threshold(row.agent.episodes_to_threshold),
+    ),
+    Column(terminal="solved", best_first="descending", cell=_solved),
+    Column(page="Training", help="seconds", terminal="time", best_first="ascending", cell=_seconds),
+    Column(page="Runs", help="finished", best_first="descending", cell=_runs),
+)
+
+# In the terminal, bandits have a table of their own; on the page, a section.
+BANDIT_COLUMNS: tuple[Column[BanditRow], ...] = (
+    Column(terminal="mean regret", cell=lambda row: _estimate(row.agent.regret)),
+    Column(terminal=f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs", cell=_spread),
+    Column(terminal="simple regret", cell=lambda row: _last(row.pulls.simple_regret.tolist())),
+    Column(terminal="reward", cell=lambda row: _last(row.pulls.reward.tolist())),
+    Column(
+        terminal="best arm",
+        cell=lambda row: Cell(f"{row.pulls.optimal[-1]:.1%}", float(row.pulls.optimal[-1])),
+    ),
+    Column(terminal="time", cell=_seconds),
+)

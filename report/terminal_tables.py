@@ -1,0 +1,117 @@
+"""A study in the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import pandas as pd
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from experiments.study_spec import METRIC_WORDS, StudySpec
+from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, BanditRow, Column, Row, filled
+from report.sentences import environment_sentences
+from report.wording import number
+
+MOST_AGENT_WIDTH = 20
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
+    """Print a table for each environment, and what it says in words."""
+    for environment in analysis.environments:
+        console.print()
+        console.print(_ranking(analysis, environment))
+        for sentence in environment_sentences(analysis.study, environment):
+            console.print(f"  {sentence}", highlight=False, markup=False)
+
+
+def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table:
+    pulls, label = analysis.results.pulls, environment.environment
+    on_bandit = [
+        BanditRow(agent, environment, pulls[agent.agent, label])
+        for agent in environment.agents
+        if (agent.agent, label) in pulls
+    ]
+    if on_bandit:
+        table = _titled(escape(label), _bandit_caption(analysis.study))
+        return _fill(table, BANDIT_COLUMNS, on_bandit)
+    rows = [Row(agent, environment) for agent in environment.agents]
+    table = _titled(_title(environment), _caption(analysis.study, environment))
+    return _fill(table, [column for column in COLUMNS if column.terminal], rows)
+
+
+def _titled(title: str, caption: str) -> Table:
+    return Table(title=title, caption=caption, title_justify="left", caption_justify="left")
+
+
+def _fill(table: Table, columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]) -> Table:
+    names = [row.agent.agent for row in rows]
+    # Longer names go over several lines.
+    width = min(max(map(len, names)), MOST_AGENT_WIDTH)
+    table.add_column("agent", overflow="fold", min_width=width)
+    shown = filled(columns, rows)
+    for column, _ in shown:
+        table.add_column(column.terminal, justify="right")
+    for place, name in enumerate(names):
+        cells = [cells[place] for _, cells in shown]
+        table.add_row(escape(name), *(cell.in_line or cell.text for cell in cells))
+    return table
+
+
+def _title(environment: EnvironmentAnalysis) -> str:
+    title = escape(environment.environment)
+    if environment.optimum is not None:
+        title += f": optimum {number(environment.optimum)}"
+        title += f", best blind policy {number(environment.best_blind)}"
+    return title
+
+
+def _caption(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals over {study.n_seeds} seeds"
+    rows = [Row(agent, environment) for agent in environment.agents]
+    explained = [column for column in COLUMNS if column.terminal and column.caption]
+    threshold = number(environment.threshold)
+    return "; ".join(
+        [
+            f"mean, IQM: {metric}",
+            *(
+                f"{column.terminal}: {column.caption.format(threshold=threshold)}"
+                for column, _ in filled(explained, rows)
+            ),
+        ]
+    )
+
+
+def _bandit_caption(study: StudySpec) -> str:
+    return (
+        f"regret: sum over the pulls of a run, with 95 % intervals over {study.n_seeds} runs; "
+        "simple regret: of recommending the arm pulled most; reward, best arm: at the last pulls"
+    )
+
+
+def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
+    """Print the table of `episodes_table`, agents side by side."""
+    for environment, rows in table.groupby("environment", sort=False):
+        title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
+        printed = Table(title=escape(title), title_justify="left")
+        printed.add_column("episode", justify="right")
+        agents = list(dict.fromkeys(rows["agent"]))
+        for agent in agents:
+            printed.add_column(escape(str(agent)), justify="right")
+        by_episode = rows.set_index(["episode", "agent"])
+        for episode in sorted(set(rows["episode"])):
+            cells = []
+            for agent in agents:
+                if (episode, agent) not in by_episode.index:
+                    cells.append("-")
+                    continue
+                row = by_episode.loc[(episode, agent)]
+                cells.append("  ".join(number(row[c]) for c in ("average", "minimum", "maximum")))
+            printed.add_row(f"{episode:,}", *cells)
+        console.print()
+        console.print(printed)
