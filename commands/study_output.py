@@ -73,12 +73,14 @@ def _do_missing(
 
 def _draw(analysis: StudyAnalysis, blocks: pd.DataFrame | None, command: str) -> list[Path]:
     """Figures and the page; the files."""
-    from report.figures.study_figures import write_figures
+    from report.figures.figure_files import write_figures
     from report.page import write_report
+    from report.series.study_series import study_series
 
     page = analysis.results.root / "report.html"
-    files = write_figures(analysis, blocks)
-    write_report(analysis, page, command)
+    series = study_series(analysis)
+    files = write_figures(series, blocks)
+    write_report(series, page, command)
     return [*files, page]
 
 

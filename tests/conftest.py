@@ -71,6 +71,7 @@ def report_study(tmp_path_factory):
     from experiments.study_plan import plan
     from pipeline.files import write_text
     from report.page import write_report
+    from report.series.study_series import study_series
 
     study, root = small_study(), tmp_path_factory.mktemp("study")
     planned = plan(study, root)
@@ -82,7 +83,7 @@ def report_study(tmp_path_factory):
     write_text(log, "Traceback:\nValueError: <the> disk & all is full\n")
     analysis = analyse(read_results(study, planned, root))
     page = root / "report.html"
-    write_report(analysis, page, "python compare.py 'a & b.yml'")
+    write_report(study_series(analysis), page, "python compare.py 'a & b.yml'")
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page
     )

@@ -16,7 +16,7 @@ from agents.bandits.batch import run_batch
 from envs.bandits import log_uniformly, read_log
 from experiments.off_policy.estimators import evaluate_policy, mean_reward
 from experiments.off_policy.reward_models import cross_fit
-from report.figures.figure_style import COLOURS
+from report.series.agent_marks import COLOURS
 
 FOLDER = Path(__file__).parent
 PULLS, RUNS = 10_000, 400

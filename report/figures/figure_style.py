@@ -1,8 +1,8 @@
-"""The look of a study's figures: one colour for each agent, PNG and SVG of each figure."""
+"""The look of a study's figures, and how one becomes files: PNG and SVG."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,27 +10,28 @@ from typing import TYPE_CHECKING, Any
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
-from experiments.study_spec import StudySpec
 from pipeline.files import replacing
+from report.series.agent_marks import COLOURS, Dash, Mark
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's colours, told apart by colour-blind readers too; the line styles go on where the
-# colours begin again.
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
-STYLES = ("-", "--", "-.", ":")
+# What Matplotlib calls Plotly's line styles.
+_LINE_STYLES: Mapping[Dash, str] = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":"}
+
+REFERENCE = "0.35"  # the grey of lines that are no agent's
 
 _FONTS: Any = {"font.size": 10, "axes.titlesize": 11, "legend.fontsize": 9, "svg.fonttype": "none"}
 
 
-def agent_style(study: StudySpec, agent: str) -> dict[str, Any]:
-    """Colour and line style of an agent, the same in every figure of a study."""
-    place = [spec.label for spec in study.agents].index(agent)
-    return {
-        "color": COLOURS[place % len(COLOURS)],
-        "linestyle": STYLES[place // len(COLOURS) % len(STYLES)],
-    }
+def line_style(mark: Mark) -> dict[str, Any]:
+    """Colour and line style of an agent, as Matplotlib's functions take them."""
+    return {"color": COLOURS[mark.colour], "linestyle": _LINE_STYLES[mark.dash]}
+
+
+def colour_of(mark: Mark) -> str:
+    """The colour alone."""
+    return COLOURS[mark.colour]
 
 
 @contextmanager
@@ -50,3 +51,12 @@ def figure(
             with replacing(target) as draft:
                 canvas.savefig(draft, format=suffix[1:], **options)
             written.append(target)
+
+
+def shared_legend(axes: Axes) -> None:
+    """Below the whole figure, the names of what these axes show."""
+    handles, names = axes.get_legend_handles_labels()
+    if handles:
+        axes.figure.legend(
+            handles, names, loc="outside lower center", ncols=min(len(names), 4), frameon=False
+        )

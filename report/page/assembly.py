@@ -8,7 +8,6 @@ from typing import Any
 
 from markupsafe import Markup
 
-from experiments.analysis import StudyAnalysis
 from pipeline.files import write_text
 from report.page import (
     bandit_section,
@@ -22,8 +21,8 @@ from report.page import (
     verdict_section,
 )
 from report.page.markup import inline_script, plain, script_hash, template_file, templates
-from report.page.palette import agent_marks
 from report.page.sections import Report, Section
+from report.series.study_series import StudySeries
 
 # A new kind of section is a module with such a function, named here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
@@ -39,15 +38,15 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
 )
 
 
-def write_report(analysis: StudyAnalysis, path: Path, command: str) -> None:
+def write_report(series: StudySeries, path: Path, command: str) -> None:
     """Write the page of a study, one file that needs nothing else and no network.
 
     Args:
-        analysis: the study.
+        series: the numbers that its figures show.
         path: the file, which is replaced.
         command: the command that reproduces the study.
     """
-    report = Report(analysis, command)
+    report = Report(series, command)
     sections = [section for make in SECTIONS if (section := make(report)) is not None]
     write_text(path, render(report, sections))
 
@@ -58,7 +57,7 @@ def render(report: Report, sections: list[Section]) -> str:
 
     environment = templates()
     study = report.analysis.study
-    marks = agent_marks(study)
+    marks = report.series.marks
     bodies = {
         section.name: Markup(  # noqa: S704  # a template's output, escaped already
             environment.get_template(f"{section.name}.html").render(
@@ -66,7 +65,7 @@ def render(report: Report, sections: list[Section]) -> str:
                     **section.context,
                     "study": study,
                     "environments": report.analysis.environments,
-                    "marks": {mark["label"]: mark for mark in marks},
+                    "marks": marks,
                 }
             )
         )
@@ -79,7 +78,7 @@ def render(report: Report, sections: list[Section]) -> str:
         environments=report.analysis.environments,
         sections=sections,
         bodies=bodies,
-        data=_data(report, marks, sections),
+        data=_data(report, sections),
         style=Markup(template_file("page.css") or ""),  # noqa: S704  # our own file
         scripts=[inline_script(script) for script in scripts],
         early=inline_script(early),
@@ -93,10 +92,10 @@ def _own_script(sections: list[Section]) -> str:
     return "\n".join(text for name in names if (text := template_file(name)) is not None)
 
 
-def _data(report: Report, marks: list[dict[str, Any]], sections: list[Section]) -> dict[str, Any]:
+def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
     """What the scripts work with, by section."""
     page = {
-        "agents": marks,
+        "agents": [vars(mark) for mark in report.series.marks.values()],
         "environments": [
             {
                 "label": environment.environment,

@@ -6,20 +6,18 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import gymnasium as gym
-import numpy as np
-from numpy.typing import NDArray
-
-from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from experiments.pull_statistics import QUANTILES, PullStatistics
-from experiments.results import StudyResults
-from pipeline.environments import make_single_env
-from report.figures.posteriors import density, grid, is_normal, truth
-from report.figures.regret_bounds import auer_bound, best_expected_reward, lai_robbins_slope
+from experiments.pull_statistics import PullStatistics
 from report.page.sections import Report, Section
-
-Floats = NDArray[np.float64]
-Pulls = Mapping[str, PullStatistics]
+from report.series.curve_series import Curve
+from report.series.posteriors import Belief
+from report.series.pull_series import (
+    SPREAD,
+    ArmSeries,
+    Pulls,
+    PullSeries,
+    mean_regret,
+    regret_of_runs,
+)
 
 MOST_ARMS = 40  # over all contexts, in a table or in a figure
 
@@ -59,29 +57,19 @@ class ContextTable:
 
 def section(report: Report) -> Section | None:
     """Figures by pull of every bandit; None where there is none."""
-    analysis = report.analysis
-    by_environment = [_pulls_on(analysis, environment) for environment in analysis.environments]
-    if not any(by_environment):
+    bandits = [one.pulls for one in report.series.environments]
+    if not any(bandits):
         return None
-    data = [
-        _environment_data(analysis.results, environment.environment, pulls) if pulls else None
-        for environment, pulls in zip(analysis.environments, by_environment, strict=True)
-    ]
+    data = [None if series is None else _environment_data(series) for series in bandits]
+    pulls = [{} if series is None else series.pulls for series in bandits]
     context = {
-        "is_bandit": [bool(pulls) for pulls in by_environment],
-        "tables": [context_tables(pulls) for pulls in by_environment],
-        "agents": [list(pulls) for pulls in by_environment],
-        "spread": f"{QUANTILES[-1] - QUANTILES[0]:.0%}",
-        "has_bounds": any(item is not None and item["bounds"] for item in data),
+        "is_bandit": [series is not None for series in bandits],
+        "tables": [context_tables(of_agents) for of_agents in pulls],
+        "agents": [list(of_agents) for of_agents in pulls],
+        "spread": SPREAD,
+        "has_bounds": any(series is not None and series.bounds for series in bandits),
     }
     return Section("bandits", "Pulls and regret", context, data, by_environment=True)
-
-
-def _pulls_on(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Pulls:
-    """The figures by agent, the best agent first."""
-    found = analysis.results.pulls
-    keys = [(agent.agent, environment.environment) for agent in environment.agents]
-    return {key[0]: found[key] for key in keys if key in found}
 
 
 def context_tables(pulls: Pulls) -> list[ContextTable]:
@@ -109,95 +97,54 @@ def context_tables(pulls: Pulls) -> list[ContextTable]:
     return tables
 
 
-def _environment_data(results: StudyResults, environment: str, pulls: Pulls) -> dict[str, Any]:
-    run = next(p for p in results.planned if p.environment == environment)
-    env = make_single_env(run.spec)
-    try:
-        best, bounds = best_expected_reward(env), _bounds(env, next(iter(pulls.values())))
-    finally:
-        env.close()
+def _environment_data(series: PullSeries) -> dict[str, Any]:
+    bounds = series.bounds
     return {
-        "best": best,
-        "bounds": bounds,
-        "curves": {agent: _curves(statistics) for agent, statistics in pulls.items()},
-        "arms": _arms(pulls),
-        "posteriors": [
-            _posteriors(results, agent, statistics)
-            for agent, statistics in pulls.items()
-            if statistics.true_means.size and len(statistics.moments)
-        ],
+        "best": series.best,
+        "bounds": None
+        if bounds is None
+        else {"x": bounds.pulls, "auer": bounds.auer, "lai_robbins": bounds.lai_robbins},
+        "curves": {agent: _curves(statistics) for agent, statistics in series.pulls.items()},
+        "arms": _arms(series.arms),
+        "posteriors": [_belief(belief) for belief in series.beliefs],
     }
 
 
 def _curves(statistics: PullStatistics) -> dict[str, Any]:
-    mean, reach = statistics.cumulative_regret, 1.96 * statistics.cumulative_regret_sem
-    low, *_, high = statistics.cumulative_regret_quantiles
-    median = statistics.cumulative_regret_quantiles[QUANTILES.index(0.5)]
     return {
         "x": statistics.pulls,
         "reward": statistics.reward,
         "optimal": statistics.optimal,
         "regret": {
-            "mean": {"y": mean, "low": mean - reach, "high": mean + reach},
-            "runs": {"y": median, "low": low, "high": high},
+            "mean": _band(mean_regret(statistics)),
+            "runs": _band(regret_of_runs(statistics)),
         },
         "simple": statistics.simple_regret,
     }
 
 
-def _bounds(env: gym.Env[Any, Any], statistics: PullStatistics) -> dict[str, Any] | None:
-    """What theory says of a single row of Bernoulli arms that stay as they are."""
-    bandit: Any = env.unwrapped
-    means = statistics.true_means
-    if bandit.kind != "clicks" or len(means) != 1 or means.max() == means.min():
+def _band(curve: Curve) -> dict[str, Any]:
+    return {"y": curve.y, "low": curve.low, "high": curve.high}
+
+
+def _arms(arms: ArmSeries | None) -> dict[str, Any] | None:
+    if arms is None or len(arms.names) > MOST_ARMS:
         return None
+    estimates = {agent: {"mean": m, "std": std} for agent, (m, std) in arms.estimates.items()}
     return {
-        "x": statistics.pulls,
-        "auer": auer_bound(means[0], statistics.pulls),
-        "lai_robbins": lai_robbins_slope(means[0]) * np.log(statistics.pulls),
+        "names": arms.names,
+        "means": arms.means,
+        "shares": arms.shares,
+        "estimates": estimates,
     }
 
 
-def _arms(pulls: Pulls) -> dict[str, Any] | None:
-    """True means and final estimates, context by context."""
-    known = {agent: p for agent, p in pulls.items() if p.true_means.size}
-    if not known:
-        return None
-    means = next(iter(known.values())).true_means
-    if means.size > MOST_ARMS:
-        return None
-    contexts, arms = means.shape
-    return {
-        "names": [
-            f"arm {arm}" if contexts == 1 else f"context {context}, arm {arm}"
-            for context in range(contexts)
-            for arm in range(arms)
-        ],
-        "means": means.ravel(),
-        "shares": {agent: statistics.shares.ravel() for agent, statistics in known.items()},
-        "estimates": {
-            agent: {
-                "mean": np.broadcast_to(statistics.estimates, means.shape).ravel(),
-                "std": np.broadcast_to(statistics.estimates_std, means.shape).ravel(),
-            }
-            for agent, statistics in known.items()
-            if np.isfinite(statistics.estimates).any()
-        },
-    }
-
-
-def _posteriors(results: StudyResults, agent: str, statistics: PullStatistics) -> dict[str, Any]:
+def _belief(belief: Belief) -> dict[str, Any]:
     """Densities by moment, context and arm."""
-    normal = is_normal(results, agent)
-    x = grid(statistics.true_means, is_normal=normal)
-    _, contexts, arms, _ = statistics.posteriors.shape
     return {
-        "agent": agent,
-        "moments": statistics.moments,
-        "x": x,
-        "truth": [[truth(statistics, c, arm) for arm in range(arms)] for c in range(contexts)],
-        "densities": [
-            [[density(parameters, x, is_normal=normal) for parameters in row] for row in moment]
-            for moment in statistics.posteriors
-        ],
+        "agent": belief.agent,
+        "moments": belief.moments,
+        "x": belief.points,
+        "truth": belief.true_means,
+        "densities": belief.densities,
     }

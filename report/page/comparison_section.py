@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from experiments.analysis import EnvironmentAnalysis, StudyAnalysis, values_over_seeds
+from experiments.analysis import EnvironmentAnalysis
 from experiments.study_spec import COSTS, METRIC_WORDS
-from report.page.scales import linear_up_to
 from report.page.sections import Report, Section, estimate_data
+from report.series.run_series import AgentRuns
+from report.series.study_series import EnvironmentSeries
 from verdicts import Verdict
 
 PHRASES: dict[Verdict, str] = {
@@ -31,7 +29,7 @@ def section(report: Report) -> Section | None:
     metric = METRIC_WORDS[analysis.study.metric]
     data = {
         "metric": metric,
-        "environments": [_data(analysis, environment) for environment in analysis.environments],
+        "environments": [_data(one) for one in report.series.environments],
     }
     context = {
         "metric": metric,
@@ -42,30 +40,24 @@ def section(report: Report) -> Section | None:
     return Section("comparison", "Differences", context, data, by_environment=True)
 
 
-def _data(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Any]:
-    values = values_over_seeds(analysis.results, environment.environment, analysis.study.metric)
-    agents = [agent.agent for agent in environment.agents]
+def _data(one: EnvironmentSeries) -> dict[str, Any]:
     return {
-        "intervals": [
-            {
-                "agent": agent.agent,
-                **estimate_data(agent.metric.mean),
-                **_runs(values[agent.agent]),
-            }
-            for agent in environment.agents
-        ],
-        "linearUpTo": linear_up_to((values[agent] for agent in agents), environment.optimum),
-        "agents": agents,
-        "improvement": improvement_matrix(environment),
+        "intervals": [_runs(agent) for agent in one.runs.agents],
+        "linearUpTo": one.runs.linear_up_to,
+        "agents": [agent.agent for agent in one.runs.agents],
+        "improvement": improvement_matrix(one.environment),
     }
 
 
-def _runs(values: NDArray[np.float64]) -> dict[str, Any]:
-    """Each run, where they are not too many to be told apart."""
-    seeds = np.flatnonzero(np.isfinite(values))
-    if len(values) > MOST_DOTS:
-        seeds = seeds[:0]
-    return {"seeds": seeds, "runs": values[seeds]}
+def _runs(agent: AgentRuns) -> dict[str, Any]:
+    """The mean, and each run where they are not too many to be told apart."""
+    many = len(agent.values) > MOST_DOTS
+    return {
+        "agent": agent.agent,
+        **estimate_data(agent.mean),
+        "seeds": agent.seeds[:0] if many else agent.seeds,
+        "runs": agent.values[:0] if many else agent.values,
+    }
 
 
 def improvement_matrix(environment: EnvironmentAnalysis) -> list[list[float | None]]:

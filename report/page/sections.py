@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from experiments.analysis import StudyAnalysis
+from report.series.study_series import StudySeries
 from verdicts import Estimate
 
 
@@ -15,12 +16,17 @@ class Report:
     """What a page is made from.
 
     Attributes:
-        analysis: the study.
-        command: the command that reproduces it.
+        series: the numbers that its figures show.
+        command: the command that reproduces the study.
     """
 
-    analysis: StudyAnalysis
+    series: StudySeries
     command: str
+
+    @property
+    def analysis(self) -> StudyAnalysis:
+        """The study."""
+        return self.series.analysis
 
 
 @dataclass(frozen=True)

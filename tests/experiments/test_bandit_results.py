@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments.study_files import read_study
-from report.figures.regret_bounds import (
+from report.series.regret_bounds import (
     auer_bound,
     best_of_normals,
 )

@@ -17,10 +17,11 @@ from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, read_results
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
-from report.figures.study_figures import write_figures
+from report.figures.figure_files import write_figures
 from report.result_files import write_tables
 from report.sentences import sentences
 from report.series.episode_blocks import episodes_table
+from report.series.study_series import study_series
 from report.terminal_tables import print_analysis, print_episodes_table
 from report.wording import enumeration, interval, number
 
@@ -259,7 +260,7 @@ def everything(results, tmp_path):
     blocks = episodes_table(results, 4)
     print_episodes_table(console, blocks, 4)
     write_tables(results)
-    write_figures(analysis, blocks)
+    write_figures(study_series(analysis), blocks)
     console.file.close()
     return console.export_text()
 
@@ -391,7 +392,7 @@ def test_the_table_per_block_of_episodes(tmp_path):
 
 def test_figures_as_png_and_svg_whose_text_is_text(tmp_path):
     results = results_of(study_of(), tmp_path, VERDICTS["better"][0])
-    paths = write_figures(analyse(results), episodes_table(results, 5))
+    paths = write_figures(study_series(analyse(results)), episodes_table(results, 5))
     names = ["episodes", "intervals", "learning_curves"]
     assert sorted(path.name for path in paths) == sorted(
         f"Warehouse-v0_{name}.{suffix}" for name in names for suffix in ("png", "svg")

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.bandit_batches import true_means
 from experiments.pull_statistics import MAX_POINTS, PullStatistics, points_of, pull_statistics
-from report.figures.regret_bounds import (
+from report.series.regret_bounds import (
     auer_bound,
     best_expected_reward,
     best_of_normals,

@@ -10,10 +10,11 @@ from scipy import integrate
 
 from experiments.analysis import analyse
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from report.figures.posteriors import density, grid, is_normal, truth
-from report.figures.study_figures import write_figures
+from report.figures.figure_files import write_figures
 from report.page import bandit_section, write_report
 from report.page.sections import Report
+from report.series.posteriors import density, grid, is_normal, truth
+from report.series.study_series import study_series
 
 PLACES = (
     EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 400}),
@@ -38,7 +39,7 @@ def analysis(tmp_path_factory, do_study):
 @pytest.fixture(scope="module")
 def page(analysis):
     path = analysis.results.root / "report.html"
-    write_report(analysis, path, "compare.py s.yml")
+    write_report(study_series(analysis), path, "compare.py s.yml")
     return path.read_text(encoding="utf-8")
 
 
@@ -135,7 +136,9 @@ def test_figures(analysis):
         results=replace(analysis.results, study=study),
         environments=analysis.environments[1:],
     )
-    names = {path.name for path in write_figures(analysis, None) if path.suffix == ".png"}
+    names = {
+        path.name for path in write_figures(study_series(analysis), None) if path.suffix == ".png"
+    }
     assert names == {
         *(f"segments_{kind}.png" for kind in ("pulls", "regret", "arms")),
         *(f"segments_{agent}_posteriors.png" for agent in ("b_Thompson_b", "blind", "normal")),
@@ -147,11 +150,11 @@ def test_bandits_whose_arms_are_drawn_anew(tmp_path, do_study):
     agents = (AGENTS[2], AGENTS[3])
     study = StudySpec("s", "S", agents, PLACES[2:], n_seeds=3, metric="regret")
     analysis = analyse(do_study(study, tmp_path))
-    (item,) = bandit_section.section(Report(analysis, "")).data
+    (item,) = bandit_section.section(Report(study_series(analysis), "")).data
     assert item["best"] == pytest.approx(1.5388, abs=1e-4)
     assert (item["bounds"], item["arms"], item["posteriors"]) == (None, None, [])
     assert set(item["curves"]) == {"normal", "eager"}
-    names = {path.stem for path in write_figures(analysis, None)}
+    names = {path.stem for path in write_figures(study_series(analysis), None)}
     assert names == {"testbed_pulls", "testbed_regret"}
 
 
@@ -168,7 +171,9 @@ def test_a_parameter_is_drawn_by_its_values(tmp_path, do_study):
         for value in (0.05, 0.1, 0.2)
     )
     study = StudySpec("s", "S", agents, PLACES[:1], n_seeds=2, metric="training")
-    names = {path.stem for path in write_figures(analyse(do_study(study, tmp_path)), None)}
+    names = {
+        path.stem for path in write_figures(study_series(analyse(do_study(study, tmp_path))), None)
+    }
     assert "coins_sweep" in names
 
 
@@ -180,7 +185,7 @@ def test_a_study_of_both_kinds(tmp_path, do_study):
     study = StudySpec("s", "S", agents, (lake, coins), n_seeds=2)
     analysis = analyse(do_study(study, tmp_path))
     path = tmp_path / "report.html"
-    write_report(analysis, path, "")
+    write_report(study_series(analysis), path, "")
     page = path.read_text(encoding="utf-8")
     by_step, by_pull = data_of(page, "curves"), data_of(page, "bandits")
     assert [item is None for item in by_step] == [False, True]

@@ -10,15 +10,17 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from report.figures.study_figures import COLOURS, agent_style
+from report.figures.figure_style import line_style
 from report.page import write_report
 from report.page.assembly import SECTIONS
 from report.page.comparison_section import improvement_matrix
 from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
 from report.page.markup import inline_script, p_value, plain, setting
-from report.page.scales import linear_up_to
 from report.ranking_columns import bar
 from report.sentences import sentences
+from report.series.agent_marks import COLOURS, agent_marks
+from report.series.axis_scale import linear_up_to
+from report.series.study_series import study_series
 from report.wording import interval_alone
 from verdicts import Estimate
 
@@ -152,7 +154,7 @@ def test_settings_command_versions_and_failures(page, report_study):
 
 
 def test_a_study_on_one_environment_compares_nothing_over_environments(one_environment, tmp_path):
-    write_report(one_environment, tmp_path / "page.html", "python compare.py x.yml")
+    write_report(study_series(one_environment), tmp_path / "page.html", "python compare.py x.yml")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     names = [attributes["id"] for attributes, _ in page.all("section")]
     assert names == [name for name in SECTION_NAMES if name != "overall"]
@@ -193,8 +195,9 @@ def test_the_curves_stand_in_a_table_too(page):
 
 def test_an_agent_has_the_colour_of_the_printed_figures(page, report_study):
     marks = data_of(page, "data-page")["agents"]
+    printed = agent_marks(report_study.study)
     assert [COLOURS[mark["colour"]] for mark in marks] == [
-        agent_style(report_study.study, mark["label"])["color"] for mark in marks
+        line_style(printed[mark["label"]])["color"] for mark in marks
     ]
 
 

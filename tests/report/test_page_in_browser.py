@@ -15,6 +15,7 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 from experiments.analysis import analyse
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from report.page import write_report
+from report.series.study_series import study_series
 
 BROWSER, DRIVER = (
     shutil.which("chromium") or shutil.which("google-chrome"),
@@ -75,7 +76,7 @@ def bandit_study(do_study, tmp_path_factory):
     root = tmp_path_factory.mktemp("bandits")
     study = StudySpec("b", "Bandits", agents, places, n_seeds=3, metric="regret")
     path = root / "report.html"
-    write_report(analyse(do_study(study, root)), path, "compare.py b.yml")
+    write_report(study_series(analyse(do_study(study, root))), path, "compare.py b.yml")
     return path
 
 

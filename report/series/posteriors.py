@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
@@ -45,3 +47,38 @@ def truth(statistics: PullStatistics, context: int, arm: int) -> float | None:
     if statistics.posteriors.shape[1] != len(statistics.true_means):
         return None
     return float(statistics.true_means[context, arm])
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What an agent believed of the arms in its first run.
+
+    Attributes:
+        agent: its label.
+        moments: after how many pulls, shape (n_moments,).
+        points: mean rewards that the densities are given at, shape (n_points,).
+        densities: shape (n_moments, n_contexts, n_arms, n_points).
+        true_means: by context and arm; None for an agent that knows no contexts.
+    """
+
+    agent: str
+    moments: NDArray[np.int64]
+    points: Floats
+    densities: Floats
+    true_means: list[list[float | None]]
+
+
+def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Belief:
+    """The densities of an agent's beliefs, at all moments that were kept."""
+    normal = is_normal(results, agent)
+    points = grid(statistics.true_means, is_normal=normal)
+    parameters = statistics.posteriors
+    _, n_contexts, n_arms, _ = parameters.shape
+    densities = [density(row, points, is_normal=normal) for row in parameters.reshape(-1, 2)]
+    return Belief(
+        agent,
+        statistics.moments,
+        points,
+        np.reshape(densities, (*parameters.shape[:3], len(points))),
+        [[truth(statistics, c, arm) for arm in range(n_arms)] for c in range(n_contexts)],
+    )

@@ -1,0 +1,127 @@
+"""Which figures a study has, and the files that they become."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+
+from experiments.study_spec import file_name
+from report.figures.bandit_figures import (
+    draw_arms,
+    draw_belief,
+    draw_regret,
+    draw_rewards,
+    draw_simple_regret,
+)
+from report.figures.figure_style import figure
+from report.figures.study_figures import (
+    draw_blocks,
+    draw_learning_curves,
+    draw_profiles,
+    draw_runs,
+    draw_sweeps,
+)
+from report.series.agent_marks import Mark
+from report.series.posteriors import Belief
+from report.series.pull_series import ArmSeries, PullSeries
+from report.series.study_series import EnvironmentSeries, StudySeries
+
+# More agents than this make no readable lines; a study of parameters shows them by parameter.
+MOST_LINES = 14
+
+Marks = Mapping[str, Mark]
+
+
+def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> list[Path]:
+    """Draw all figures that the study has the runs for, into its folder ``figures``.
+
+    Args:
+        series: what they show.
+        episodes_table: from `report.series.episode_blocks`, or None for no such figure.
+
+    Returns:
+        The files.
+    """
+    folder = series.analysis.results.root / "figures"
+    folder.mkdir(exist_ok=True)
+    paths: list[Path] = []
+    for one in series.environments:
+        if one.pulls is not None:
+            name = one.environment.environment
+            paths += _bandit_figures(one.pulls, name, folder, series.marks)
+    for one in series.environments:
+        paths += _study_figures(series, one, episodes_table, folder)
+    if series.analysis.overall is not None:
+        with figure(folder / "performance_profiles", paths) as (axes,):
+            draw_profiles(axes, series.analysis.overall, series.marks)
+    return paths
+
+
+def _study_figures(
+    series: StudySeries, one: EnvironmentSeries, blocks: pd.DataFrame | None, folder: Path
+) -> list[Path]:
+    written: list[Path] = []
+    environment, metric, marks = one.environment, series.analysis.study.metric, series.marks
+    name = file_name(environment.environment)
+    if one.sweeps:
+        with figure(folder / f"{name}_sweep", written) as (axes,):
+            draw_sweeps(axes, one.sweeps, environment.environment, metric)
+    if len(environment.agents) > MOST_LINES or one.curves is None:
+        return written
+    with figure(folder / f"{name}_learning_curves", written, n_columns=2) as places:
+        draw_learning_curves(places, one.curves, environment, marks)
+    with figure(folder / f"{name}_intervals", written) as (axes,):
+        draw_runs(axes, one.runs, environment, metric, marks)
+    if blocks is not None:
+        rows = blocks[blocks["environment"] == environment.environment]
+        written += _block_figure(rows, folder / f"{name}_episodes", marks)
+    return written
+
+
+def _block_figure(rows: pd.DataFrame, path: Path, marks: Marks) -> list[Path]:
+    agents = list(dict.fromkeys(rows["agent"]))
+    written: list[Path] = []
+    if agents:
+        with figure(path, written, n_columns=len(agents)) as places:
+            for axes, agent in zip(places, agents, strict=True):
+                draw_blocks(axes, rows[rows["agent"] == agent], marks[agent])
+    return written
+
+
+def _bandit_figures(pulls: PullSeries, place: str, folder: Path, marks: Marks) -> list[Path]:
+    written: list[Path] = []
+    name = file_name(place)
+    if len(pulls.pulls) <= MOST_LINES:
+        with figure(folder / f"{name}_pulls", written, n_columns=2) as (left, right):
+            draw_rewards(left, right, pulls, place, marks)
+        n_columns = 1 + pulls.has_simple_regret
+        with figure(folder / f"{name}_regret", written, n_columns=n_columns) as (left, *others):
+            draw_regret(left, pulls, place, marks)
+            for axes in others:
+                draw_simple_regret(axes, pulls, marks)
+    if pulls.arms is not None and len(pulls.arms.shares) <= MOST_LINES:
+        written += _arm_figure(pulls.arms, folder / f"{name}_arms", marks)
+    for belief in pulls.beliefs:
+        path = folder / f"{name}_{file_name(belief.agent)}_posteriors"
+        written += _belief_figure(belief, path)
+    return written
+
+
+def _arm_figure(arms: ArmSeries, path: Path, marks: Marks) -> list[Path]:
+    written: list[Path] = []
+    height = 4.2 * max(arms.n_contexts / 2, 1)
+    with figure(path, written, n_columns=2, height=height) as (left, right):
+        draw_arms(left, right, arms, marks)
+    return written
+
+
+def _belief_figure(belief: Belief, path: Path) -> list[Path]:
+    written: list[Path] = []
+    n_moments, n_contexts = belief.densities.shape[:2]
+    with figure(
+        path, written, n_columns=n_moments, n_rows=n_contexts, height=3.2 * n_contexts
+    ) as panels:
+        draw_belief(panels, belief)
+    return written

@@ -1,0 +1,39 @@
+"""One colour and one line style for each agent, the same in every figure of a study."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from experiments.study_spec import StudySpec
+
+# Okabe and Ito's colours, told apart by colour-blind readers too; the line styles go on where the
+# colours begin again. The page's style sheet has them as well, with others for a dark theme.
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+Dash = Literal["solid", "dash", "dashdot", "dot"]
+DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
+
+
+@dataclass(frozen=True)
+class Mark:
+    """How an agent is drawn.
+
+    Attributes:
+        label: the agent's.
+        colour: the place of its colour in `COLOURS`.
+        dash: its line style, as Plotly calls it.
+    """
+
+    label: str
+    colour: int
+    dash: Dash
+
+
+def agent_marks(study: StudySpec) -> dict[str, Mark]:
+    """The marks of the agents by label, in the order of the study."""
+    marks = {}
+    for place, label in enumerate(agent.label for agent in study.agents):
+        dash = DASHES[place // len(COLOURS) % len(DASHES)]
+        marks[label] = Mark(label, place % len(COLOURS), dash)
+    return marks

@@ -1,0 +1,69 @@
+"""Learning curves of all agents, by step, episode and wall time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.analysis import EnvironmentAnalysis, mean_curve
+from experiments.results import StudyResults
+from report.series.axis_scale import linear_up_to
+
+KINDS = ("evaluation", "training")
+AXES = ("step", "episode", "seconds")
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A line and its interval, each of shape (n_points,); NaN where there is no interval."""
+
+    x: Floats
+    y: Floats
+    low: Floats
+    high: Floats
+
+
+@dataclass(frozen=True)
+class LearningCurves:
+    """The mean curves on an environment.
+
+    Attributes:
+        by_axis: by axis, and then by agent, the best first; an agent without a curve is left out.
+        linear_up_to: where a symmetric logarithmic axis of returns ceases to be linear; None for a
+            linear axis.
+    """
+
+    by_axis: Mapping[str, Mapping[str, Curve]]
+    linear_up_to: float | None
+
+
+def learning_curves(
+    results: StudyResults, environment: EnvironmentAnalysis
+) -> dict[str, LearningCurves]:
+    """The curves on an environment, by kind."""
+    found = {}
+    for kind in KINDS:
+        by_axis = {by: _curves(results, environment, kind, by) for by in AXES}
+        by_step = [curve.y for curve in by_axis["step"].values()]
+        found[kind] = LearningCurves(by_axis, linear_up_to(by_step, environment.optimum))
+    return found
+
+
+def _curves(
+    results: StudyResults, environment: EnvironmentAnalysis, kind: str, by: str
+) -> dict[str, Curve]:
+    curves = {}
+    for agent in environment.agents:
+        try:
+            found = mean_curve(results, environment.environment, agent.agent, kind, by)
+        except ValueError:
+            continue  # a clock that was set back has made wall times fall
+        if found is not None:
+            points, band = found
+            curves[agent.agent] = Curve(points, band.point, band.low, band.high)
+    return curves
