@@ -1,174 +1,278 @@
-"""Figures of bandits by pull, worked on paper, and what theory says beforehand."""
+"""What the figures of a bandit show, asked of Matplotlib's axes."""
 
-import dataclasses
-import math
-
-import gymnasium as gym
 import numpy as np
 import pytest
 
-from experiments.bandit_batches import true_means
-from experiments.pull_statistics import MAX_POINTS, PullStatistics, points_of, pull_statistics
-from report.series.regret_bounds import (
-    auer_bound,
-    best_expected_reward,
-    best_of_normals,
-    lai_robbins_slope,
+from experiments.pull_statistics import PullStatistics
+from report.figures.bandit_figures import (
+    draw_arms,
+    draw_belief,
+    draw_regret,
+    draw_rewards,
+    draw_simple_regret,
 )
+from report.figures.figure_files import write_figures
+from report.series.agent_marks import COLOURS, Mark
+from report.series.posteriors import Belief
+from report.series.pull_series import ArmSeries, PullSeries, RegretBounds
+from report.series.run_series import RunSeries
+from report.series.study_series import EnvironmentSeries, StudySeries
 
-COINS = (0.2, 0.5, 0.75)
-
-# --- figures by pull, on paper -------------------------------------------------------------------
-
-# Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
-ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)
-REWARDS = np.array([[1, 0, 1, 1], [0, 1, 1, 0]], dtype=np.float32)
-REGRETS = np.where(ARMS == 0, 0.3, 0.0)
+BLUE, ORANGE, GREEN = COLOURS[:3]
+GREY = "#595959"
+MARKS = {"first": Mark("first", 1, "solid"), "second": Mark("second", 0, "dash")}
+PULLS = np.array([1, 10, 100])
 
 
-def test_two_runs_of_four_pulls_on_paper():
-    found = pull_statistics(ARMS, REWARDS, REGRETS, None, 2)
-    assert found.pulls.tolist() == [1, 2, 3, 4]
-    assert found.reward == pytest.approx([0.5, 0.5, 1, 0.5])
-    assert found.optimal == pytest.approx([0.5, 1, 0.5, 0.5])
-    assert found.regret == pytest.approx([0.15, 0, 0.15, 0.15])
-    # The sums are .3 .3 .3 .6 and 0 0 .3 .3.
-    assert found.cumulative_regret == pytest.approx([0.15, 0.15, 0.3, 0.45])
-    assert found.cumulative_regret_sem == pytest.approx([0.15, 0.15, 0, 0.15])
-    low, lower, median, upper, high = found.cumulative_regret_quantiles
-    assert [low[0], lower[0], median[0], upper[0], high[0]] == pytest.approx(
-        [0.015, 0.075, 0.15, 0.225, 0.285]
+def statistics(start, n_runs=4):
+    """Figures that begin with ``start``, each ten higher than the one before."""
+    rise = np.array([0.0, 1.0, 2.0])
+    nothing = np.empty(0)
+    return PullStatistics(
+        pulls=PULLS,
+        reward=start + rise,
+        optimal=(start + rise) / 100,
+        regret=start + 10 + rise,
+        cumulative_regret=start + 20 + rise,
+        cumulative_regret_sem=np.array([0.0, 1.0, 2.0]),
+        cumulative_regret_quantiles=np.array([start + 20 + rise + d for d in (-9, -3, -1, 3, 12)]),
+        simple_regret=start + 30 + rise,
+        total_reward=np.zeros(n_runs),
+        total_regret=np.zeros(n_runs),
+        shares=nothing,
+        context_regret=nothing,
+        estimates=nothing,
+        estimates_std=nothing,
+        true_means=nothing,
+        moments=np.empty(0, dtype=np.int64),
+        posteriors=nothing,
     )
-    assert median == pytest.approx([0.15, 0.15, 0.3, 0.45])
-    # The first run has pulled arm 0 most after pulls 1, 2 and 4, where ties go to the first arm.
-    assert found.simple_regret == pytest.approx([0.15, 0.15, 0, 0.15])
-    assert found.total_reward.tolist() == [3, 2]
-    assert found.total_regret == pytest.approx([0.6, 0.3])
-    assert found.shares == pytest.approx(np.array([[3 / 8, 5 / 8]]))
-    assert found.context_regret == pytest.approx(np.array([[0.3, 0]]))
-    for name in ("estimates", "estimates_std", "true_means", "moments", "posteriors"):
-        assert getattr(found, name).size == 0, name
 
 
-def test_contexts_on_paper():
-    """Arm 1 alone, which costs .4 in context 0 and nothing in context 1; there are three."""
-    contexts = np.array([[0, 1, 0, 1]])
-    regrets = np.where(contexts == 0, 0.4, 0.0)
-    arms, rewards = np.ones((1, 4), dtype=np.int16), np.zeros((1, 4), dtype=np.float32)
-    found = pull_statistics(arms, rewards, regrets, contexts, 2, 3)
-    # Each context weighs as often as it was seen.
-    assert found.simple_regret == pytest.approx([0.4, 0.4 / 2, 0.4 * 2 / 3, 0.4 / 2])
-    assert np.array_equal(found.shares, [[0, 1], [0, 1], [math.nan] * 2], equal_nan=True)
-    expected = [[math.nan, 0.4], [math.nan, 0], [math.nan] * 2]
-    assert found.context_regret == pytest.approx(np.array(expected), nan_ok=True)
-    assert found.cumulative_regret_sem.tolist() == [0, 0, 0, 0]  # of a single run
+BOUNDS = RegretBounds(PULLS, np.array([10.0, 30.0, 90.0]), np.array([0.0, 5.0, 10.0]))
+ARMS = ArmSeries(
+    2,
+    [f"context {context}, arm {arm}" for context in (0, 1) for arm in (0, 1)],
+    np.array([0.1, 0.2, 0.3, 0.4]),
+    {"first": np.array([0.25, 0.75, 0.5, 0.5]), "second": np.array([1, 0, 0, 1.0])},
+    {"second": (np.array([0.1, 0.3, 0.2, 0.5]), np.array([0.01, 0.02, 0.03, 0.04]))},
+)
+BELIEF = Belief(
+    "second",
+    np.array([10, 2000]),
+    np.array([0.0, 0.5, 1.0]),
+    np.arange(24.0).reshape(2, 2, 2, 3),
+    [[0.25, 0.75], [None, 0.5]],
+)
 
 
-def test_estimates_leave_out_arms_that_were_never_tried():
-    estimates = np.array([[[1.0, math.nan]], [[3.0, math.nan]], [[math.nan, math.nan]]])
-    arms, rewards = np.zeros((3, 2), dtype=np.int16), np.zeros((3, 2), dtype=np.float32)
-    found = pull_statistics(arms, rewards, np.zeros((3, 2)), None, 2, estimates=estimates)
-    assert np.array_equal(found.estimates, [[2, math.nan]], equal_nan=True)
-    assert np.array_equal(found.estimates_std, [[1, math.nan]], equal_nan=True)
+def series(**changes):
+    known = {
+        "pulls": {"first": statistics(10), "second": statistics(50)},
+        "best": 75.0,
+        "bounds": None,
+        "arms": None,
+        "beliefs": (),
+    }
+    return PullSeries(**known | changes)
 
 
-@pytest.mark.parametrize("n", [1, 2, MAX_POINTS, MAX_POINTS + 1, 1000, 100_000])
-def test_points(n):
-    points = points_of(n)
-    assert points[0] == 1
-    assert points[-1] == n
-    assert (np.diff(points) > 0).all()
-    assert len(points) <= MAX_POINTS
-    assert points[:100].tolist() == list(range(1, min(n, 100) + 1))
+def test_rewards_on_the_left_and_best_arms_on_the_right(axes, drawn):
+    places = axes(2)
+    draw_rewards(*places, series(), "coins", MARKS)
+    left, right = map(drawn, places)
+    assert left.names == left.shared_legend == ["first", "second", "best possible"]
+    assert [line["y"] for line in left.lines] == [[10, 11, 12], [50, 51, 52], [75, 75]]
+    assert [line["y"] for line in right.lines] == [[0.1, 0.11, 0.12], [0.5, 0.51, 0.52]]
+    for place in (left, right):
+        assert [line["x"] for line in place.lines[:2]] == [[1, 10, 100]] * 2
+        assert [line["colour"] for line in place.lines[:2]] == [ORANGE, BLUE]
+        assert [line["style"] for line in place.lines[:2]] == ["-", "--"]
+    assert left.line("best possible")["colour"] == GREY
+    assert left.title == "coins, 4 runs"
+    assert left.labels == ("pulls", "average reward")
+    assert right.labels == ("pulls", "runs that pull a best arm")
+    assert right.axes.get_ylim() == (0, 1)
+    assert right.axes.yaxis.get_major_formatter()(0.5) == "50%"
 
 
-def test_between_points_nothing_is_lost():
-    rng = np.random.default_rng(0)
-    arms = rng.integers(3, size=(4, 1000)).astype(np.int16)
-    rewards = rng.normal(size=(4, 1000)).astype(np.float32)
-    regrets = np.array([0.0, 0.1, 0.7])[arms]
-    found = pull_statistics(arms, rewards, regrets, None, 3)
-    widths = np.diff(found.pulls, prepend=0)
-    assert len(found.pulls) < 1000
-    assert found.reward @ widths == pytest.approx(found.total_reward.mean())
-    assert found.optimal @ widths == pytest.approx((arms == 0).sum(axis=1).mean())
-    assert found.regret @ widths == pytest.approx(found.total_regret.mean())
-    assert found.cumulative_regret == pytest.approx(np.cumsum(found.regret * widths))
-    index = int(np.searchsorted(found.pulls, 500))
-    upto = found.pulls[index]
-    most = [np.bincount(row[:upto], minlength=3).argmax() for row in arms]
-    assert found.simple_regret[index] == pytest.approx(np.array([0, 0.1, 0.7])[most].mean())
+def test_no_line_for_a_best_reward_that_is_not_known(axes, drawn):
+    places = axes(2)
+    draw_rewards(*places, series(best=None), "coins", MARKS)
+    assert drawn(places[0]).names == ["first", "second"]
 
 
-def test_saved_and_loaded(tmp_path):
-    found = pull_statistics(ARMS, REWARDS, REGRETS, None, 2, true_means=np.array([[0.2, 0.5]]))
-    found.save(tmp_path / "file.npz")
-    again = PullStatistics.load(tmp_path / "file.npz")
-    for field in dataclasses.fields(PullStatistics):
-        one, other = getattr(found, field.name), getattr(again, field.name)
-        assert one.dtype == other.dtype
-        assert np.array_equal(one, other), field.name
-    assert [path.name for path in tmp_path.iterdir()] == ["file.npz"]
+def test_regret_with_its_interval_and_the_spread_of_runs(axes, drawn):
+    (axis,) = axes()
+    draw_regret(axis, series(), "coins", MARKS)
+    place = drawn(axis)
+    assert place.names == place.shared_legend == ["first", "second"]
+    assert [line["y"] for line in place.lines] == [[30, 31, 32], [70, 71, 72]]
+    assert [line["x"] for line in place.lines] == [[1, 10, 100]] * 2
+    assert [band["colour"] for band in place.bands] == [ORANGE, ORANGE, BLUE, BLUE]
+    assert [band["alpha"] for band in place.bands] == [0.3, 0.08] * 2
+    interval, spread = (band["ends"] for band in place.bands[:2])
+    assert interval[1] == (30, 30)
+    assert interval[100] == pytest.approx((32 - 2 * 1.96, 32 + 2 * 1.96))
+    assert spread == {1: (21, 42), 10: (22, 43), 100: (23, 44)}
+    assert place.title == "coins: mean, 95 % interval, 90% of runs"
+    assert place.labels == ("pulls", "cumulative regret")
+    assert place.axes.get_xscale() == "log"
 
 
-# --- what theory says ----------------------------------------------------------------------------
-
-
-def test_auers_bound():
-    """(8 / .55 + 8 / .25) ln n + (1 + pi^2 / 3) (.55 + .25), which is 432.1 at 10,000."""
-    assert float(auer_bound(COINS, 10_000)) == pytest.approx(432.1, abs=0.05)
-    at_once = 0.8 * (1 + math.pi**2 / 3)
-    assert auer_bound(COINS, [1, math.e]) == pytest.approx([at_once, at_once + 8 / 0.55 + 8 / 0.25])
-    assert float(auer_bound((0.5, 0.5), 10)) == 0
-
-
-def test_lai_and_robbins_slope():
-    assert lai_robbins_slope(COINS) == pytest.approx(2.564, abs=0.0005)
-    # By hand for a pair: .25 / (.5 ln(.5 / .75) + .5 ln(.5 / .25)).
-    by_hand = 0.25 / (0.5 * math.log(2 / 3) + 0.5 * math.log(2))
-    assert lai_robbins_slope((0.5, 0.75)) == pytest.approx(by_hand)
-
-
-def test_best_of_normals():
-    """Closed forms for two and three; 1.5388 for the testbed's ten."""
-    assert best_of_normals(1) == pytest.approx(0, abs=1e-9)
-    assert best_of_normals(2) == pytest.approx(1 / math.sqrt(math.pi))
-    assert best_of_normals(3) == pytest.approx(1.5 / math.sqrt(math.pi))
-    assert best_of_normals(10) == pytest.approx(1.5388, abs=5e-5)
+def test_bounds_and_the_height_that_they_leave(axes, drawn):
+    (axis,) = axes()
+    draw_regret(axis, series(bounds=BOUNDS), "coins", MARKS)
+    place = drawn(axis)
+    assert place.names == ["first", "second", "Auer, for UCB1", "Lai-Robbins slope"]
+    auer, slope = place.line("Auer, for UCB1"), place.line("Lai-Robbins slope")
+    assert (auer["x"], auer["y"]) == ([1, 10, 100], [10, 30, 90])
+    assert (slope["x"], slope["y"]) == ([1, 10, 100], [0, 5, 10])
+    assert (auer["style"], slope["style"]) == ("--", ":")
+    assert {auer["colour"], slope["colour"]} == {GREY}
+    low, high = place.axes.get_ylim()
+    assert low == 0
+    assert 84 < high < 90  # what the agents need, which the bound does not cut off
 
 
 @pytest.mark.parametrize(
-    ("env_id", "kwargs", "expected"),
-    [
-        ("BernoulliBandit-v0", {}, 0.75),
-        ("SegmentBandit-v0", {}, 0.3 * 0.25 + 0.7 * 0.12),
-        ("GaussianBandit-v0", {"means": [1.0, 3.0, 2.0]}, 3.0),
-        ("GaussianBandit-v0", {"mean_loc": 4.0, "n_arms": 2}, 4 + 1 / math.sqrt(math.pi)),
-        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
-        ("LinearBandit-v0", {}, None),
-    ],
+    ("last", "n_shown", "highest"),
+    [(1000.0, 2, None), (50.0, 3, 55.0)],  # a bound far above is cut; one far below sets the limit
 )
-def test_best_expected_reward(env_id, kwargs, expected):
-    env = gym.make(env_id, **kwargs)
-    env.reset(seed=0)
-    best = best_expected_reward(env)
-    env.close()
-    assert best == (None if expected is None else pytest.approx(expected))
+def test_a_bound_that_does_not_fit(axes, drawn, last, n_shown, highest):
+    (axis,) = axes()
+    bounds = RegretBounds(PULLS, np.array([10.0, 30.0, last]), BOUNDS.lai_robbins)
+    draw_regret(axis, series(bounds=bounds), "coins", MARKS)
+    place = drawn(axis)
+    assert len(place.line("Auer, for UCB1")["x"]) == n_shown
+    if highest is not None:
+        assert place.axes.get_ylim() == pytest.approx((0, highest))
 
 
-@pytest.mark.parametrize(
-    ("env_id", "kwargs", "expected"),
-    [
-        ("BernoulliBandit-v0", {}, [[0.2, 0.5, 0.75]]),
-        ("SegmentBandit-v0", {}, [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]),
-        ("GaussianBandit-v0", {"means": [1.0, 3.0]}, [[1, 3]]),
-        ("GaussianBandit-v0", {}, None),
-        ("GaussianBandit-v0", {"means": [0.0, 0.0], "drift_std": 0.1}, None),
-        ("LinearBandit-v0", {}, None),
-    ],
-)
-def test_means_that_all_runs_share(env_id, kwargs, expected):
-    env = gym.make(env_id, **kwargs)
-    found = true_means(env)
-    env.close()
-    assert (None if found is None else found.tolist()) == expected
+def test_simple_regret(axes, drawn):
+    (axis,) = axes()
+    draw_simple_regret(axis, series(), MARKS)
+    place = drawn(axis)
+    assert [line["y"] for line in place.lines] == [[40, 41, 42], [80, 81, 82]]
+    assert [line["x"] for line in place.lines] == [[1, 10, 100]] * 2
+    assert [line["colour"] for line in place.lines] == [ORANGE, BLUE]
+    assert place.labels == ("pulls", "simple regret")
+    assert place.title == "of recommending the arm pulled most"
+    assert place.axes.get_xscale() == "log"
+
+
+def test_arms_side_by_side_within_each_context(axes, drawn):
+    left, right = axes(2)
+    draw_arms(left, right, ARMS, MARKS)
+    first, second = left.containers
+    assert (first.get_label(), second.get_label()) == ("first", "second")
+    assert [bar.get_height() for bar in first] == [0.25, 0.75, 0.5, 0.5]
+    assert [bar.get_height() for bar in second] == [1, 0, 0, 1]
+    assert [bar.get_x() for bar in first] == pytest.approx([-0.4, 0.6, 1.6, 2.6])
+    assert [bar.get_x() for bar in second] == pytest.approx([0, 1, 2, 3])
+    assert drawn(left).shared_legend == ["first", "second"]
+    names = ["context 0\narm 0", "context 0\narm 1", "context 1\narm 0", "context 1\narm 1"]
+    for place in (left, right):
+        assert [text.get_text() for text in place.get_xticklabels()] == names
+    assert drawn(left).labels[1] == "share of the pulls"
+    assert drawn(left).title == "pulls, by context"
+    assert left.get_ylim() == (0, 1)
+    assert left.yaxis.get_major_formatter()(0.5) == "50%"
+
+
+def test_estimates_beside_the_truth(axes, drawn):
+    left, right = axes(2)
+    draw_arms(left, right, ARMS, MARKS)
+    (estimates,) = right.containers  # of the second agent alone, at its bars
+    dots, _, (bars,) = estimates
+    assert dots.get_xdata() == pytest.approx([0.2, 1.2, 2.2, 3.2])
+    assert dots.get_ydata().tolist() == [0.1, 0.3, 0.2, 0.5]
+    assert dots.get_color() == BLUE
+    lengths = [segment[1, 1] - segment[0, 1] for segment in bars.get_segments()]
+    assert lengths == pytest.approx([0.02, 0.04, 0.06, 0.08])
+    truth = drawn(right).lines[-1]
+    assert (truth["x"], truth["y"]) == ([0, 1, 2, 3], [0.1, 0.2, 0.3, 0.4])
+    assert truth["marker"] == "_"
+    assert drawn(right).labels[1] == "mean reward"
+    assert drawn(right).title == ("final estimates, mean and spread over runs; bars are the truth")
+
+
+def test_beliefs_by_context_and_moment(axes, drawn):
+    panels = axes(4)
+    draw_belief(panels, BELIEF)
+    places = [drawn(panel) for panel in panels]
+    assert [place.title for place in places] == [
+        "second, context 0, after 10 pulls",
+        "second, context 0, after 2,000 pulls",
+        "second, context 1, after 10 pulls",
+        "second, context 1, after 2,000 pulls",
+    ]
+    densities = [[line["y"] for line in place.lines if line["label"]] for place in places]
+    # The densities count up: by moment, context, arm and point.
+    assert densities == [
+        [[0, 1, 2], [3, 4, 5]],
+        [[12, 13, 14], [15, 16, 17]],
+        [[6, 7, 8], [9, 10, 11]],
+        [[18, 19, 20], [21, 22, 23]],
+    ]
+    for place in places:
+        assert place.names == ["arm 0", "arm 1"]
+        assert [place.line(name)["colour"] for name in place.names] == [BLUE, ORANGE]
+        assert place.line("arm 0")["x"] == [0, 0.5, 1]
+        assert place.labels == ("mean reward", "density")
+    truths = [[line["x"] for line in place.lines if not line["label"]] for place in places]
+    assert truths == [[[0.25] * 2, [0.75] * 2]] * 2 + [[[0.5] * 2]] * 2
+    assert [place.legend for place in places] == [["arm 0", "arm 1"], None, None, None]
+
+
+def test_a_single_context_is_not_named(axes, drawn):
+    panels = axes(2)
+    draw_belief(
+        panels,
+        Belief("blind", BELIEF.moments, BELIEF.points, BELIEF.densities[:, :1], [[None, None]]),
+    )
+    assert [drawn(panel).title for panel in panels] == [
+        "blind, after 10 pulls",
+        "blind, after 2,000 pulls",
+    ]
+    assert len(drawn(panels[0]).lines) == 2
+
+
+@pytest.fixture
+def study(made_up, tmp_path):
+    """A study of one bandit, to be drawn from what is handed in."""
+
+    def make(pulls, agents=("first", "second")):
+        place = made_up.environment([made_up.agent(name, 1.0) for name in agents], "coins")
+        analysis = made_up.analysis([place], agents, tmp_path, metric="regret")
+        one = EnvironmentSeries(place, None, RunSeries((), None), pulls, {})
+        marks = {name: MARKS.get(name, Mark(name, 2, "solid")) for name in agents}
+        return StudySeries(analysis, marks, (one,))
+
+    return make
+
+
+def test_files_of_a_bandit(study, canvases, drawn):
+    paths = write_figures(study(series(arms=ARMS, beliefs=(BELIEF,))), None)
+    stems = [f"coins_{kind}" for kind in ("pulls", "regret", "arms", "second_posteriors")]
+    assert [path.stem for path in paths[::2]] == stems
+    assert [len(canvases[stem]) for stem in stems] == [2, 2, 2, 4]
+    assert [drawn(place).labels[1] for place in canvases["coins_regret"]] == [
+        "cumulative regret",
+        "simple regret",
+    ]
+    assert drawn(canvases["coins_pulls"][0]).labels[1] == "average reward"
+
+
+def test_agents_without_a_simple_regret_leave_no_empty_panel(study, canvases):
+    pulls = {"first": statistics(10)}
+    pulls["first"].simple_regret[:] = np.nan
+    write_figures(study(series(pulls=pulls)), None)
+    assert len(canvases["coins_regret"]) == 1
+
+
+def test_too_many_agents_on_a_bandit_make_no_lines(study):
+    names = [f"agent {n}" for n in range(15)]
+    crowd = {name: statistics(10) for name in names}
+    arms = ArmSeries(1, ["arm 0"], np.ones(1), dict.fromkeys(names, np.ones(1)), {})
+    assert write_figures(study(series(pulls=crowd, arms=arms), tuple(names)), None) == []

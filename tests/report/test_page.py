@@ -19,7 +19,6 @@ from report.page.markup import inline_script, p_value, plain, setting
 from report.ranking_columns import bar
 from report.sentences import sentences
 from report.series.agent_marks import COLOURS, agent_marks
-from report.series.axis_scale import linear_up_to
 from report.series.study_series import study_series
 from report.wording import interval_alone
 from verdicts import Estimate
@@ -325,18 +324,3 @@ def test_a_bar_stays_between_the_blind_policy_and_the_optimum():
     assert bar(Estimate(-3.0, -4.0, 0.25, 4)) == (0, 0, 0.25)
     assert bar(Estimate(0.5, math.nan, math.nan, 1)) == (0.5, 0.5, 0.5)
     assert bar(Estimate(math.nan, math.nan, math.nan, 0)) == (0, 0, 0)
-
-
-@pytest.mark.parametrize(
-    ("curves", "optimum", "expected"),
-    [
-        ([[-5000.0, -50.0, 70.0]], 79.0, 79.0),  # early returns dwarf the optimum
-        ([[-500.0, -50.0, 70.0]], 79.0, None),
-        ([[-300.0, 1.0, 2.0, 2.0]], None, 2.0),  # the end of the curve stands for the optimum
-        ([[np.nan, 1.0], [np.nan]], None, None),
-        ([], 79.0, None),
-        ([[-9.0, 0.0]], 0.1, None),  # returns below one are never dwarfed by those below ten
-    ],
-)
-def test_where_an_axis_ceases_to_be_linear(curves, optimum, expected):
-    assert linear_up_to([np.array(curve) for curve in curves], optimum) == expected

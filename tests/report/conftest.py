@@ -1,0 +1,170 @@
+"""Analyses made up by hand, so that what is drawn and printed can be worked out on paper."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from verdicts import Estimate, Summary, ThresholdSummary
+
+
+def estimate(point, low=None, high=None, n=4):
+    """An estimate; with an interval from a tenth below the point to a fifth above by default."""
+    low = point - 0.1 if low is None else low
+    high = point + 0.2 if high is None else high
+    return Estimate(point, low, high, n)
+
+
+def agent_analysis(label, mean, **changes):
+    """An agent whose figures are the mean plus 1, 2, 3 and so on, so that none is another."""
+    figures = AgentAnalysis(
+        agent=label,
+        algo="qlearning",
+        n_runs=4,
+        n_missing=0,
+        metric=Summary(estimate(mean), estimate(mean + 1), estimate(mean + 2)),
+        score=Summary(estimate(mean / 100), estimate(mean / 50), estimate(mean / 25)),
+        final=estimate(mean + 3),
+        area=estimate(mean + 4),
+        last_episodes=estimate(mean + 5),
+        regret=estimate(mean + 6),
+        steps_to_threshold=ThresholdSummary(estimate(mean + 7), estimate(0.75, 0.5, 0.9)),
+        episodes_to_threshold=ThresholdSummary(estimate(mean + 8), estimate(0.75, 0.5, 0.9)),
+        success_rate=estimate(0.5, 0.25, 0.625),
+        seconds=estimate(mean + 9),
+    )
+    return replace(figures, **changes)
+
+
+def environment_analysis(agents=(), label="lake", **changes):
+    known = EnvironmentAnalysis(label, "Lake-v0", 100.0, 20.0, 96.0, 1.6, True, tuple(agents), ())
+    return replace(known, **changes)
+
+
+def study_of(labels, metric="final", places=("lake",), n_seeds=4):
+    return StudySpec(
+        "s",
+        "S",
+        tuple(AgentSpec(label, "qlearning", tuned=False) for label in labels),
+        tuple(EnvironmentSpec(place, "FrozenLake-v1") for place in places),
+        n_seeds=n_seeds,
+        metric=metric,
+    )
+
+
+def study_analysis(environments, labels, root=None, pulls=None, overall=None, **fields):
+    study = study_of(labels, places=[one.environment for one in environments], **fields)
+    empty = pd.DataFrame(columns=RUN_COLUMNS), pd.DataFrame(columns=CURVE_COLUMNS)
+    results = StudyResults(study, root, *empty, (), pulls or {})
+    return StudyAnalysis(results, tuple(environments), overall)
+
+
+@pytest.fixture
+def made_up():
+    """What makes an estimate, an agent, an environment, a study, and its analysis."""
+
+    class MadeUp:
+        estimate = staticmethod(estimate)
+        agent = staticmethod(agent_analysis)
+        environment = staticmethod(environment_analysis)
+        study = staticmethod(study_of)
+        analysis = staticmethod(study_analysis)
+        nothing = Estimate(math.nan, math.nan, math.nan, 0)
+
+    return MadeUp
+
+
+@pytest.fixture
+def axes():
+    """Axes to draw on, as many as asked for."""
+    from matplotlib.figure import Figure
+
+    def make(n=1):
+        return list(Figure().subplots(1, n, squeeze=False).flat)
+
+    return make
+
+
+class Drawn:
+    """What Matplotlib's axes show: asked for in plain numbers."""
+
+    def __init__(self, axes):
+        from matplotlib.collections import PolyCollection
+        from matplotlib.colors import to_hex
+
+        self.axes = axes
+        self.lines = [
+            {
+                "label": line.get_label() if not line.get_label().startswith("_") else None,
+                "x": np.asarray(line.get_xdata(), dtype=float).tolist(),
+                "y": np.asarray(line.get_ydata(), dtype=float).tolist(),
+                "colour": to_hex(line.get_color()).upper(),
+                "style": line.get_linestyle(),
+                "marker": line.get_marker(),
+            }
+            for line in axes.get_lines()
+        ]
+        self.bands = [
+            {
+                "colour": to_hex(area.get_facecolor()[0]).upper(),
+                "alpha": round(float(area.get_facecolor()[0][3]), 2),
+                "ends": self._ends(area.get_paths()[0].vertices),
+            }
+            for area in axes.collections
+            if isinstance(area, PolyCollection)
+        ]
+        legend = axes.get_legend()
+        self.legend = None if legend is None else [text.get_text() for text in legend.get_texts()]
+        self.title = axes.get_title(loc="left")
+        self.labels = (axes.get_xlabel(), axes.get_ylabel())
+
+    @staticmethod
+    def _ends(vertices):
+        """Low and high end of an area at each x."""
+        return {
+            float(x): (
+                float(vertices[vertices[:, 0] == x, 1].min()),
+                float(vertices[vertices[:, 0] == x, 1].max()),
+            )
+            for x in np.unique(vertices[:, 0])
+        }
+
+    def line(self, label):
+        (found,) = [line for line in self.lines if line["label"] == label]
+        return found
+
+    @property
+    def names(self):
+        """The lines that have a name, in the order in which they were drawn."""
+        return [line["label"] for line in self.lines if line["label"] is not None]
+
+    @property
+    def shared_legend(self):
+        """The names in the legend of the whole figure."""
+        (legend,) = self.axes.figure.legends
+        return [text.get_text() for text in legend.get_texts()]
+
+
+@pytest.fixture
+def drawn():
+    return Drawn
+
+
+@pytest.fixture
+def canvases(monkeypatch):
+    """By file name, the axes of each figure as it was written; the files themselves are empty."""
+    import report.figures.figure_style as style
+
+    seen = {}
+
+    def keep(self, target, **options):
+        seen[target.name.strip(".").partition(".")[0]] = self.axes
+        target.touch()
+
+    monkeypatch.setattr(style.Figure, "savefig", keep)
+    return seen
