@@ -16,7 +16,6 @@ from report.page.assembly import SECTIONS
 from report.page.comparison_section import improvement_matrix
 from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
 from report.page.markup import inline_script, p_value, plain, setting
-from report.ranking_columns import bar
 from report.sentences import sentences
 from report.series.agent_marks import COLOURS, agent_marks
 from report.series.study_series import study_series
@@ -318,9 +317,3 @@ def test_words_for_figures():
         "lin_0.1",
         '{"a": [1]}',
     ]
-
-
-def test_a_bar_stays_between_the_blind_policy_and_the_optimum():
-    assert bar(Estimate(-3.0, -4.0, 0.25, 4)) == (0, 0, 0.25)
-    assert bar(Estimate(0.5, math.nan, math.nan, 1)) == (0.5, 0.5, 0.5)
-    assert bar(Estimate(math.nan, math.nan, math.nan, 0)) == (0, 0, 0)
