@@ -15,8 +15,8 @@ import numpy as np
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
 from experiments.pull_statistics import QUANTILES, PullStatistics
 from experiments.study_spec import COSTS, StudySpec
-from report.wording import interval, interval_alone, number
-from verdicts import Estimate, ThresholdSummary
+from report.ranking_cells import Cell, bar, estimate_cell, number_cell, threshold_cell
+from report.wording import interval_alone, number
 
 Order = Literal["ascending", "descending"]
 
@@ -34,25 +34,6 @@ class BanditRow(Row):
     """An agent on a bandit, with its figures by pull."""
 
     pulls: PullStatistics
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One cell.
-
-    Attributes:
-        text: the figure.
-        value: what it is sorted by; None puts it last.
-        note: what the page has below it in small print.
-        in_line: what the terminal has in place of the text, where it has something else.
-        bar: low end, point and high end, each between 0 and 1, of a bar to draw; or None.
-    """
-
-    text: str
-    value: float | None
-    note: str = ""
-    in_line: str = ""
-    bar: tuple[float, float, float] | None = None
 
 
 AnyRow = TypeVar("AnyRow", bound=Row)
@@ -95,34 +76,11 @@ def filled(
     ]
 
 
-def bar(score: Estimate) -> tuple[float, float, float]:
-    """Low end, point and high end of a score, cut to what lies between 0 and 1."""
-    low, high = (score.low, score.high) if score.has_interval else (score.point, score.point)
-    return (_share(low), _share(score.point), _share(high))
-
-
-def _share(value: float) -> float:
-    return 0.0 if math.isnan(value) else round(min(max(value, 0.0), 1.0), 4)
-
-
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-def _estimate(estimate: Estimate) -> Cell:
-    return Cell(
-        number(estimate.point),
-        _known(estimate.point),
-        interval_alone(estimate),
-        interval(estimate),
-    )
-
-
 def _score(row: Row) -> Cell | None:
     if row.agent.score is None:
         return None
     mean = row.agent.score.mean
-    return replace(_estimate(mean), bar=None if math.isnan(mean.point) else bar(mean))
+    return replace(estimate_cell(mean), bar=None if math.isnan(mean.point) else bar(mean))
 
 
 def _gap(row: Row) -> Cell | None:
@@ -130,7 +88,7 @@ def _gap(row: Row) -> Cell | None:
     if optimum is None:
         return None
     low, high = optimum - final.high, optimum - final.low
-    return _estimate(replace(final, point=optimum - final.point, low=low, high=high))
+    return estimate_cell(replace(final, point=optimum - final.point, low=low, high=high))
 
 
 def _success(row: Row) -> Cell | None:
@@ -143,14 +101,6 @@ def _success(row: Row) -> Cell | None:
     return Cell(f"{rate.point:.1%}", rate.point, note)
 
 
-def _threshold(summary: ThresholdSummary | None) -> Cell | None:
-    if summary is None:
-        return None
-    median, share = summary.median.point, summary.share_reached.point
-    note = "" if math.isnan(share) else f"{share:.0%} of runs"
-    return Cell(number(median), _known(median), note)
-
-
 def _solved(row: Row) -> Cell | None:
     summary = row.agent.steps_to_threshold
     if summary is None:
@@ -161,7 +111,7 @@ def _solved(row: Row) -> Cell | None:
 
 def _seconds(row: Row) -> Cell:
     seconds = row.agent.seconds
-    return replace(_estimate(seconds), in_line=f"{number(seconds.point)} s")
+    return replace(estimate_cell(seconds), in_line=f"{number(seconds.point)} s")
 
 
 def _runs(row: Row) -> Cell:
@@ -174,24 +124,22 @@ def _spread(row: BanditRow) -> Cell:
     return Cell(f"{number(low)} to {number(high)}", float(high))
 
 
-def _last(values: Sequence[float]) -> Cell:
-    return Cell(number(values[-1]), _known(values[-1]))
-
-
 COLUMNS: tuple[Column[Row], ...] = (
     Column(
         page="Mean",
         help="over seeds",
         terminal="mean",
-        cell=lambda row: _estimate(row.agent.metric.mean),
+        cell=lambda row: estimate_cell(row.agent.metric.mean),
     ),
     Column(
         page="IQM",
         help="middle half",
         terminal="IQM",
-        cell=lambda row: _estimate(row.agent.metric.iqm),
+        cell=lambda row: estimate_cell(row.agent.metric.iqm),
     ),
-    Column(page="Median", help="over seeds", cell=lambda row: _estimate(row.agent.metric.median)),
+    Column(
+        page="Median", help="over seeds", cell=lambda row: estimate_cell(row.agent.metric.median)
+    ),
     Column(
         page="Score", help="1 is optimal", terminal="score", best_first="descending", cell=_score
     ),
@@ -199,7 +147,7 @@ COLUMNS: tuple[Column[Row], ...] = (
     Column(
         terminal="training",
         caption="return of the last 100 training episodes",
-        cell=lambda row: _estimate(row.agent.last_episodes),
+        cell=lambda row: estimate_cell(row.agent.last_episodes),
     ),
     Column(page="Success", help="in the end", best_first="descending", cell=_success),
     Column(
@@ -208,13 +156,13 @@ COLUMNS: tuple[Column[Row], ...] = (
         terminal="steps",
         caption="until a return of {threshold}, the median run",
         best_first="ascending",
-        cell=lambda row: _threshold(row.agent.steps_to_threshold),
+        cell=lambda row: threshold_cell(row.agent.steps_to_threshold),
     ),
     Column(
         page="Episodes",
         help="to {threshold}",
         best_first="ascending",
-        cell=lambda row: _threshold(row.agent.episodes_to_threshold),
+        cell=lambda row: threshold_cell(row.agent.episodes_to_threshold),
     ),
     Column(terminal="solved", best_first="descending", cell=_solved),
     Column(page="Training", help="seconds", terminal="time", best_first="ascending", cell=_seconds),
@@ -223,10 +171,10 @@ COLUMNS: tuple[Column[Row], ...] = (
 
 # In the terminal, bandits have a table of their own; on the page, a section.
 BANDIT_COLUMNS: tuple[Column[BanditRow], ...] = (
-    Column(terminal="mean regret", cell=lambda row: _estimate(row.agent.regret)),
+    Column(terminal="mean regret", cell=lambda row: estimate_cell(row.agent.regret)),
     Column(terminal=f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs", cell=_spread),
-    Column(terminal="simple regret", cell=lambda row: _last(row.pulls.simple_regret.tolist())),
-    Column(terminal="reward", cell=lambda row: _last(row.pulls.reward.tolist())),
+    Column(terminal="simple regret", cell=lambda row: number_cell(row.pulls.simple_regret[-1])),
+    Column(terminal="reward", cell=lambda row: number_cell(row.pulls.reward[-1])),
     Column(
         terminal="best arm",
         cell=lambda row: Cell(f"{row.pulls.optimal[-1]:.1%}", float(row.pulls.optimal[-1])),

@@ -13,7 +13,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from report.ranking_columns import bar
+from report.ranking_cells import bar
 from report.wording import interval_alone, number
 
 SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer

@@ -6,7 +6,8 @@ import pytest
 
 from report.page import ranking_section
 from report.page.sections import Report
-from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, Row, bar, filled
+from report.ranking_cells import bar
+from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, Row, filled
 from report.series.study_series import StudySeries
 from verdicts import Estimate, ThresholdSummary
 
