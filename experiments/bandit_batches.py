@@ -13,9 +13,9 @@ import yaml
 from numpy.typing import NDArray
 
 from agents.bandits.batch import run_batch
+from agents.bandits.batch_result import BatchResult
 from agents.bandits.one_by_one import run_one_by_one
-from agents.bandits.results import BatchResult
-from agents.bandits.worlds import NotBatchable
+from agents.compiled.compile_envs import NotCompilable
 from experiments.pull_statistics import PullStatistics, pull_statistics
 from pipeline.environments import make_single_env
 from pipeline.files import write_text
@@ -63,7 +63,7 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
     )
     try:
         return run_batch(*arguments), "compiled batch"
-    except NotBatchable as reason:
+    except NotCompilable as reason:
         return run_one_by_one(*arguments), f"one by one: {reason}"
 
 

@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
-from agents.tabular.base import TabularAlgorithm
+from agents.tabular.tabular_algorithm import TabularAlgorithm
 from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
 from envs.layout import GridLayout, grid_layout
 from mdp import (
