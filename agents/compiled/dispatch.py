@@ -30,14 +30,7 @@ def by_type(stub: Function) -> Function:
     name = stub.__name__
 
     def choose(thing: Any, *others: Any) -> Any:
-        function = getattr(_class_of(thing), name, None)
-        if function is None:
-            return None
-
-        def call(thing: Any, *others: Any) -> Any:
-            return function(thing, *others)
-
-        return call
+        return getattr(getattr(_class_of(thing), name, None), "py_func", None)
 
     options: Any = {**BARE_OPTIONS, "forceinline": True}
     overload(stub, strict=False, jit_options=options)(choose)
