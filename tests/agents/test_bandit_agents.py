@@ -128,7 +128,7 @@ def test_arguments_travel_with_the_agent(name, tmp_path):
     model.save(tmp_path / "agent.zip")
     loaded = load_algorithm(name).load(tmp_path / "agent.zip")
     assert {key: getattr(loaded, key) for key in own} == own
-    assert loaded.settings == model.settings
+    assert loaded.settings().tobytes() == model.settings().tobytes()
     assert loaded.lr_schedule(0.5) == model.lr_schedule(0.5)
     assert loaded.exploration_rate == model.exploration_rate
 
