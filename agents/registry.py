@@ -44,6 +44,12 @@ class AlgorithmEntry:
     extra: str | None = None
 
     @property
+    def family(self) -> str:
+        """The folder of `agents` that the class lives in; empty where it is in none."""
+        package, *folders = self.entry_point.partition(":")[0].split(".")
+        return folders[0] if package == "agents" and len(folders) > 1 else ""
+
+    @property
     def is_installed(self) -> bool:
         """Whether the package that the agent needs is there."""
         return self.package is None or importlib.util.find_spec(self.package) is not None
