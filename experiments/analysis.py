@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from experiments.results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
+from mdp.array_types import Floats
 from verdicts import (
     Band,
     Estimate,
@@ -31,8 +31,6 @@ from verdicts import (
 SEED = 0  # of all resampling: the same runs give the same figures
 CURVE_POINTS = 200
 MARGIN = 0.02  # of the way from the best blind policy to the optimum
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from agents.bandits.one_by_one import run_one_by_one
 from agents.bandits.results import BatchResult
 from agents.bandits.worlds import NotBatchable
 from experiments.pull_statistics import PullStatistics, pull_statistics
+from mdp.array_types import Floats
 from pipeline.environments import make_single_env
 from pipeline.files import write_text
 from pipeline.preparation import algorithm_kwargs
@@ -93,7 +94,7 @@ def _without_simple_regret(statistics: PullStatistics) -> PullStatistics:
     return replace(statistics, simple_regret=np.full_like(statistics.simple_regret, np.nan))
 
 
-def true_means(env: gym.Env[Any, Any]) -> NDArray[np.float64] | None:
+def true_means(env: gym.Env[Any, Any]) -> Floats | None:
     """Means of the arms by context, shape (n_contexts, n_arms), where each run has the same."""
     bandit: Any = env.unwrapped
     moves = getattr(bandit, "redraws", False) or getattr(bandit, "drift_std", 0.0) > 0

@@ -9,19 +9,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from experiments.bandit_results import batch_rows, read_pulls, run_regret
 from experiments.pull_statistics import PullStatistics
 from experiments.study_plan import PlannedRun
 from experiments.study_spec import StudySpec
+from mdp.array_types import Floats
 from pipeline.run_folder import Run
 from verdicts import area_under_curve, steps_to_threshold
 
 LAST_EPISODES = 100
 TRAINING_POINTS = 100
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

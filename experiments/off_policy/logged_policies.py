@@ -9,18 +9,16 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from commands.train_request import check_algorithm
 from envs.bandits import LoggedData, read_log
 from experiments.off_policy.estimators import PolicyTerms, check_rewards, evaluate_policy
 from experiments.off_policy.reward_models import CrossFit, cross_fit
+from mdp.array_types import Floats
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import policy_matrix
 from pipeline.model_loading import check_model_file, hand_written_algorithm, load_model, run_of
-
-Floats = NDArray[np.float64]
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
