@@ -9,7 +9,6 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from agents.bandits.batch import run_batch
@@ -19,12 +18,11 @@ from agents.bandits.worlds import NotBatchable
 from experiments.pull_statistics import PullStatistics, pull_statistics
 from mdp.array_types import Floats
 from pipeline.environments import make_single_env
-from pipeline.files import write_text
 from pipeline.preparation import algorithm_kwargs
 from pipeline.pull_recording import PULLS_FILE
 from pipeline.run_folder import FINISHED, Run
+from pipeline.run_record import recorded_versions, write_settings
 from pipeline.train_spec import TrainSpec
-from pipeline.training import recorded_versions
 
 STATISTICS_FILE = "pull_statistics.npz"
 
@@ -39,8 +37,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     finally:
         env.close()
     statistics.save(run.path / STATISTICS_FILE)
-    write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
-    write_text(run.params_path / "command.txt", command + "\n")
+    write_settings(run, spec, command)
     run.update_info(
         state=FINISHED,
         env_name=run.env_name,

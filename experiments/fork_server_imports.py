@@ -12,14 +12,14 @@ from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
-from pipeline.settings import hyperparams
+from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
 
 
 def _warm_up() -> None:
     raw = {"n_timesteps": 100}
-    spec = TrainSpec("qlearning", "Warehouse-v0", hyperparams.split(raw), raw, 0, pictures=False)
+    spec = TrainSpec("qlearning", "Warehouse-v0", split(raw), raw, 0, pictures=False)
     with TemporaryDirectory() as folder:
         train(replace(spec, log_folder=Path(folder)), Console(quiet=True), {}, "")
 

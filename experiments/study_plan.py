@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
-from commands.train_request import check_algorithm, check_fit
 from envs.known_models import time_limit
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
+from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
 from pipeline.run_folder import FINISHED, Run, environment_name
-from pipeline.settings import hyperparams
+from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
+from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.train_spec import TrainSpec
 
 # What a run of the same settings may differ in: where it is written, and what is shown meanwhile.
@@ -176,7 +177,7 @@ def _check_folders(what: str, labels: Sequence[str]) -> None:
 def _is_batch(spec: TrainSpec) -> bool:
     """Whether the runs of a spec go as one batch: bandit agents as they are, for one episode."""
     entry, special = ALGORITHMS[spec.algo], spec.hyperparams
-    untouched = hyperparams.Hyperparams()
+    untouched = Hyperparams()
     if not (entry.for_bandits and entry.package is None) or special.n_timesteps is None:
         return False
     env = make_single_env(spec)
@@ -200,7 +201,7 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
     spec = TrainSpec(
         algo=agent.algo,
         env_id=environment.env_id,
-        hyperparams=hyperparams.split(raw, place),
+        hyperparams=split(raw, place),
         saved_hyperparams=raw,
         seed=0,
         eval_freq=study.eval_freq,
@@ -219,8 +220,8 @@ def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str
     raw: dict[str, Any] = {}
     if agent.tuned:
         try:
-            raw = hyperparams.read_hyperparams(agent.algo, environment.env_id)
-        except hyperparams.NoEntryError:
+            raw = read_hyperparams(agent.algo, environment.env_id)
+        except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
     for settings in (environment.settings, agent.settings):

@@ -1,46 +1,39 @@
-"""From a spec to a finished run folder."""
+"""From a spec to a finished run folder: `prepare` makes all parts, `carry_out` trains."""
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
 import torch as th
-import yaml
 from rich.console import Console
 
-from commands.run_output import print_header
 from pipeline.callbacks import save_model, save_normalization
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import value_map
-from pipeline.files import write_text
 from pipeline.pictures.learning_curve import draw_learning_curve
 from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.pull_recording import PullSummary, summarise_pulls
 from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
+from pipeline.run_record import recorded_versions, write_arguments, write_settings
 from pipeline.train_spec import TrainSpec
 
 FINAL_EVALUATION_EPISODES = 100
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
 
-RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
-
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run has come to.
+    """What came out of a run.
 
     Attributes:
         run: its folder.
@@ -52,7 +45,7 @@ class Outcome:
         best_return: mean return of the best evaluation during training, if there was one.
         best_timesteps: when that was.
         engine: for tabular agents, whether training was compiled, and if not, why.
-        pulls: on bandits, what the pulls of training came to; else None.
+        pulls: on bandits, figures on the pulls of training; else None.
     """
 
     run: Run
@@ -69,13 +62,18 @@ class Outcome:
 def train(
     spec: TrainSpec, console: Console, args: dict[str, Any], command: str, run: Run | None = None
 ) -> Outcome:
-    """Train the agent and leave a run folder.
+    """Train the agent and leave a run folder: `prepare`, then `carry_out`."""
+    return carry_out(prepare(spec, console, args, command, run))
 
-    Ctrl-C ends the training early; what has been learnt is saved all the same.
+
+def prepare(
+    spec: TrainSpec, console: Console, args: dict[str, Any], command: str, run: Run | None = None
+) -> Training:
+    """Make the run folder and all parts of the training.
 
     Args:
         spec: what to do.
-        console: where to report to.
+        console: where the training is to report to.
         args: the command's arguments, for the run folder.
         command: the command itself, likewise.
         run: the run folder, made already; by default a new one in the spec's log folder.
@@ -91,10 +89,16 @@ def train(
     with ExitStack() as undo, _library_errors_in_one_line():
         undo.callback(run.discard)
         training = set_up(spec, run, kwargs, console, undo)
-        _write_settings(training, args, command)
+        write_settings(run, spec, command)
+        write_arguments(run, spec, args)
+        run.update_info(
+            state=RUNNING,
+            env_name=run.env_name,
+            spec=spec.as_data(),
+            versions=recorded_versions(),
+        )
         undo.pop_all()
-    print_header(console, spec)
-    return _execute(training)
+    return training
 
 
 @contextmanager
@@ -106,30 +110,15 @@ def _library_errors_in_one_line() -> Iterator[None]:
         raise UserError(one_line(error)) from error
 
 
-def _write_settings(training: Training, args: dict[str, Any], command: str) -> None:
-    """Write what the run was asked to do, as rl_zoo3 does and as our own ``run.json``."""
-    run, spec = training.run, training.spec
-    write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
-    # rl_zoo3 takes this for the mapping that it makes of the flag, and puts it over config.yml.
-    args = {**args, "env_kwargs": spec.saved_hyperparams.get("env_kwargs")}
-    write_text(run.params_path / "args.yml", yaml.safe_dump(args))
-    write_text(run.params_path / "command.txt", command + "\n")
-    run.update_info(
-        state=RUNNING,
-        env_name=run.env_name,
-        spec=spec.as_data(),
-        versions=recorded_versions(),
-    )
+def carry_out(training: Training) -> Outcome:
+    """Train, and save, judge and draw what was learnt.
 
+    Ctrl-C ends the training early; what was learnt until then is saved all the same.
 
-@cache
-def recorded_versions() -> dict[str, str]:
-    """The versions that a run's results may depend on."""
-    packages = {package: version(package) for package in RECORDED_PACKAGES}
-    return {"python": platform.python_version(), **packages}
-
-
-def _execute(training: Training) -> Outcome:
+    Raises:
+        UserError: if the agent finds at its first step that it cannot work so; no folder is left
+            behind then.
+    """
     model = training.model
     started = time.monotonic()
     state = FINISHED

@@ -18,7 +18,7 @@ import enjoy
 import train
 from commands.parsing import run_command
 from pipeline import files
-from pipeline.playing import FRAMES_PER_SECOND
+from pipeline.filming import FRAMES_PER_SECOND
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]

@@ -37,7 +37,8 @@ from pipeline.settings.components import (
     vec_wrapper_factory,
     wrapper_factory,
 )
-from pipeline.settings.hyperparams import component_specs, read_hyperparams, split
+from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparams import component_specs, split
 from pipeline.settings.literals import DottedName
 
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"

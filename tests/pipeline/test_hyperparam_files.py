@@ -6,12 +6,13 @@ import gymnasium as gym
 import pytest
 
 from agents import ALGORITHMS, load_algorithm
-from commands.train_request import check_fit
+from pipeline.agent_checks import check_fit
 from pipeline.environments import make_single_env, make_training_env
 from pipeline.settings import hyperparams
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.settings.components import callbacks, vec_wrapper_factory
-from pipeline.settings.hyperparams import entry_names, override, read_hyperparams, split
+from pipeline.settings.hyperparam_entries import entry_names, override, read_hyperparams
+from pipeline.settings.hyperparams import split
 from pipeline.settings.strict_yaml import read_yaml
 from pipeline.train_spec import TrainSpec
 
