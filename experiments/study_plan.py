@@ -18,10 +18,10 @@ from pipeline.errors import UserError
 from pipeline.run_folder import FINISHED, Run, environment_name
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import Hyperparams, split
-from pipeline.train_spec import TrainSpec
+from pipeline.train_spec import TrainSpec, completed
 
 # What a run of the same settings may differ in: where it is written, and what is shown meanwhile.
-_NO_PART_OF_IDENTITY = (
+_MAY_DIFFER = (
     "log_folder",
     "tensorboard_log",
     "save_every_n_episodes",
@@ -31,8 +31,8 @@ _NO_PART_OF_IDENTITY = (
     "pictures",
 )
 
-# What a batch takes heed of, beside the agent's own arguments.
-_UNDERSTOOD = ("n_timesteps", "env_kwargs", "algorithm")
+# What a batch can follow, besides the agent's own arguments.
+_BATCH_SETTINGS = ("n_timesteps", "env_kwargs", "algorithm")
 
 
 @dataclass(frozen=True)
@@ -66,18 +66,17 @@ class PlannedRun:
     def is_finished(self) -> bool:
         """Whether the folder holds this very run, to its end."""
         info = self.run.read_info()
-        recorded = info.get("spec", {})
+        if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
+            return False
+        recorded = completed(self.run.recorded_spec())
         wanted = self.spec.save_every_n_episodes
-        return (
-            info.get("state") == FINISHED
-            and info.get("n_runs", 1) == self.n_runs
-            and _identity(recorded) == _identity(self.spec.as_data())
-            and (wanted < 1 or self.is_batch or recorded.get("save_every_n_episodes") == wanted)
+        return _identity(recorded) == _identity(self.spec.as_data()) and (
+            wanted < 1 or self.is_batch or recorded["save_every_n_episodes"] == wanted
         )
 
 
 def _identity(spec: Mapping[str, Any]) -> Any:
-    kept = {key: value for key, value in spec.items() if key not in _NO_PART_OF_IDENTITY}
+    kept = {key: value for key, value in spec.items() if key not in _MAY_DIFFER}
     return json.loads(json.dumps(kept))
 
 
@@ -100,7 +99,7 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
     for environment in study.environments:
         check_env_id(environment.env_id)
         for agent in study.agents:
-            with _told_where(agent):
+            with _naming_the_place(agent):
                 spec = _train_spec(study, agent, environment)
                 check_fit(spec)
             specs[agent.label, environment.label] = spec
@@ -146,14 +145,14 @@ def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
     agents = {agent.label: agent for agent in study.agents}
     for run in planned:
         if run.seed == 0:
-            with _told_where(agents[run.agent]):
+            with _naming_the_place(agents[run.agent]):
                 algorithm_kwargs(run.spec)
                 callbacks = run.spec.hyperparams.callback
                 components.callbacks(callbacks, run.spec.gym_packages, run.path)
 
 
 @contextmanager
-def _told_where(agent: AgentSpec) -> Iterator[None]:
+def _naming_the_place(agent: AgentSpec) -> Iterator[None]:
     """Say in mistakes where the study asks for the agent."""
     try:
         yield
@@ -188,7 +187,7 @@ def _is_batch(spec: TrainSpec) -> bool:
     return all(
         getattr(special, name) == getattr(untouched, name)
         for name in vars(untouched)
-        if name not in _UNDERSTOOD
+        if name not in _BATCH_SETTINGS
     )
 
 
@@ -216,7 +215,7 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
 
 
 def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str, Any]:
-    """The agent's file, the environment's settings over it, and the agent's own over those."""
+    """The agent's file, changed by the environment's settings, and these by the agent's own."""
     raw: dict[str, Any] = {}
     if agent.tuned:
         try:

@@ -29,6 +29,17 @@ def spec_of(algo, env_id, **changes):
     return TrainSpec(algo, env_id, split(raw), raw, seed=0)
 
 
+def environment_for(algo):
+    """One that the agent's file names, or any that fits where the file has a default alone."""
+    for env_id in [*entry_names(algo), "FrozenLake-v1", "CartPole-v1", "GaussianBandit-v0"]:
+        env = gym.make(env_id)
+        fits = ALGORITHMS[algo].env_misfit(env) == ""
+        env.close()
+        if fits or env_id in entry_names(algo):
+            return env_id
+    raise LookupError(algo)
+
+
 def test_every_file_is_an_agents_and_every_agent_has_one():
     assert {path.stem for path in FILES} == set(ALGORITHMS)
     assert {path.name for path in FOLDER.iterdir()} == {f"{name}.yml" for name in ALGORITHMS}
@@ -79,7 +90,7 @@ def test_every_entry_names_components_that_there_are(algo, key, tmp_path):
 @pytest.mark.parametrize("algo", ALGORITHMS)
 def test_an_agent_takes_its_first_steps(algo):
     """One entry of each file, as it stands there."""
-    spec = spec_of(algo, entry_names(algo)[0])
+    spec = spec_of(algo, environment_for(algo))
     algorithm = load_algorithm(algo)
     env = make_training_env(spec, None)
     kwargs = build_algorithm_kwargs(algorithm, spec.hyperparams.algorithm, algo)
