@@ -10,8 +10,8 @@ from rich.console import Console
 from commands.study_progress import StudyProgress
 from commands.terminal import table_console
 from experiments.execution import RunFailure, available_cores, execute
-from experiments.results import StudyResults, read_results
 from experiments.study_plan import PlannedRun, check_settings
+from experiments.study_results import StudyResults, read_results
 from experiments.study_spec import StudySpec
 
 

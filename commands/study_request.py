@@ -22,7 +22,7 @@ from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError, unknown
 from pipeline.settings.literals import parse_assignments
 
-_LEAST = {
+_MINIMUM = {
     "seeds": 1,
     "n_timesteps": 1,
     "n_episodes": 1,
@@ -50,7 +50,7 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
 
 
 def _check_output(args: argparse.Namespace) -> None:
-    for key, least in _LEAST.items():
+    for key, least in _MINIMUM.items():
         value = getattr(args, key)
         if value is not None and value < least:
             raise UserError(f"--{key.replace('_', '-')} must be at least {least}, not {value}")

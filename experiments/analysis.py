@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
-from experiments.results import StudyResults
+from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
 from mdp.array_types import Floats
 from verdicts import (
@@ -274,7 +274,7 @@ def mean_curve(
 
     Returns:
         The points, shape (n,), and the mean there with its interval; None without any run, or where
-        one has ended before another has come to its first point.
+        one ended before the first point of another.
     """
     table = results.curves
     chosen = (table["environment"] == environment) & (table["agent"] == agent)

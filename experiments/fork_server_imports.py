@@ -1,7 +1,7 @@
 """Imported by the server that runs are forked from, so that what takes long is done once.
 
-Imports alone take two seconds, and half a second goes by until the compiled loops are loaded: a
-short training sees to both. Where nothing is compiled yet, it is done here too.
+Imports alone take two seconds, and loading the compiled loops half a second: a short training does
+both. Where nothing is compiled yet, it is done here too.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What many runs on a bandit have come to, pull by pull."""
+"""Figures on many runs on a bandit, pull by pull."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the runs of a study have come to, as tidy tables."""
+"""The results of the runs of a study, as tables with one row for each observation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All parts of a training run, made and fitted together before the first step."""
+"""All parts of a training run, made before its first step."""
 
 from __future__ import annotations
 

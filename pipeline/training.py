@@ -216,7 +216,7 @@ def _keep_pulls(training: Training, state: str, title: str) -> PullSummary | Non
     if recorder is None or not recorder.n_calls:
         return None
     if state == INTERRUPTED:
-        recorder.write()  # which the end of a training does by itself
+        recorder.write()  # as it does by itself where the training was not interrupted
     arrays = recorder.arrays()
     if training.spec.pictures:
         draw_pulls(training.run.pulls_picture_path, title, arrays)

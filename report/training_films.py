@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from experiments.results import StudyResults, read_episodes
 from experiments.study_plan import PlannedRun
+from experiments.study_results import StudyResults, read_episodes
 from experiments.study_spec import file_name
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError, one_line

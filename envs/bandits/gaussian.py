@@ -1,4 +1,4 @@
-"""The ten-armed testbed and its kin."""
+"""The ten-armed testbed and variants of it."""
 
 from __future__ import annotations
 

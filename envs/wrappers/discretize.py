@@ -13,7 +13,7 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
 from envs.argument_checks import check_whole_number
-from envs.wrappers.encodings import row_major
+from envs.wrappers.observation_encodings import row_major
 from mdp.array_types import Floats, Ints
 
 

@@ -28,7 +28,7 @@ from pipeline.model_loading import (
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
-_RUNS = Path("logs")
+_LOG_FOLDER = Path("logs")
 
 
 @dataclass(frozen=True)
@@ -114,7 +114,7 @@ def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
     if algo is None:
         raise UserError(f"{path} lies in no run folder: what agent it holds is not known")
     if hand_written is None and not trust:
-        check_origin(zip_path, _RUNS, given=path)
+        check_origin(zip_path, _LOG_FOLDER, given=path)
     settings = spec.get("hyperparams") or {}
     changed = next((key for key in _OBSERVATION_SETTINGS if settings.get(key)), None)
     if changed is not None:
@@ -155,8 +155,8 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
             rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, model)))
         except UserError as error:
             notes.append(str(error))
-    told = data.rewards
-    as_logged = PolicyTerms(told, told, told, told, effective=float(len(data)))
+    rewards = data.rewards
+    as_logged = PolicyTerms(rewards, rewards, rewards, rewards, effective=float(len(data)))
     if data.categories is not None:
         numbered = ", ".join(f"{i} {name}" for i, name in enumerate(data.categories))
         notes.append(f"{data.context_names[0]} was read as {numbered}")

@@ -133,7 +133,7 @@ def policy_matrix(
             distribution: Any = agent.policy.get_distribution(tensor).distribution
         return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
     if hasattr(agent, "exploration_rate"):
-        # DQN and its kin, QR-DQN too, which may not be installed and is no subclass of DQN.
+        # DQN and agents like it: QR-DQN too, which may not be installed and is no subclass of DQN.
         epsilon = float(agent.exploration_rate)
         greedy = policy_matrix(agent, observations)
         return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
