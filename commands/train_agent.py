@@ -28,8 +28,13 @@ def build_parser() -> argparse.ArgumentParser:
     add("--algo", default="ppo", help="agent (default: ppo; see --list)")
     add("--env", default="CartPole-v1", help="environment id (default: CartPole-v1; see --list)")
     add("--list", action="store_true", help="list agents and environments, and which fit which")
-    budget = parser.add_argument_group("how long, and on what settings")
-    add = budget.add_argument
+    _add_training_flags(parser)
+    _add_output_flags(parser)
+    return parser
+
+
+def _add_training_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("how long, and on what settings").add_argument
     add("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="environment steps")
     add("--n-episodes", type=int, default=-1, metavar="N", help="episodes instead of steps")
     add("--seed", type=int, default=-1, help="seed of everything (default: a random one)")
@@ -55,8 +60,6 @@ def build_parser() -> argparse.ArgumentParser:
     add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=int, default=1, help="torch threads (default: 1)")
-    _add_output_flags(parser)
-    return parser
 
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:

@@ -89,6 +89,10 @@ CURVE_COLUMNS = (
 )
 
 
+# Columns that have the same name in ``run.json``.
+_FIGURES = ("success_rate", "exact", "optimum", "best_blind", "gap", "score")
+
+
 @dataclass(frozen=True)
 class Episodes:
     """The training episodes of a run in the order in which they ended.
@@ -218,12 +222,7 @@ def _summary_row(
         "final": final.get("mean_return"),
         "final_std": final.get("std_return"),
         "final_length": final.get("mean_length"),
-        "success_rate": final.get("success_rate"),
-        "exact": final.get("exact"),
-        "optimum": final.get("optimum"),
-        "best_blind": final.get("best_blind"),
-        "gap": final.get("gap"),
-        "score": final.get("score"),
+        **{name: final.get(name) for name in _FIGURES},
         "best": info["best_mean_return"],
         "best_timesteps": info["best_timesteps"],
         "area": area_under_curve(steps, values) if len(steps) else None,

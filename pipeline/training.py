@@ -12,11 +12,11 @@ from uuid import uuid4
 import torch as th
 from rich.console import Console
 
-from pipeline.callbacks import save_model, save_normalization
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import value_map
+from pipeline.model_saving import save_model, save_normalization
 from pipeline.pictures.learning_curve import draw_learning_curve
 from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
@@ -180,33 +180,38 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
         evaluation.evaluate_now()
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
-    yardstick = None if final is None else final.yardstick
     pulls = _keep_pulls(training, state, title)
     if training.spec.pictures and (pulls is None or evaluation.evaluations_timesteps):
+        yardstick = None if final is None else final.yardstick
         draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
     _keep_value_map(training, title)
-    best = evaluation.best_mean_reward if evaluation.best_timesteps else None
-    engine = getattr(model, "engine_in_use", None)
-    run.update_info(
-        state=state,
-        n_timesteps=model.num_timesteps,
-        seconds=round(seconds, 3),
-        final=None if final is None else final.summary(),
-        best_mean_return=best,
-        best_timesteps=evaluation.best_timesteps,
-        engine=engine,
-        **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
-    )
-    return Outcome(
+    outcome = Outcome(
         run,
         state,
-        model.num_timesteps,
-        seconds,
-        final,
-        best,
-        evaluation.best_timesteps,
-        engine,
-        pulls,
+        n_steps=model.num_timesteps,
+        seconds=seconds,
+        final=final,
+        best_return=evaluation.best_mean_reward if evaluation.best_timesteps else None,
+        best_timesteps=evaluation.best_timesteps,
+        engine=getattr(model, "engine_in_use", None),
+        pulls=pulls,
+    )
+    _record(outcome)
+    return outcome
+
+
+def _record(outcome: Outcome) -> None:
+    """Write what came out into ``run.json``, the last file of a run."""
+    pulls = outcome.pulls
+    outcome.run.update_info(
+        state=outcome.state,
+        n_timesteps=outcome.n_steps,
+        seconds=round(outcome.seconds, 3),
+        final=None if outcome.final is None else outcome.final.summary(),
+        best_mean_return=outcome.best_return,
+        best_timesteps=outcome.best_timesteps,
+        engine=outcome.engine,
+        **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
     )
 
 
