@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -197,17 +197,17 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
     place = f"{agent.label} on {environment.label}"
     if study.is_quick:
         raw = _shortened(raw, study.quick.budget)
+    # A field of the study that has the name of one of the run goes there as it is.
+    named = {key.name for key in fields(TrainSpec)} & {key.name for key in fields(StudySpec)}
     spec = TrainSpec(
         algo=agent.algo,
         env_id=environment.env_id,
         hyperparams=split(raw, place),
         saved_hyperparams=raw,
         seed=0,
-        eval_freq=study.eval_freq,
-        eval_episodes=study.eval_episodes,
-        gym_packages=study.gym_packages,
         verbose=0,
         pictures=False,
+        **{name: getattr(study, name) for name in named},
     )
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
         raise UserError(f"{place}: how long to train? give n_timesteps or n_episodes")
