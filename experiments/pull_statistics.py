@@ -13,7 +13,7 @@ from mdp.array_types import AnyInts, Floats, Ints
 from pipeline.files import replacing
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-FIRST_PULLS = 100  # told one by one; later ones thin out towards `MAX_POINTS`
+FIRST_PULLS = 100  # kept one by one; of later ones fewer and fewer, `MAX_POINTS` in all
 MAX_POINTS = 300
 
 

@@ -72,7 +72,7 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
 def set_up(
     spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
 ) -> Training:
-    """Make all parts of the training; ``undo`` is told how to take them back."""
+    """Make all parts of the training, and add to ``undo`` how to remove them again."""
     env = make_training_env(spec, run.path)
     undo.callback(env.close)
     model = _make_model(spec, env, kwargs)
@@ -138,7 +138,7 @@ def is_unread(spec: TrainSpec) -> bool:
 
 
 def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
-    """Find out now what would end the training half-way."""
+    """Refuse now what would end the training half-way."""
     for callback in callbacks:
         if isinstance(callback, ExponentialExploration):
             callback.check_model(model)

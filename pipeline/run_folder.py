@@ -184,7 +184,7 @@ class Run:
         write_json(self.info_path, {**self.read_info(), **fields})
 
     def discard(self) -> None:
-        """Remove the folder, where nothing has come of the run, and those left empty by that."""
+        """Remove the folder of a run that left nothing, and those above it that are empty then."""
         shutil.rmtree(self.path, ignore_errors=True)
         for folder in list(self.path.parents)[:2]:
             try:

@@ -40,7 +40,7 @@ class Outcome:
         state: ``"finished"`` or ``"interrupted"``.
         n_steps: environment steps that were run.
         seconds: time that they took, evaluations included.
-        final: evaluation of the agent at the end, by episodes that served nothing else; None where
+        final: evaluation of the agent at the end, by episodes used for nothing else; None where
             evaluation was turned off.
         best_return: mean return of the best evaluation during training, if there was one.
         best_timesteps: when that was.
@@ -103,7 +103,7 @@ def prepare(
 
 @contextmanager
 def _library_errors_in_one_line() -> Iterator[None]:
-    """Settings that only the library finds fault with, when it is handed them."""
+    """Errors of settings that only the library checks, when it gets them."""
     try:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError) as error:
@@ -142,7 +142,7 @@ def carry_out(training: Training) -> Outcome:
 
 
 def _give_up(training: Training, error: BaseException) -> None:
-    """Note the reason; or leave nothing, where the agent saw at once that it cannot work so.
+    """Note the reason; or remove the folder, where the agent failed before its first step.
 
     Raises:
         UserError: in that case.
@@ -229,7 +229,7 @@ def _keep_pulls(training: Training, state: str, title: str) -> PullSummary | Non
 
 
 def _keep_value_map(training: Training, title: str) -> None:
-    """Record and draw the policy that has come out, where evaluation is on and knows a map."""
+    """Record and draw the final policy, where evaluation is on and knows a map."""
     model, maps = training.model, training.evaluation.value_maps
     if maps is None or not training.evaluation.is_asked_for:
         return
@@ -240,7 +240,7 @@ def _keep_value_map(training: Training, title: str) -> None:
 
 
 def _final_evaluation(training: Training) -> Evaluation | None:
-    """Exact, or by episodes that have served nothing else; none where evaluation is off."""
+    """Exact, or by episodes that were used for nothing else; none where evaluation is off."""
     evaluator = training.evaluation.evaluator
     if not training.evaluation.is_asked_for:
         return None

@@ -14,7 +14,7 @@ from scipy import stats
 
 from verdicts.score_arrays import Counts, Floats
 
-# The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would be unsteady.
+# The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would vary too much.
 N_RESAMPLES = 10_000
 # Those over many seeds lie further in, and need fewer.
 ENOUGH_RESAMPLES = 1_000

@@ -18,7 +18,7 @@ from verdicts.estimates import Estimate
 from verdicts.paired import SAME, differences, same_shape
 from verdicts.score_arrays import Counts, Floats
 
-# From here on the bootstrap and the normal interval are the same to the eye.
+# From here on the bootstrap and the normal interval look the same.
 MANY_SEEDS = 200
 
 

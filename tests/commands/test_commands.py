@@ -388,7 +388,7 @@ def test_a_file_of_one_default_entry_is_enough(type_command, monkeypatch, tmp_pa
     assert plan(study, tmp_path)[0].spec.hyperparams.n_timesteps == 60
 
 
-HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy")
+HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib")
 
 
 @pytest.mark.parametrize(
