@@ -96,7 +96,7 @@ class ProgressDisplay(BlockCallback):
         self.close()
 
     def close(self) -> None:
-        """Let go of the terminal; harmless when called again."""
+        """Give the terminal back; may be called again."""
         self.notice.stop()
         if self.bar is not None:
             self.bar.stop()

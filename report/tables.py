@@ -13,7 +13,7 @@ from rich.table import Table
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.pull_statistics import QUANTILES, PullStatistics
-from experiments.results import StudyResults, read_episodes
+from experiments.study_results import StudyResults, read_episodes
 from experiments.study_spec import METRIC_WORDS, StudySpec
 from pipeline.files import replacing
 from report.sentences import environment_sentences, interval, number

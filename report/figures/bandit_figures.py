@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.ticker import PercentFormatter
 
 from experiments.pull_statistics import QUANTILES, PullStatistics
-from experiments.results import StudyResults
+from experiments.study_results import StudyResults
 from experiments.study_spec import file_name
 from pipeline.environments import make_single_env
 from report.figures.figure_style import COLOURS, agent_style, figure

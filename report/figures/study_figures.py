@@ -14,9 +14,8 @@ from experiments.analysis import (
     AgentAnalysis,
     EnvironmentAnalysis,
     StudyAnalysis,
-    mean_curve,
-    values_over_seeds,
 )
+from experiments.seed_values import mean_curve, values_over_seeds
 from experiments.study_spec import METRIC_WORDS, StudySpec, file_name
 from report.figures.bandit_figures import MOST_LINES, write_bandit_figures
 from report.figures.figure_style import COLOURS, agent_style, figure

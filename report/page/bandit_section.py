@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.pull_statistics import QUANTILES, PullStatistics
-from experiments.results import StudyResults
+from experiments.study_results import StudyResults
 from pipeline.environments import make_single_env
 from report.figures.posteriors import density, grid, is_normal, truth
 from report.figures.regret_bounds import auer_bound, best_expected_reward, lai_robbins_slope

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.analysis import EnvironmentAnalysis, StudyAnalysis, values_over_seeds
+from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from experiments.seed_values import values_over_seeds
 from experiments.study_spec import COSTS, METRIC_WORDS
 from report.page.scales import linear_up_to
 from report.page.sections import Report, Section, estimate_data

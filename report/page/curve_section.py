@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.analysis import EnvironmentAnalysis, StudyAnalysis, mean_curve
+from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from experiments.seed_values import mean_curve
 from report.page.scales import linear_up_to
 from report.page.sections import Report, Section
 from verdicts import Band

@@ -12,6 +12,8 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
+from mdp.array_types import AnyInts, Ints
+
 
 class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
     """Turns an observation of several whole numbers into one, the last number counting fastest.
@@ -43,7 +45,7 @@ class FlattenToDiscrete(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
             index = index * size + int(value) - first
         return index
 
-    def map_observations(self, batch: ArrayLike) -> NDArray[np.int64]:
+    def map_observations(self, batch: ArrayLike) -> Ints:
         """The numbers of many observations, shape (n,).
 
         Args:
@@ -80,14 +82,14 @@ class OneHotObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructor
         hot[int(observation) - self._first] = 1
         return hot
 
-    def map_observations(self, batch: NDArray[np.integer[Any]]) -> NDArray[np.float32]:
+    def map_observations(self, batch: AnyInts) -> NDArray[np.float32]:
         """The vectors of many numbers of shape (n,), shape (n, number of values)."""
         hot = np.zeros((len(batch), self._n), np.float32)
         hot[np.arange(len(batch)), np.asarray(batch) - self._first] = 1
         return hot
 
 
-def row_major(parts: NDArray[Any], sizes: Sequence[int]) -> NDArray[np.int64]:
+def row_major(parts: NDArray[Any], sizes: Sequence[int]) -> Ints:
     """The index of each row of ``parts``, the last column counting fastest."""
     index = np.zeros(len(parts), np.int64)
     for column, size in enumerate(sizes):

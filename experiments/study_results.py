@@ -1,4 +1,4 @@
-"""What the runs of a study have come to, as tidy tables."""
+"""The results of the runs of a study, as tables with one row for each observation."""
 
 from __future__ import annotations
 
@@ -9,19 +9,17 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from experiments.bandit_results import batch_rows, read_pulls, run_regret
 from experiments.pull_statistics import PullStatistics
 from experiments.study_plan import PlannedRun
 from experiments.study_spec import StudySpec
+from mdp.array_types import Floats
 from pipeline.run_folder import Run
 from verdicts import area_under_curve, steps_to_threshold
 
 LAST_EPISODES = 100
 TRAINING_POINTS = 100
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -89,6 +87,10 @@ CURVE_COLUMNS = (
     "seconds",
     "value",  # return
 )
+
+
+# Columns that have the same name in ``run.json``.
+_FIGURES = ("success_rate", "exact", "optimum", "best_blind", "gap", "score")
 
 
 @dataclass(frozen=True)
@@ -220,12 +222,7 @@ def _summary_row(
         "final": final.get("mean_return"),
         "final_std": final.get("std_return"),
         "final_length": final.get("mean_length"),
-        "success_rate": final.get("success_rate"),
-        "exact": final.get("exact"),
-        "optimum": final.get("optimum"),
-        "best_blind": final.get("best_blind"),
-        "gap": final.get("gap"),
-        "score": final.get("score"),
+        **{name: final.get(name) for name in _FIGURES},
         "best": info["best_mean_return"],
         "best_timesteps": info["best_timesteps"],
         "area": area_under_curve(steps, values) if len(steps) else None,
