@@ -2,9 +2,9 @@
 
 Numba keeps the machine code of a function beside its source, and throws it away when that one file
 changes. A function that others inline can change without that: they go on running as it was. Here
-the machine code lies in a folder named for a digest: of every source that can take part in it, of
-the versions of Python, Numba and NumPy, and of the processor. A changed source has another digest,
-and so never meets old code.
+the machine code lies in a folder named for a digest of every source that can take part in it, and
+of the versions of Python, Numba and NumPy. A changed source has another digest, and so never meets
+old code; nor does another processor, which Numba itself keeps apart.
 
 Not kept on disk is code that depends on sources outside of this project, such as a user's own
 update rule, and whatever is compiled in a process whose sources have changed since it began. Where
@@ -13,6 +13,7 @@ no folder can be written, nothing is kept.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import importlib.metadata
 import logging
@@ -21,13 +22,11 @@ import platform
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
-from llvmlite import binding
 
 # Everything that is compiled, and every constant that is compiled into it, stands in these.
 PACKAGES = ("mdp", "agents")
@@ -55,12 +54,10 @@ def stamps_at_start() -> Stamps:
 
 @cache
 def digest() -> str:
-    """Of the sources, of what compiles them, and of the processor that they are compiled for."""
-    lines = [
-        platform.python_version(),
-        *(f"{name} {importlib.metadata.version(name)}" for name in ("numba", "numpy", "llvmlite")),
-        f"{binding.get_host_cpu_name()} {binding.get_host_cpu_features().flatten()}",
-    ]
+    """Of the sources and of what compiles them; Numba itself tells processors apart."""
+    compilers = ("numba", "numpy", "llvmlite")
+    lines = [f"{name} {importlib.metadata.version(name)}" for name in compilers]
+    lines.append(f"python {platform.python_version()}")
     for path, _, _ in stamps_at_start():
         content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
         lines.append(f"{Path(path).relative_to(ROOT)} {content}")
@@ -107,7 +104,7 @@ def remove_old(parent: Path) -> None:
             shutil.rmtree(path, ignore_errors=True)
 
 
-@contextmanager
+@contextlib.contextmanager
 def numba_cache_dir(path: Path) -> Iterator[None]:
     """Let functions that are decorated meanwhile keep their machine code in ``path``."""
     config: Any = numba.config
@@ -138,10 +135,19 @@ class CheckedCache:
         """The machine code for these argument types, or None where it has to be compiled."""
         found = None
         if is_keyed(signature):
-            found = self._cache.load_overload(signature, target_context)
+            try:
+                found = self._cache.load_overload(signature, target_context)
+            except Exception as error:  # noqa: BLE001  # a damaged file can fail in any way
+                logger.warning("the machine code of %s is damaged: %s", self._name, error)
+                self._forget()
         if found is None:
             logger.info("compiling %s", self._name)
         return found
+
+    def _forget(self) -> None:
+        """Let the function begin with an empty index again."""
+        with contextlib.suppress(OSError):
+            self._cache.flush()
 
     def save_overload(self, signature: Any, data: Any) -> None:
         """Keep the machine code for these argument types, where the digest stands for it."""
