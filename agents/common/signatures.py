@@ -14,6 +14,8 @@ import torch as th
 TieBreaking = Literal["random", "first"]
 ExplorationDecay = Literal["constant", "linear", "exponential"]
 
+_STARRED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+
 
 class CommonArguments(TypedDict, total=False):
     """What every hand-written agent's constructor takes; see `OnlineAlgorithm`."""
@@ -35,11 +37,12 @@ class LearningArguments(CommonArguments, total=False):
 def full_signature(cls: type) -> inspect.Signature:
     """The constructor's own arguments, and in place of ``**kwargs`` those of the base class.
 
-    Where ``**kwargs`` is annotated with the keys that it may have, no others are added.
+    Where ``**kwargs`` is annotated with the keys that it may have, no others are added. A
+    constructor that takes ``*args`` hands those on as well, and adds what is given by name.
     """
     owner = next(base for base in cls.__mro__ if "__init__" in vars(base))
     own = inspect.signature(vars(owner)["__init__"], eval_str=True).parameters.values()
-    merged = {p.name: p for p in own if p.name != "self" and p.kind is not p.VAR_KEYWORD}
+    merged = {p.name: p for p in own if p.name != "self" and p.kind not in _STARRED}
     rest = next((p for p in own if p.kind is p.VAR_KEYWORD), None)
     if rest is not None:
         above = cls.__mro__[cls.__mro__.index(owner) + 1]
@@ -48,4 +51,4 @@ def full_signature(cls: type) -> inspect.Signature:
         for name, parameter in full_signature(above).parameters.items():
             if names is None or name in names:
                 merged.setdefault(name, parameter)
-    return inspect.Signature(list(merged.values()))
+    return inspect.Signature(sorted(merged.values(), key=lambda parameter: parameter.kind))

@@ -36,6 +36,7 @@ class LearningAlgorithm(OnlineAlgorithm):
         learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
         tie_breaking: which of several best actions to take while learning: a random one, or the
             first, as NumPy's argmax does. `predict` takes the first.
+        policy_kwargs: further arguments of the policy.
         kwargs: as in `OnlineAlgorithm`.
 
     Attributes:
@@ -59,11 +60,12 @@ class LearningAlgorithm(OnlineAlgorithm):
         env: GymEnv | str | None = None,
         learning_rate: StepSize = 0.0,
         tie_breaking: TieBreaking = "random",
+        policy_kwargs: dict[str, Any] | None = None,
         **kwargs: Unpack[CommonArguments],
     ) -> None:
         self.tie_breaking = tie_breaking
         self.exploration_schedule: Schedule = FloatSchedule(0.0)
-        super().__init__(policy, env, cast(Any, learning_rate), **kwargs)
+        super().__init__(policy, env, cast(Any, learning_rate), policy_kwargs, **kwargs)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)

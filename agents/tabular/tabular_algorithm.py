@@ -104,6 +104,7 @@ class TabularAlgorithm(LearningAlgorithm):
         initial_q_std: float = 0.0,
         skip_terminal_update: bool = False,
         engine: EngineChoice = "auto",
+        policy_kwargs: dict[str, Any] | None = None,
         **kwargs: Unpack[CommonArguments],
     ) -> None:
         self.gamma = gamma
@@ -122,7 +123,7 @@ class TabularAlgorithm(LearningAlgorithm):
         self.mean_td_error = 0.0
         self._next_actions: Ints = np.empty(0, dtype=np.int64)
         self._workspace: Workspace | None = None
-        super().__init__(policy, env, learning_rate, tie_breaking, **kwargs)
+        super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
         check_space(self, "observations", self.observation_space)
