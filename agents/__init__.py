@@ -4,6 +4,9 @@ Importing this package loads neither torch nor Stable-Baselines3: names can be l
 compared, before anything heavy is paid for.
 """
 
+from agents.old_names import install
 from agents.registry import ALGORITHMS, AlgorithmEntry, fitting_algorithms, load_algorithm
+
+install()
 
 __all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm"]

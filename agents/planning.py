@@ -7,7 +7,7 @@ see what they see of any other agent.
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import numpy as np
 import torch as th
@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.common.online import OnlineAlgorithm
+from agents.common.signatures import CommonArguments
 from envs.known_models import observations_of_states, time_limit, transition_model
 from mdp import TransitionModel, finite_horizon_optimum, value_iteration
 
@@ -78,11 +79,7 @@ class PlanningAgent(OnlineAlgorithm):
         env: environment whose transition model is known, or its id.
         gamma: discount factor of the planning; by default 0.99 for value iteration, and 1 for the
             optimum under the time limit.
-        stats_window_size: episodes over which logged statistics are averaged.
-        tensorboard_log: folder for TensorBoard, or None.
-        verbose: 0 silent, 1 information.
-        seed: seeds the agent's generators, its action space and its environments.
-        device: not used, as there is no network.
+        kwargs: as in `OnlineAlgorithm`.
 
     Raises:
         ValueError: if ``gamma`` lies outside [0, 1]; by `learn`, if the model is not known.
@@ -97,29 +94,11 @@ class PlanningAgent(OnlineAlgorithm):
         policy: str | type[BasePolicy] = "ActionTablePolicy",
         env: GymEnv | str | None = None,
         gamma: float | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "cpu",
-        _init_setup_model: bool = True,
+        **kwargs: Unpack[CommonArguments],
     ) -> None:
-        super().__init__(
-            policy,
-            env,
-            learning_rate=0.0,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device="cpu",
-            support_multi_env=True,
-            seed=seed,
-            supported_action_spaces=(spaces.Discrete,),
-        )
         self.gamma = self.default_gamma if gamma is None else gamma
         self._steps = np.zeros(0, dtype=np.int64)
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(policy, env, supported_action_spaces=(spaces.Discrete,), **kwargs)
 
     def _setup_model(self) -> None:
         if not 0 <= self.gamma <= 1:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import numpy as np
 import torch as th
@@ -11,6 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from agents.common.online import OnlineAlgorithm
+from agents.common.signatures import CommonArguments
 
 POLE_ANGLE = 2
 LEFT, RIGHT = 0, 1
@@ -53,37 +54,16 @@ class ReferenceAgent(OnlineAlgorithm):
     Args:
         policy: name of the policy.
         env: environment, or its id.
-        stats_window_size: episodes over which logged statistics are averaged.
-        tensorboard_log: folder for TensorBoard, or None.
-        verbose: 0 silent, 1 information.
-        seed: seeds the agent's generators, its action space and its environments.
-        device: not used, as there is no network.
+        kwargs: as in `OnlineAlgorithm`.
     """
 
     def __init__(
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "cpu",
-        _init_setup_model: bool = True,
+        **kwargs: Unpack[CommonArguments],
     ) -> None:
-        super().__init__(
-            policy,
-            env,
-            learning_rate=0.0,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            verbose=verbose,
-            device="cpu",
-            support_multi_env=True,
-            seed=seed,
-        )
-        if _init_setup_model:
-            self._setup_model()
+        super().__init__(policy, env, **kwargs)
 
     def _setup_model(self) -> None:
         self._setup_lr_schedule()

@@ -44,6 +44,12 @@ class AlgorithmEntry:
     extra: str | None = None
 
     @property
+    def family(self) -> str:
+        """The folder of `agents` that the class lives in; empty where it is in none."""
+        package, *folders = self.entry_point.partition(":")[0].split(".")
+        return folders[0] if package == "agents" and len(folders) > 1 else ""
+
+    @property
     def is_installed(self) -> bool:
         """Whether the package that the agent needs is there."""
         return self.package is None or importlib.util.find_spec(self.package) is not None
@@ -78,8 +84,8 @@ def is_bandit(env: gym.Env[Any, Any]) -> bool:
     return isinstance(env.unwrapped, Bandit)
 
 
-def _tabular(name: str, summary: str) -> AlgorithmEntry:
-    return AlgorithmEntry(f"agents.tabular.algorithms:{name}", summary, DISCRETE, DISCRETE)
+def _tabular(entry_point: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(f"agents.tabular.{entry_point}", summary, DISCRETE, DISCRETE)
 
 
 def _deep(entry_point: str, summary: str, actions: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
@@ -93,7 +99,7 @@ def _bandit(entry_point: str, summary: str) -> AlgorithmEntry:
 
 def _linear(name: str, summary: str) -> AlgorithmEntry:
     return AlgorithmEntry(
-        f"agents.bandits.linear:{name}", summary, LINEAR_INPUTS, DISCRETE, for_bandits=True
+        f"agents.bandits.linear_bandits:{name}", summary, LINEAR_INPUTS, DISCRETE, for_bandits=True
     )
 
 
@@ -110,10 +116,12 @@ def _mabwiser(name: str, summary: str, observations: tuple[str, ...] = DISCRETE)
 
 
 ALGORITHMS: dict[str, AlgorithmEntry] = {
-    "qlearning": _tabular("QLearning", "Q-learning on a table"),
-    "sarsa": _tabular("SARSA", "SARSA on a table"),
-    "expected_sarsa": _tabular("ExpectedSARSA", "Expected SARSA on a table"),
-    "double_qlearning": _tabular("DoubleQLearning", "double Q-learning on two tables"),
+    "qlearning": _tabular("q_learning:QLearning", "Q-learning on a table"),
+    "sarsa": _tabular("sarsa:SARSA", "SARSA on a table"),
+    "expected_sarsa": _tabular("expected_sarsa:ExpectedSARSA", "Expected SARSA on a table"),
+    "double_qlearning": _tabular(
+        "double_q_learning:DoubleQLearning", "double Q-learning on two tables"
+    ),
     "dqn": _deep("stable_baselines3:DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
     "deep_qlearning": _deep(
@@ -162,12 +170,12 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         DISCRETE,
         observation_shape=(4,),
     ),
-    "epsilon_greedy": _bandit("values:EpsilonGreedy", "bandit: epsilon-greedy"),
-    "boltzmann": _bandit("values:Boltzmann", "bandit: softmax of the estimates"),
-    "ucb": _bandit("bounds:UCB", "bandit: upper confidence bounds"),
-    "kl_ucb": _bandit("bounds:KLUCB", "bandit: upper bounds by the divergence of coins"),
-    "gradient_bandit": _bandit("preferences:GradientBandit", "bandit: gradient on preferences"),
-    "exp3": _bandit("preferences:Exp3", "bandit: exponential weights against an adversary"),
+    "epsilon_greedy": _bandit("value_bandits:EpsilonGreedy", "bandit: epsilon-greedy"),
+    "boltzmann": _bandit("value_bandits:Boltzmann", "bandit: softmax of the estimates"),
+    "ucb": _bandit("ucb:UCB", "bandit: upper confidence bounds"),
+    "kl_ucb": _bandit("kl_ucb:KLUCB", "bandit: upper bounds by the divergence of coins"),
+    "gradient_bandit": _bandit("gradient_bandit:GradientBandit", "bandit: gradient on preferences"),
+    "exp3": _bandit("exp3:Exp3", "bandit: exponential weights against an adversary"),
     "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),
     "linucb": _linear("LinUCB", "contextual bandit: linear upper confidence bounds"),
     "lin_thompson": _linear("LinThompson", "contextual bandit: linear Thompson sampling"),

@@ -9,7 +9,7 @@ from rich.table import Table
 from agents import ALGORITHMS, fitting_algorithms
 from agents.registry import is_bandit
 from pipeline.environments import make_env
-from pipeline.settings.hyperparams import entry_names
+from pipeline.settings.hyperparam_entries import entry_names
 
 
 def print_lists() -> None:

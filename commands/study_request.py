@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError, unknown
 from pipeline.settings.literals import parse_assignments
 
-_LEAST = {
+_MINIMUM = {
     "seeds": 1,
     "n_timesteps": 1,
     "n_episodes": 1,
@@ -41,23 +41,16 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
     _check_output(args)
     import_gym_packages(tuple(args.gym_packages))
     study = _study_of_file(args) if args.study else _study_of_flags(args)
-    changes: dict[str, Any] = {
-        "gym_packages": tuple(args.gym_packages),
-        "tensorboard": args.tensorboard,
-        "render_every": args.render_every,
-        "n_seeds": args.seeds,
-        "metric": args.metric,
-        "margin": args.margin,
-        "episodes_table": args.episodes_table,
-        "name": args.name,
-    }
+    # A flag that has the name of a field goes there as it is, where it is given.
+    named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
+    changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}
     changes = {key: value for key, value in changes.items() if value is not None}
     study = replace(_with_settings(study, args), **changes)
-    return study.quickened() if args.quick else study
+    return study.quickened() if args.is_quick else study
 
 
 def _check_output(args: argparse.Namespace) -> None:
-    for key, least in _LEAST.items():
+    for key, least in _MINIMUM.items():
         value = getattr(args, key)
         if value is not None and value < least:
             raise UserError(f"--{key.replace('_', '-')} must be at least {least}, not {value}")

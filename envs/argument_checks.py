@@ -7,7 +7,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+
+from mdp.array_types import Floats
 
 
 def check_number(name: str, value: object, low: float = -math.inf, high: float = math.inf) -> float:
@@ -74,9 +75,7 @@ def check_numbers(
     return tuple(check_number(f"{name}[{i}]", value, low, high) for i, value in enumerate(values))
 
 
-def check_table(
-    name: str, rows: object, low: float = -math.inf, high: float = math.inf
-) -> NDArray[np.float64]:
+def check_table(name: str, rows: object, low: float = -math.inf, high: float = math.inf) -> Floats:
     """Rows of numbers, all as long as the first, as an array of shape (rows, columns).
 
     Raises:

@@ -7,13 +7,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from envs import sprites
 from envs.scene import Chart
 from envs.sprites import Box, Disc, Label, Shape
-
-Floats = NDArray[np.float64]
+from mdp.array_types import Floats, Ints
 
 # Of more arms the first are shown, of more contexts those around the present one.
 MAX_ARMS_SHOWN = 40
@@ -42,7 +40,7 @@ class Tally:
         last: context, arm and reward of the latest pull, None before the first.
     """
 
-    counts: NDArray[np.int64]
+    counts: Ints
     sums: Floats
     last: tuple[int, int, float] | None = None
 

@@ -17,6 +17,7 @@ from envs.grid_map import GOAL, Description, GridMap
 from envs.rendering import GridRenderer
 from envs.scene import Scene
 from envs.text_rendering import render_text
+from mdp.array_types import AnyInts, Floats, Ints
 
 if TYPE_CHECKING:
     from mdp.transition_model import TransitionModel
@@ -138,7 +139,7 @@ class GridWorld(gym.Env[Any, Any]):
             self._renderer.close()
             self._renderer = None
 
-    def observation_of(self, states: NDArray[np.integer[Any]]) -> NDArray[Any]:
+    def observation_of(self, states: AnyInts) -> NDArray[Any]:
         """What is observed in each of many states: here the states themselves.
 
         Args:
@@ -154,7 +155,7 @@ class GridWorld(gym.Env[Any, Any]):
         return self.dynamics.transition_model(self.initial_state_distrib)
 
     @cached_property
-    def initial_state_distrib(self) -> NDArray[np.float64]:
+    def initial_state_distrib(self) -> Floats:
         """Probabilities of the starting states, shape (S,)."""
         starts, thresholds = self._starts
         distribution = np.zeros(self.dynamics.n_states)
@@ -190,7 +191,7 @@ class GridWorld(gym.Env[Any, Any]):
         return int(self.map.distances[self.map.start])
 
     @cached_property
-    def _starts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _starts(self) -> tuple[Ints, Floats]:
         """The cells where an episode may begin, in order, and their cumulative probabilities."""
         if self.random_start:
             starts = np.flatnonzero(self.map.distances > 0)
@@ -229,7 +230,7 @@ class GridWorld(gym.Env[Any, Any]):
         )
 
 
-def _uniform(n: int) -> NDArray[np.float64]:
+def _uniform(n: int) -> Floats:
     """Equal probabilities whose running sum ends at exactly one.
 
     Otherwise a uniform number above the sum would choose state 0, as `categorical_sample` does.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.grid_map import MAX_STATES, GridMap
+from mdp.array_types import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from mdp.transition_model import TransitionModel
@@ -105,7 +106,7 @@ class GridDynamics:
             collected |= self.collectable_bits[target]
         return Move(target + self.n_cells * collected, reward, tile.terminated, bumped=False)
 
-    def transition_model(self, initial: NDArray[np.float64]) -> TransitionModel:
+    def transition_model(self, initial: Floats) -> TransitionModel:
         """Every move of every state as arrays.
 
         Args:
@@ -127,7 +128,7 @@ class GridDynamics:
             initial=initial,
         )
 
-    def _all_moves(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_]]:
+    def _all_moves(self) -> tuple[Ints, Floats, Bools]:
         """`move` for all states and directions: next states, rewards, ends; each (S, 4)."""
         codes = np.frombuffer(self.codes, np.uint8)
         target, inside = self._targets()
@@ -157,7 +158,7 @@ class GridDynamics:
         shape = (self.n_states, len(MOVES))
         return next_state.reshape(shape), reward.reshape(shape), terminated.reshape(shape)
 
-    def _targets(self) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    def _targets(self) -> tuple[Ints, Bools]:
         """The cell each move aims at, and whether it lies on the map; each (cells, 4)."""
         rows, columns = np.divmod(np.arange(self.n_cells)[:, None], self.n_columns)
         steps = np.array(MOVES)

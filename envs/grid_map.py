@@ -11,6 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import Bools
+
 START = "S"
 GOAL = "G"
 # 4096 x 4096 cells: a Q-table of four actions then fills half a gigabyte.
@@ -86,7 +88,7 @@ class GridMap:
         return len(self.codes)
 
 
-def distances_to(targets: Iterable[int], free: NDArray[np.bool_]) -> NDArray[np.int32]:
+def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
     """Moves from each cell to the nearest target over free cells, by breadth-first search.
 
     Args:

@@ -27,6 +27,7 @@ from envs.wrappers import (
     ScaleReward,
     TerminationReward,
 )
+from mdp.array_types import Bools
 from mdp.transition_model import TransitionModel
 
 Env = gym.Env[Any, Any]
@@ -83,7 +84,7 @@ def time_limit(env: Env) -> int | None:
     return min(limits, default=None)
 
 
-def success_outcomes(env: Env) -> NDArray[np.bool_] | None:
+def success_outcomes(env: Env) -> Bools | None:
     """The transitions that end an episode well, bool of shape (S, A, K) as in `transition_model`.
 
     In a grid world those are the ones that reach a goal. Elsewhere they are the ones that
@@ -105,7 +106,7 @@ def success_outcomes(env: Env) -> NDArray[np.bool_] | None:
         good = codes[model.next_state % base.map.n_cells] == ord(GOAL)
     else:
         good = model.reward == model.reward[ends].max()
-    success: NDArray[np.bool_] = ends & good
+    success: Bools = ends & good
     return success
 
 

@@ -14,17 +14,15 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-from numpy.typing import NDArray
 
 from envs.grid import GridWorld
 from envs.grid_dynamics import MOVES, Tile
+from mdp.array_types import Ints
 
 FREE, START, WALL, GOAL, TRAP, PRIZE = ".S#GXP"
 
 UP, DOWN, LEFT, RIGHT = MOVES
 WORDS = {"#": "shelf", "M": "mine", "P": "power"}
-
-Indices = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -73,12 +71,12 @@ class GridLayout:
         return self.n_cells * self.n_layers
 
     @property
-    def cells(self) -> Indices:
+    def cells(self) -> Ints:
         """The cell of each state, shape (S,)."""
         return np.arange(self.n_states) % self.n_cells
 
     @property
-    def layers(self) -> Indices:
+    def layers(self) -> Ints:
         """The layer of each state, shape (S,)."""
         return np.arange(self.n_states) // self.n_cells
 

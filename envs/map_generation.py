@@ -8,6 +8,7 @@ import numpy as np
 
 from envs.argument_checks import check_number, check_whole_number
 from envs.grid_map import MAX_STATES
+from mdp.array_types import Bools
 
 MAX_SIZE = int(MAX_STATES**0.5)
 
@@ -45,7 +46,7 @@ def random_warehouse(size: int, shelf_density: float = 0.3, seed: int = 0) -> li
     return [row.tobytes().decode("ascii") for row in letters]
 
 
-def _easiest_way(free: np.typing.NDArray[np.bool_], start: int, goal: int) -> list[int]:
+def _easiest_way(free: Bools, start: int, goal: int) -> list[int]:
     """The cells of a way that passes the fewest cells that are not free.
 
     A breadth-first search that first goes wherever it can without entering a shelf, then enters

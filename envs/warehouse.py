@@ -13,6 +13,7 @@ from envs.argument_checks import check_choice, check_number
 from envs.grid import GridWorld, Observation
 from envs.grid_dynamics import Tile
 from envs.grid_map import Description
+from mdp.array_types import AnyInts
 
 DEFAULT_MAP = (
     "...#.....G",
@@ -125,7 +126,7 @@ class WarehouseEnv(GridWorld):
         elif observation == "one_hot":
             self.observation_space = spaces.Box(0, 1, (self.map.n_cells,), np.float32)
 
-    def observation_of(self, states: NDArray[np.integer[Any]]) -> NDArray[Any]:
+    def observation_of(self, states: AnyInts) -> NDArray[Any]:
         """What is observed in each of many states.
 
         Args:

@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
-from experiments.results import StudyResults
+from experiments.seed_values import RESAMPLING_SEED, values_over_seeds
+from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
+from mdp.array_types import Floats
 from verdicts import (
     Band,
     Estimate,
@@ -18,21 +19,14 @@ from verdicts import (
     Summary,
     ThresholdSummary,
     compare_pairs,
-    curve_band,
     estimate,
-    on_grid,
     performance_profile,
     probability_of_improvement,
-    shared_grid,
     summarise,
     summarise_steps,
 )
 
-SEED = 0  # of all resampling: the same runs give the same figures
-CURVE_POINTS = 200
 MARGIN = 0.02  # of the way from the best blind policy to the optimum
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -149,17 +143,6 @@ def analyse(results: StudyResults) -> StudyAnalysis:
     return StudyAnalysis(results, tuple(environments), _analyse_overall(results))
 
 
-def values_over_seeds(results: StudyResults, environment: str, column: str) -> dict[str, Floats]:
-    """A column of the summary by agent, shape (n_seeds,); NaN where a run is missing."""
-    table = results.summary
-    table = table[table["environment"] == environment]
-    pivot = table.pivot(index="seed", columns="agent", values=column)
-    pivot = pivot.reindex(
-        index=range(results.study.n_seeds), columns=[a.label for a in results.study.agents]
-    )
-    return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
-
-
 def _first(table: pd.DataFrame, column: str) -> float | None:
     known = table[column].dropna()
     return None if known.empty else float(known.iloc[0])
@@ -189,7 +172,9 @@ def _analyse_environment(results: StudyResults, environment: str) -> Environment
         exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is no False here
         agents=tuple(agents),
         pairs=tuple(
-            compare_pairs({a.agent: sign * metric[a.agent] for a in agents}, margin, seed=SEED)
+            compare_pairs(
+                {a.agent: sign * metric[a.agent] for a in agents}, margin, seed=RESAMPLING_SEED
+            )
         ),
         missing=missing,
     )
@@ -208,17 +193,19 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         return column_of.to_numpy(dtype=np.float64, na_value=np.nan)
 
     def mean(column: str) -> Estimate:
-        return estimate(values(column), "mean", seed=SEED)
+        return estimate(values(column), "mean", seed=RESAMPLING_SEED)
 
     has_threshold = bool(table["threshold"].notna().any())
-    metric = summarise(values(study.metric), seed=SEED)
+    metric = summarise(values(study.metric), seed=RESAMPLING_SEED)
     return AgentAnalysis(
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
         n_runs=len(table),
         n_missing=study.n_seeds - len(table),
         metric=metric,
-        score=summarise(values("score"), seed=SEED) if table["score"].notna().any() else None,
+        score=summarise(values("score"), seed=RESAMPLING_SEED)
+        if table["score"].notna().any()
+        else None,
         final=mean("final"),
         area=mean("area"),
         last_episodes=mean("last_episodes"),
@@ -244,48 +231,20 @@ def _analyse_overall(results: StudyResults) -> OverallAnalysis | None:
     }
     if any(np.isnan(matrix).all(axis=0).any() for matrix in scores.values()):
         return None
-    summaries = {agent: summarise(matrix, seed=SEED) for agent, matrix in scores.items()}
+    summaries = {agent: summarise(matrix, seed=RESAMPLING_SEED) for agent, matrix in scores.items()}
     order = sorted(summaries, key=lambda agent: summaries[agent].iqm.point, reverse=True)
     thresholds = np.linspace(0, 1, 101)
     return OverallAnalysis(
         scores={agent: summaries[agent] for agent in order},
         improvement={
-            (one, two): probability_of_improvement(scores[one], scores[two], seed=SEED)
+            (one, two): probability_of_improvement(scores[one], scores[two], seed=RESAMPLING_SEED)
             for one in order
             for two in order
             if one != two
         },
         thresholds=thresholds,
         profiles={
-            agent: performance_profile(scores[agent], thresholds, seed=SEED) for agent in order
+            agent: performance_profile(scores[agent], thresholds, seed=RESAMPLING_SEED)
+            for agent in order
         },
     )
-
-
-def mean_curve(
-    results: StudyResults, environment: str, agent: str, kind: str, by: str
-) -> tuple[Floats, Band] | None:
-    """The mean learning curve of an agent over its seeds.
-
-    Args:
-        results: the runs.
-        environment: label of the environment.
-        agent: label of the agent.
-        kind: ``"evaluation"`` or ``"training"``.
-        by: ``"step"``, ``"episode"`` or ``"seconds"``.
-
-    Returns:
-        The points, shape (n,), and the mean there with its interval; None without any run, or where
-        one has ended before another has come to its first point.
-    """
-    table = results.curves
-    chosen = (table["environment"] == environment) & (table["agent"] == agent)
-    runs = [
-        (rows[by].to_numpy(dtype=np.float64), rows["value"].to_numpy(dtype=np.float64))
-        for _, rows in table[chosen & (table["kind"] == kind)].groupby("seed")
-    ]
-    if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
-        return None
-    grid = shared_grid([points for points, _ in runs], CURVE_POINTS)
-    values = np.array([on_grid(points, returns, grid) for points, returns in runs])
-    return grid, curve_band(values, seed=SEED)

@@ -9,21 +9,20 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from agents.bandits.batch import run_batch
+from agents.bandits.batch_result import BatchResult
 from agents.bandits.one_by_one import run_one_by_one
-from agents.bandits.results import BatchResult
-from agents.bandits.worlds import NotBatchable
+from agents.compiled.compile_envs import NotCompilable
 from experiments.pull_statistics import PullStatistics, pull_statistics
+from mdp.array_types import Floats
 from pipeline.environments import make_single_env
-from pipeline.files import write_text
 from pipeline.preparation import algorithm_kwargs
 from pipeline.pull_recording import PULLS_FILE
 from pipeline.run_folder import FINISHED, Run
+from pipeline.run_record import recorded_versions, write_settings
 from pipeline.train_spec import TrainSpec
-from pipeline.training import recorded_versions
 
 STATISTICS_FILE = "pull_statistics.npz"
 
@@ -38,8 +37,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     finally:
         env.close()
     statistics.save(run.path / STATISTICS_FILE)
-    write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
-    write_text(run.params_path / "command.txt", command + "\n")
+    write_settings(run, spec, command)
     run.update_info(
         state=FINISHED,
         env_name=run.env_name,
@@ -63,7 +61,7 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
     )
     try:
         return run_batch(*arguments), "compiled batch"
-    except NotBatchable as reason:
+    except NotCompilable as reason:
         return run_one_by_one(*arguments), f"one by one: {reason}"
 
 
@@ -93,7 +91,7 @@ def _without_simple_regret(statistics: PullStatistics) -> PullStatistics:
     return replace(statistics, simple_regret=np.full_like(statistics.simple_regret, np.nan))
 
 
-def true_means(env: gym.Env[Any, Any]) -> NDArray[np.float64] | None:
+def true_means(env: gym.Env[Any, Any]) -> Floats | None:
     """Means of the arms by context, shape (n_contexts, n_arms), where each run has the same."""
     bandit: Any = env.unwrapped
     moves = getattr(bandit, "redraws", False) or getattr(bandit, "drift_std", 0.0) > 0

@@ -1,4 +1,4 @@
-"""What the runs on bandits have come to, from batches and from runs of their own."""
+"""Results of the runs on bandits, from batches and from runs of their own."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Work in processes of its own, so that one that dies takes nothing else with it.
+"""Tasks in processes of their own, so that one that dies takes nothing else with it.
 
 `supervise` runs a function in a fresh child process and waits for it; any executor whose workers
 can call it launches a study. Here that is a pool of threads, each with one child at a time. The
@@ -31,7 +31,7 @@ _lock = threading.Lock()
 _stopping = threading.Event()
 
 
-class WorkFailedError(Exception):
+class TaskFailedError(Exception):
     """The function raised an exception, or its process died each time.
 
     Attributes:
@@ -44,7 +44,7 @@ class WorkFailedError(Exception):
 
 
 class StoppedError(Exception):
-    """The work was called off."""
+    """The task was stopped."""
 
 
 def supervise(
@@ -65,12 +65,14 @@ def supervise(
         What the function returns.
 
     Raises:
-        WorkFailedError: if it raised an exception, which is not tried again, or died each time.
+        TaskFailedError: if it raised an exception, which is not tried again, or died each time.
         StoppedError: if `stop_all` ended it.
     """
     for _ in range(tries):
         receiver, sender = _context.Pipe(duplex=False)
-        child = _context.Process(target=_work, args=(sender, clean_up, function, args), daemon=True)
+        child = _context.Process(
+            target=_answer_from_child, args=(sender, clean_up, function, args), daemon=True
+        )
         with _started(child):
             sender.close()
             try:
@@ -86,10 +88,10 @@ def supervise(
         if kind == "returned":
             return answer
         if kind == "raised":
-            raise WorkFailedError(*answer)
+            raise TaskFailedError(*answer)
     code = child.exitcode or 0
     how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    raise WorkFailedError(f"its process died {tries} times ({how})", f"{how}, {tries} times")
+    raise TaskFailedError(f"its process died {tries} times ({how})", f"{how}, {tries} times")
 
 
 @contextlib.contextmanager
@@ -126,9 +128,9 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def start_server() -> None:
-    """Start the process that children are forked from, deaf to Ctrl-C while it imports.
+    """Start the process that children are forked from, which ignores Ctrl-C while it imports.
 
-    It goes on by itself: who starts it early has it sooner.
+    It works in the background: start it early to have it sooner.
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -150,7 +152,7 @@ def stop_all() -> None:
             child.kill()
 
 
-def _work(
+def _answer_from_child(
     sender: Connection,
     clean_up: Callable[[], object],
     function: Callable[..., Any],

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from experiments.child_processes import StoppedError, WorkFailedError, local_executor, supervise
+from experiments.child_processes import StoppedError, TaskFailedError, local_executor, supervise
 from experiments.run_in_child import (
     do_run,
     draft_path,
@@ -24,7 +24,7 @@ from pipeline.files import write_text
 
 @dataclass(frozen=True)
 class RunFailure:
-    """A run that came to nothing.
+    """A run that failed.
 
     Attributes:
         planned: the run.
@@ -60,7 +60,7 @@ def execute(
         root: the study's folder.
         command: the command that asked for it, noted in every run folder.
         n_workers: how many at once.
-        listener: told of every run that has ended, and how it failed if it did.
+        listener: called for every run that has ended, with how it failed if it did.
 
     Returns:
         Those that failed.
@@ -93,7 +93,7 @@ def _supervised_run(planned: PlannedRun, root: Path, command: str) -> RunFailure
         supervise(do_run, planned, draft, command, clean_up=partial(remove_draft, draft))
     except StoppedError:
         return None
-    except WorkFailedError as error:
+    except TaskFailedError as error:
         make_folder(log.parent)
         write_text(log, error.details)
         return RunFailure(planned, str(error), log)

@@ -1,4 +1,4 @@
-"""What many runs on a bandit have come to, pull by pull."""
+"""Figures on many runs on a bandit, pull by pull."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import AnyInts, Floats, Ints
 from pipeline.files import replacing
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
-FIRST_PULLS = 100  # told one by one; later ones thin out towards `MAX_POINTS`
+FIRST_PULLS = 100  # kept one by one; of later ones fewer and fewer, `MAX_POINTS` in all
 MAX_POINTS = 300
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class PullStatistics:
             deviation, shape (n_moments, n_contexts, n_arms, 2); else empty.
     """
 
-    pulls: NDArray[np.int64]
+    pulls: Ints
     reward: Floats
     optimal: Floats
     regret: Floats
@@ -63,7 +62,7 @@ class PullStatistics:
     estimates: Floats
     estimates_std: Floats
     true_means: Floats
-    moments: NDArray[np.int64]
+    moments: Ints
     posteriors: Floats
 
     def save(self, path: Path) -> None:
@@ -79,7 +78,7 @@ class PullStatistics:
             return cls(**{field.name: arrays[field.name] for field in fields(cls)})
 
 
-def points_of(n_pulls: int) -> NDArray[np.int64]:
+def points_of(n_pulls: int) -> Ints:
     """The pulls to give figures at: the first one by one, later ones ever further apart."""
     if n_pulls <= MAX_POINTS:
         return np.arange(1, n_pulls + 1)
@@ -89,10 +88,10 @@ def points_of(n_pulls: int) -> NDArray[np.int64]:
 
 
 def pull_statistics(
-    arms: NDArray[np.integer[Any]],
+    arms: AnyInts,
     rewards: NDArray[np.floating[Any]],
     regrets: Floats,
-    contexts: NDArray[np.integer[Any]] | None,
+    contexts: AnyInts | None,
     n_arms: int,
     n_contexts: int = 1,
     estimates: Floats | None = None,
@@ -158,15 +157,13 @@ def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
         return mean, np.sqrt(squares.sum(axis=0) / n_known)
 
 
-def _mean_since_last(by_pull: Floats, points: NDArray[np.int64]) -> Floats:
+def _mean_since_last(by_pull: Floats, points: Ints) -> Floats:
     """Means over the pulls from one point, not included, to the next."""
     sums = np.cumsum(by_pull)[points - 1]
     return np.asarray(np.diff(sums, prepend=0.0) / np.diff(points, prepend=0))
 
 
-def _simple_regret(
-    cells: NDArray[np.int64], regrets: Floats, at: NDArray[np.int64], shape: tuple[int, int]
-) -> Floats:
+def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int]) -> Floats:
     """Mean over runs of what recommending the arm pulled most so far falls short by.
 
     Args:

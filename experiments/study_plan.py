@@ -5,22 +5,23 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
-from commands.train_request import check_algorithm, check_fit
 from envs.known_models import time_limit
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
+from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
 from pipeline.run_folder import FINISHED, Run, environment_name
-from pipeline.settings import hyperparams
-from pipeline.train_spec import TrainSpec
+from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
+from pipeline.settings.hyperparams import Hyperparams, split
+from pipeline.train_spec import TrainSpec, completed
 
 # What a run of the same settings may differ in: where it is written, and what is shown meanwhile.
-_NO_PART_OF_IDENTITY = (
+_MAY_DIFFER = (
     "log_folder",
     "tensorboard_log",
     "save_every_n_episodes",
@@ -30,8 +31,8 @@ _NO_PART_OF_IDENTITY = (
     "pictures",
 )
 
-# What a batch takes heed of, beside the agent's own arguments.
-_UNDERSTOOD = ("n_timesteps", "env_kwargs", "algorithm")
+# What a batch can follow, besides the agent's own arguments.
+_BATCH_SETTINGS = ("n_timesteps", "env_kwargs", "algorithm")
 
 
 @dataclass(frozen=True)
@@ -65,18 +66,17 @@ class PlannedRun:
     def is_finished(self) -> bool:
         """Whether the folder holds this very run, to its end."""
         info = self.run.read_info()
-        recorded = info.get("spec", {})
+        if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
+            return False
+        recorded = completed(self.run.recorded_spec())
         wanted = self.spec.save_every_n_episodes
-        return (
-            info.get("state") == FINISHED
-            and info.get("n_runs", 1) == self.n_runs
-            and _identity(recorded) == _identity(self.spec.as_data())
-            and (wanted < 1 or self.is_batch or recorded.get("save_every_n_episodes") == wanted)
+        return _identity(recorded) == _identity(self.spec.as_data()) and (
+            wanted < 1 or self.is_batch or recorded["save_every_n_episodes"] == wanted
         )
 
 
 def _identity(spec: Mapping[str, Any]) -> Any:
-    kept = {key: value for key, value in spec.items() if key not in _NO_PART_OF_IDENTITY}
+    kept = {key: value for key, value in spec.items() if key not in _MAY_DIFFER}
     return json.loads(json.dumps(kept))
 
 
@@ -99,7 +99,7 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
     for environment in study.environments:
         check_env_id(environment.env_id)
         for agent in study.agents:
-            with _told_where(agent):
+            with _naming_the_place(agent):
                 spec = _train_spec(study, agent, environment)
                 check_fit(spec)
             specs[agent.label, environment.label] = spec
@@ -145,14 +145,14 @@ def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
     agents = {agent.label: agent for agent in study.agents}
     for run in planned:
         if run.seed == 0:
-            with _told_where(agents[run.agent]):
+            with _naming_the_place(agents[run.agent]):
                 algorithm_kwargs(run.spec)
                 callbacks = run.spec.hyperparams.callback
                 components.callbacks(callbacks, run.spec.gym_packages, run.path)
 
 
 @contextmanager
-def _told_where(agent: AgentSpec) -> Iterator[None]:
+def _naming_the_place(agent: AgentSpec) -> Iterator[None]:
     """Say in mistakes where the study asks for the agent."""
     try:
         yield
@@ -176,7 +176,7 @@ def _check_folders(what: str, labels: Sequence[str]) -> None:
 def _is_batch(spec: TrainSpec) -> bool:
     """Whether the runs of a spec go as one batch: bandit agents as they are, for one episode."""
     entry, special = ALGORITHMS[spec.algo], spec.hyperparams
-    untouched = hyperparams.Hyperparams()
+    untouched = Hyperparams()
     if not (entry.for_bandits and entry.package is None) or special.n_timesteps is None:
         return False
     env = make_single_env(spec)
@@ -187,7 +187,7 @@ def _is_batch(spec: TrainSpec) -> bool:
     return all(
         getattr(special, name) == getattr(untouched, name)
         for name in vars(untouched)
-        if name not in _UNDERSTOOD
+        if name not in _BATCH_SETTINGS
     )
 
 
@@ -197,17 +197,17 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
     place = f"{agent.label} on {environment.label}"
     if study.is_quick:
         raw = _shortened(raw, study.quick.budget)
+    # A field of the study that has the name of one of the run goes there as it is.
+    named = {key.name for key in fields(TrainSpec)} & {key.name for key in fields(StudySpec)}
     spec = TrainSpec(
         algo=agent.algo,
         env_id=environment.env_id,
-        hyperparams=hyperparams.split(raw, place),
+        hyperparams=split(raw, place),
         saved_hyperparams=raw,
         seed=0,
-        eval_freq=study.eval_freq,
-        eval_episodes=study.eval_episodes,
-        gym_packages=study.gym_packages,
         verbose=0,
         pictures=False,
+        **{name: getattr(study, name) for name in named},
     )
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
         raise UserError(f"{place}: how long to train? give n_timesteps or n_episodes")
@@ -215,12 +215,12 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
 
 
 def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str, Any]:
-    """The agent's file, the environment's settings over it, and the agent's own over those."""
+    """The agent's file, changed by the environment's settings, and these by the agent's own."""
     raw: dict[str, Any] = {}
     if agent.tuned:
         try:
-            raw = hyperparams.read_hyperparams(agent.algo, environment.env_id)
-        except hyperparams.NoEntryError:
+            raw = read_hyperparams(agent.algo, environment.env_id)
+        except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
     for settings in (environment.settings, agent.settings):

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from pipeline.settings.hyperparams import override
+from pipeline.settings.hyperparam_entries import override
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
@@ -26,12 +26,12 @@ METRIC_WORDS: dict[str, str] = {
 COSTS = ("regret",)
 
 
-# Settings that map names to values: such a mapping is put over another name by name.
+# Settings that map names to values: such mappings are merged name by name.
 MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 
 
 def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings with ``changes`` put over them."""
+    """The settings with ``changes`` made to them."""
     merged = {
         key: {**settings[key], **changes[key]}
         for key in MERGED
@@ -52,7 +52,7 @@ class AgentSpec:
     Attributes:
         label: what it is called in tables and figures.
         algo: its name in the table of agents.
-        settings: hyperparameters, put over those of its file.
+        settings: hyperparameters, which change those of its file.
         tuned: whether to begin with the entry of ``hyperparams/<algo>.yml``; otherwise with the
             defaults of its constructor.
         summary: a few words on it, for the report.
@@ -79,7 +79,7 @@ class EnvironmentSpec:
         label: what it is called in tables and figures.
         env_id: its Gymnasium id.
         settings: hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``,
-            put over those of the agents' files.
+            which change those of the agents' files.
     """
 
     label: str

@@ -8,11 +8,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import Bools, Floats, Ints
 from mdp.graph import reachable_states, steps_to_end
 from mdp.transition_model import TransitionModel
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
 
 LARGEST_DENSE = 300
 
@@ -33,16 +31,16 @@ class PolicyChain:
     """
 
     model: TransitionModel
-    used: NDArray[np.bool_]
-    states: Indices
-    row: Indices
+    used: Bools
+    states: Ints
+    row: Ints
     weight: Floats
-    following: Indices
-    outcome: Indices
+    following: Ints
+    outcome: Ints
 
     @classmethod
     def build(
-        cls, model: TransitionModel, policy: Floats, states: NDArray[np.bool_] | None = None
+        cls, model: TransitionModel, policy: Floats, states: Bools | None = None
     ) -> PolicyChain:
         """The chain of a policy matrix (S, A), on the states it visits or on those given.
 
@@ -66,12 +64,12 @@ class PolicyChain:
         return self.model.reward.ravel()[self.outcome]
 
     @cached_property
-    def terminated(self) -> NDArray[np.bool_]:
+    def terminated(self) -> Bools:
         """Whether each outcome ends the episode, bool of shape (m,)."""
         return self.model.terminated.ravel()[self.outcome]
 
     @cached_property
-    def endless(self) -> NDArray[np.bool_]:
+    def endless(self) -> Bools:
         """The states from which the episode never ends, bool of shape (n,)."""
         nowhere = np.zeros(self.model.n_states, np.bool_)
         steps, _ = steps_to_end(self.model, self.used, nowhere)
@@ -82,7 +80,7 @@ class PolicyChain:
         """The number of states, n."""
         return len(self.states)
 
-    def mean(self, per_outcome: NDArray[np.floating] | NDArray[np.bool_]) -> Floats:
+    def mean(self, per_outcome: NDArray[np.floating] | Bools) -> Floats:
         """The expectation of a quantity (m,) of one step's outcome, for each state (n,)."""
         total = np.bincount(self.row, weights=self.weight * per_outcome, minlength=self.size)
         return total.astype(np.float64)
@@ -100,7 +98,7 @@ class PolicyChain:
         right: Floats,
         discount: float,
         *,
-        zero: NDArray[np.bool_] | None = None,
+        zero: Bools | None = None,
         transposed: bool = False,
     ) -> Floats:
         """Solve (I - discount P) x = right, where P are the probabilities of going on.
@@ -126,7 +124,7 @@ class PolicyChain:
         return result
 
 
-def _solve(row: Indices, column: Indices, weight: Floats, right: Floats) -> Floats:
+def _solve(row: Ints, column: Ints, weight: Floats, right: Floats) -> Floats:
     """Solve (I + W) x = right, with the entries of W given one by one."""
     n = len(right)
     if n <= LARGEST_DENSE:

@@ -7,9 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.machine_code import compiled
-from mdp.sweeps import TIE_TOLERANCE, Floats, Indices, Mask, States
+from mdp.sweeps import TIE_TOLERANCE
 from mdp.transition_model import TransitionModel
+
+# Of as few bytes each as the number of actions allows.
+Actions = NDArray[np.unsignedinteger]
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,24 +31,22 @@ class FiniteHorizonPlan:
     """
 
     values: Floats
-    actions_left: NDArray[np.unsignedinteger]
+    actions_left: Actions
     horizon: int
     start_value: float
 
-    def actions(self, step: int) -> NDArray[np.unsignedinteger]:
+    def actions(self, step: int) -> Actions:
         """The actions (S,) to take after ``step`` steps of the episode, 0 to horizon - 1."""
         if not 0 <= step < self.horizon:
             raise ValueError(f"step is {step}, it must lie between 0 and {self.horizon - 1}")
-        row: NDArray[np.unsignedinteger] = self.actions_left[
-            min(self.horizon - step, len(self.actions_left)) - 1
-        ]
+        row: Actions = self.actions_left[min(self.horizon - step, len(self.actions_left)) - 1]
         return row
 
     @property
-    def policy(self) -> NDArray[np.unsignedinteger]:
+    def policy(self) -> Actions:
         """The actions at each step, shape (horizon, S), in order of time."""
         left = np.minimum(np.arange(self.horizon, 0, -1), len(self.actions_left))
-        rows: NDArray[np.unsignedinteger] = self.actions_left[left - 1]
+        rows: Actions = self.actions_left[left - 1]
         return rows
 
 
@@ -72,7 +74,7 @@ def finite_horizon_optimum(
     states = np.flatnonzero(model.reachable)
     arrays = (model.prob, model.next_state, model.terminated, model.expected_reward)
     values = np.zeros(model.n_states)
-    rows: list[NDArray[np.unsignedinteger]] = []
+    rows: list[Actions] = []
     for _ in range(horizon):
         earlier = np.zeros(model.n_states)
         actions = np.zeros(model.n_states, np.min_scalar_type(model.n_actions - 1))
@@ -87,14 +89,14 @@ def finite_horizon_optimum(
 @compiled
 def back_up(
     prob: Floats,
-    next_state: States,
-    terminated: Mask,
+    next_state: AnyInts,
+    terminated: Bools,
     mean_reward: Floats,
     discount: float,
-    states: Indices,
+    states: Ints,
     values: Floats,
     earlier: Floats,
-    actions: NDArray[np.unsignedinteger],
+    actions: Actions,
 ) -> None:
     """Values one step earlier, and the actions to take there, into ``earlier`` and ``actions``."""
     action_values = np.empty(prob.shape[1])

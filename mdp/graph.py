@@ -9,29 +9,24 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.machine_code import compiled
+from mdp.reachability import reached_from
 from mdp.transition_model import TransitionModel
 
-Mask = NDArray[np.bool_]
-Indices = NDArray[np.int64]
 
-
-def reachable_states(model: TransitionModel, allowed: Mask | None = None) -> Mask:
+def reachable_states(model: TransitionModel, allowed: Bools) -> Bools:
     """The states that are visited, with positive probability, by allowed actions.
 
     Returns:
         bool of shape (S,): starting states, and whatever non-terminating transitions reach.
     """
-    if allowed is None:
-        allowed = np.ones((model.n_states, model.n_actions), np.bool_)
-    found = model.initial > 0
-    _flood(model.prob, model.next_state, model.terminated, allowed, found)
-    return found
+    start = model.initial > 0
+    return reached_from(start, model.prob, model.next_state, model.terminated, allowed)
 
 
-def steps_to_end(model: TransitionModel, allowed: Mask, target: Mask) -> tuple[Indices, Indices]:
+def steps_to_end(model: TransitionModel, allowed: Bools, target: Bools) -> tuple[Ints, Ints]:
     """The fewest transitions of positive probability to a termination or to a target state.
 
     Returns:
@@ -51,7 +46,7 @@ def steps_to_end(model: TransitionModel, allowed: Mask, target: Mask) -> tuple[I
     return steps, order[:found]
 
 
-def end_components(model: TransitionModel, allowed: Mask) -> tuple[Indices, Mask]:
+def end_components(model: TransitionModel, allowed: Bools) -> tuple[Ints, Bools]:
     """The maximal sets of states in which an agent can stay for ever, surely.
 
     An end component is a set of states and actions such that no outcome ends the episode or
@@ -75,7 +70,7 @@ def end_components(model: TransitionModel, allowed: Mask) -> tuple[Indices, Mask
         inside = kept
 
 
-def _graph(model: TransitionModel, allowed: Mask) -> Any:
+def _graph(model: TransitionModel, allowed: Bools) -> Any:
     from scipy.sparse import csr_array
 
     edges = (model.prob > 0) & allowed[:, :, None]
@@ -86,43 +81,12 @@ def _graph(model: TransitionModel, allowed: Mask) -> Any:
 
 
 @compiled
-def _flood(
-    prob: NDArray[np.float64],
-    next_state: NDArray[np.integer],
-    terminated: Mask,
-    allowed: Mask,
-    found: Mask,
-) -> None:
-    """Extend ``found`` by all that it leads to, in place."""
-    n_states, n_actions, n_outcomes = prob.shape
-    stack = np.empty(n_states, np.int64)
-    height = 0
-    for state in range(n_states):
-        if found[state]:
-            stack[height] = state
-            height += 1
-    while height > 0:
-        height -= 1
-        state = stack[height]
-        for action in range(n_actions):
-            if not allowed[state, action]:
-                continue
-            for k in range(n_outcomes):
-                reached = next_state[state, action, k]
-                leads = prob[state, action, k] > 0 and not terminated[state, action, k]
-                if leads and not found[reached]:
-                    found[reached] = True
-                    stack[height] = reached
-                    height += 1
-
-
-@compiled
 def _count_predecessors(
-    prob: NDArray[np.float64],
-    next_state: NDArray[np.integer],
-    terminated: Mask,
-    allowed: Mask,
-) -> Indices:
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    allowed: Bools,
+) -> Ints:
     """Where each state's list of predecessors begins; the last entry is the length of all."""
     n_states, n_actions, n_outcomes = prob.shape
     first = np.zeros(n_states + 1, np.int64)
@@ -139,12 +103,12 @@ def _count_predecessors(
 
 @compiled
 def _list_predecessors(
-    prob: NDArray[np.float64],
-    next_state: NDArray[np.integer],
-    terminated: Mask,
-    allowed: Mask,
-    place: Indices,
-    predecessors: NDArray[np.integer],
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    allowed: Bools,
+    place: Ints,
+    predecessors: AnyInts,
 ) -> None:
     n_states, n_actions, n_outcomes = prob.shape
     for state in range(n_states):
@@ -159,7 +123,7 @@ def _list_predecessors(
 
 @compiled
 def _search_backwards(
-    first: Indices, predecessors: NDArray[np.integer], steps: Indices, order: Indices, found: int
+    first: Ints, predecessors: AnyInts, steps: Ints, order: Ints, found: int
 ) -> int:
     """Breadth-first search from the first ``found`` states in order; returns how many there are."""
     done = 0

@@ -1,40 +1,68 @@
-"""The decorator of every compiled function.
+"""The decorators of compiled functions.
 
 Numba ships no type annotations, so that its own decorator would hide the signatures of the
-functions under it. ``compiled`` keeps them, and holds the options in one place: the machine code is
-cached beside the source, nothing compiles before the first call, and floating-point arithmetic
-stays as IEEE 754 has it.
+functions under it. These keep them, and hold the options in one place: the machine code is kept as
+`mdp.code_cache` says, nothing compiles before the first call, and floating-point arithmetic stays
+as IEEE 754 has it.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+
+from mdp.code_cache import PACKAGES, ROOT, CheckedCache, folder, numba_cache_dir
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
 
 # Division by zero gives what IEEE 754 says and raises nothing: checks for it would keep the
 # compiler from seeing through a function that is called by another.
-_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy"}
+OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 
 # Without reference counts, which cost a loop of small steps more than the steps themselves. Right
 # for functions that allocate nothing: their caller in Python keeps all arrays alive.
-_BARE_OPTIONS: dict[str, Any] = {**_OPTIONS, "_nrt": False}
+BARE_OPTIONS: dict[str, Any] = {**OPTIONS, "_nrt": False}
 
 
 def compiled(function: Function) -> Function:
     """Compile a function of numbers and arrays on its first call."""
-    return cast(Function, numba.njit(**_OPTIONS)(function))
+    return _decorated(function, OPTIONS)
 
 
 def kernel(function: Function) -> Function:
     """Compile a long loop that allocates nothing."""
-    return cast(Function, numba.njit(**_BARE_OPTIONS)(function))
+    return _decorated(function, BARE_OPTIONS)
 
 
 def inlined(function: Function) -> Function:
     """Compile a small function that allocates nothing, as a part of those that call it."""
-    return cast(Function, numba.njit(**_BARE_OPTIONS, forceinline=True)(function))
+    return _decorated(function, {**BARE_OPTIONS, "forceinline": True})
+
+
+def internal(function: Function) -> Function:
+    """As `inlined`, for functions whose arguments or results Python cannot see."""
+    return _decorated(function, {**BARE_OPTIONS, "forceinline": True, "no_cpython_wrapper": True})
+
+
+def _decorated(function: Function, options: dict[str, Any]) -> Function:
+    kept_in = folder() if _is_own(function) else None
+    if kept_in is None:
+        return cast(Function, numba.njit(**options)(function))
+    with numba_cache_dir(kept_in):
+        dispatcher = numba.njit(cache=True, **options)(function)
+    dispatcher._cache = CheckedCache(dispatcher._cache, function.__qualname__)
+    return cast(Function, dispatcher)
+
+
+def _is_own(function: Callable[..., object]) -> bool:
+    """Whether the function stands in a source that the digest of the cache covers."""
+    try:
+        place = Path(inspect.getfile(function)).resolve().relative_to(ROOT)
+    except (TypeError, ValueError):
+        return False
+    return place.parts[0] in PACKAGES

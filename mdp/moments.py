@@ -8,22 +8,18 @@ stationary policy, T = horizon for one that changes with the step.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import Bools, Floats, Ints
 from mdp.machine_code import compiled
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @compiled
 def moments_under_limit(
     prob: Floats,
-    next_state: Indices,
-    terminated: Mask,
+    next_state: Ints,
+    terminated: Bools,
     reward: Floats,
-    success: Mask,
+    success: Bools,
     policy: Floats,
     horizon: int,
     discount: float,
@@ -58,10 +54,10 @@ def moments_under_limit(
 @compiled
 def _means(
     prob: Floats,
-    next_state: Indices,
-    terminated: Mask,
+    next_state: Ints,
+    terminated: Bools,
     reward: Floats,
-    success: Mask,
+    success: Bools,
     chances: Floats,
     discount: float,
     later: Floats,
@@ -87,8 +83,8 @@ def _means(
 @compiled
 def _variances(
     prob: Floats,
-    next_state: Indices,
-    terminated: Mask,
+    next_state: Ints,
+    terminated: Bools,
     reward: Floats,
     chances: Floats,
     discount: float,
@@ -117,8 +113,8 @@ def _variances(
 @compiled
 def visits_under_limit(
     prob: Floats,
-    next_state: Indices,
-    terminated: Mask,
+    next_state: Ints,
+    terminated: Bools,
     policy: Floats,
     initial: Floats,
     horizon: int,

@@ -9,17 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import Bools, Floats, Ints
 from mdp.chain import PolicyChain
 from mdp.graph import end_components, steps_to_end
 from mdp.problem import PlanningProblem
 from mdp.sweeps import TIE_TOLERANCE, improve
 from mdp.transition_model import TransitionModel
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Beyond this many rounds only plain sweeps are made, which are known to converge.
 ROUNDS_WITH_EVALUATION = 1000
@@ -51,7 +47,7 @@ class Plan:
 
     values: Floats
     action_values: Floats
-    policy: Indices
+    policy: Ints
     iterations: int
     error_bound: float
     start_value: float
@@ -135,7 +131,7 @@ def _worth_evaluating(
     return change > 1e-13 * float(np.abs(values).max())
 
 
-def _exact_values(problem: PlanningProblem, policy: Indices) -> Floats:
+def _exact_values(problem: PlanningProblem, policy: Ints) -> Floats:
     model = problem.model
     taken = np.zeros((model.n_states, model.n_actions))
     taken[np.arange(model.n_states), policy] = 1.0
@@ -168,7 +164,7 @@ def _plan(problem: PlanningProblem, values: Floats, change: float, iterations: i
     return Plan(values, action_values, policy, iterations, error_bound, start_value)
 
 
-def _greedy(problem: PlanningProblem, action_values: Floats, tie: float, rests: Mask) -> Indices:
+def _greedy(problem: PlanningProblem, action_values: Floats, tie: float, rests: Bools) -> Ints:
     """The first best action of each state, shape (S,), that also gets somewhere."""
     model, part = problem.model, problem.part
     best = action_values.max(axis=1)
@@ -184,7 +180,7 @@ def _greedy(problem: PlanningProblem, action_values: Floats, tie: float, rests: 
     return _first(chosen)
 
 
-def _first(mask: Mask) -> Indices:
+def _first(mask: Bools) -> Ints:
     """The first true column of each row."""
-    first: Indices = mask.argmax(axis=1)
+    first: Ints = mask.argmax(axis=1)
     return first

@@ -10,11 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.transition_model import TransitionModel
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Policy = NDArray[np.floating] | NDArray[np.integer]
+Policy = NDArray[np.floating] | AnyInts
 
 # Networks work in float32, whose probabilities sum to one within some 1e-7.
 POLICY_TOLERANCE = 1e-5
@@ -24,7 +23,7 @@ def canonical_policy(model: TransitionModel, policy: Policy, horizon: int | None
     """The policy as a float64 matrix (S, A), or as actions of shape (1 or horizon, S)."""
     n_states, n_actions = model.n_states, model.n_actions
     if np.issubdtype(policy.dtype, np.integer):
-        actions: NDArray[np.integer] = np.atleast_2d(policy)
+        actions: AnyInts = np.atleast_2d(policy)
         if actions.shape not in {(1, n_states), (horizon, n_states)}:
             raise ValueError(
                 f"actions have shape {policy.shape}, they must have ({n_states},), or "
@@ -49,7 +48,7 @@ def canonical_policy(model: TransitionModel, policy: Policy, horizon: int | None
     return matrix
 
 
-def chances_in(model: TransitionModel, policy: Policy, states: Indices) -> Floats:
+def chances_in(model: TransitionModel, policy: Policy, states: Ints) -> Floats:
     """The probabilities of actions in the listed states, shape (1 or horizon, n, A)."""
     if np.issubdtype(policy.dtype, np.integer):
         return np.eye(model.n_actions)[policy[:, states]]
@@ -62,7 +61,7 @@ def policy_matrix(model: TransitionModel, policy: Policy) -> Floats:
     return matrix
 
 
-def actions_used(model: TransitionModel, policy: Policy) -> NDArray[np.bool_]:
+def actions_used(model: TransitionModel, policy: Policy) -> Bools:
     """The actions that the policy may take at some step, bool of shape (S, A)."""
     if not np.issubdtype(policy.dtype, np.integer):
         return policy > 0

@@ -9,17 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import Bools, Floats, Ints
 from mdp.chain import PolicyChain
 from mdp.graph import reachable_states
 from mdp.moments import moments_under_limit, visits_under_limit
 from mdp.policies import Policy, actions_used, canonical_policy, chances_in, policy_matrix
 from mdp.transition_model import TransitionModel
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ def policy_return(
     policy: Policy,
     horizon: int | None,
     discount: float = 1.0,
-    success: Mask | None = None,
+    success: Bools | None = None,
 ) -> PolicyReturn:
     """Evaluate a policy exactly.
 
@@ -134,7 +130,7 @@ def best_blind_return(model: TransitionModel, horizon: int, discount: float = 1.
 
 
 def _check(
-    model: TransitionModel, horizon: int | None, discount: float, success: Mask | None
+    model: TransitionModel, horizon: int | None, discount: float, success: Bools | None
 ) -> None:
     if horizon is not None and horizon < 1:
         raise ValueError(f"horizon is {horizon}, it must be at least 1, or None for no limit")
@@ -144,7 +140,7 @@ def _check(
         raise ValueError(f"success has shape {success.shape}, the model has {model.prob.shape}")
 
 
-def _visited(model: TransitionModel, policy: Policy) -> tuple[Indices, Floats, Indices, Mask]:
+def _visited(model: TransitionModel, policy: Policy) -> tuple[Ints, Floats, Ints, Bools]:
     """The states that a policy visits, and the rows of the model for them alone.
 
     Returns:
@@ -156,7 +152,7 @@ def _visited(model: TransitionModel, policy: Policy) -> tuple[Indices, Floats, I
     return states, model.prob[states], place[model.next_state[states]], model.terminated[states]
 
 
-def _moments_without_limit(chain: PolicyChain, discount: float, ends_well: Mask) -> Floats:
+def _moments_without_limit(chain: PolicyChain, discount: float, ends_well: Bools) -> Floats:
     """As ``moments_under_limit``, from linear systems."""
     if discount == 1:
         _refuse_endless(chain)

@@ -6,16 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.graph import steps_to_end
 from mdp.sweeps import action_values, evaluate, first_guess, policy_rows
 from mdp.transition_model import TransitionModel
 from mdp.undiscounted import FinitePart, finite_part
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 EPSILON = float(np.finfo(np.float64).eps)
 # Where less of the probability than this is settled, relaxing by its inverse overshoots.
@@ -46,18 +42,18 @@ class PlanningProblem:
         return cls(model, float(discount), part)
 
     @cached_property
-    def order(self) -> Indices:
+    def order(self) -> Ints:
         """The states to plan for, those nearest to the end (or to rest) first."""
         steps, order = steps_to_end(self.model, self.part.allowed, self.part.resting)
         return np.concatenate([order, np.flatnonzero(self.part.states & (steps < 0))])
 
     @property
-    def rows(self) -> tuple[Floats, NDArray[np.integer], Mask, Floats]:
+    def rows(self) -> tuple[Floats, AnyInts, Bools, Floats]:
         """The arrays of the model as the sweeps take them."""
         model = self.model
         return model.prob, model.next_state, model.terminated, model.expected_reward
 
-    def start(self) -> tuple[Floats, Indices]:
+    def start(self) -> tuple[Floats, Ints]:
         """First values, shape (S,), and a policy, shape (S,), that surely ends or comes to rest.
 
         Where rest is possible these are the policy's own values: from below, sweeps converge to
@@ -78,7 +74,7 @@ class PlanningProblem:
         return values, policy
 
     def evaluate(
-        self, reward: Floats, policy: Indices, order: Indices, values: Floats, enough: float
+        self, reward: Floats, policy: Ints, order: Ints, values: Floats, enough: float
     ) -> float:
         """Improve the values of a policy, in place, by some sweeps over the states of ``order``.
 
@@ -141,7 +137,7 @@ class PlanningProblem:
         needed = (model.expected_reward[ends] + self.part.step_cost) / ending[ends]
         return float(needed.max(initial=0.0))
 
-    def longest_episode(self, policy: Indices, rests: Mask) -> float:
+    def longest_episode(self, policy: Ints, rests: Bools) -> float:
         """The largest expected number of steps until a policy ends the episode or rests."""
         order = self.order[~rests[self.order]]
         steps = np.zeros(self.model.n_states)

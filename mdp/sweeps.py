@@ -10,12 +10,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.machine_code import compiled
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-States = NDArray[np.integer]
-Mask = NDArray[np.bool_]
 
 TIE_TOLERANCE = 1e-12
 
@@ -23,15 +19,15 @@ TIE_TOLERANCE = 1e-12
 @compiled
 def improve(
     prob: Floats,
-    next_state: States,
-    terminated: Mask,
+    next_state: AnyInts,
+    terminated: Bools,
     mean_reward: Floats,
-    allowed: Mask,
+    allowed: Bools,
     floor: Floats,
     discount: float,
-    order: Indices,
+    order: Ints,
     values: Floats,
-    policy: Indices,
+    policy: Ints,
 ) -> tuple[float, float]:
     """One Gauss-Seidel sweep of the Bellman optimality operator, in place.
 
@@ -72,15 +68,15 @@ def improve(
 @compiled
 def first_guess(
     prob: Floats,
-    next_state: States,
-    terminated: Mask,
+    next_state: AnyInts,
+    terminated: Bools,
     mean_reward: Floats,
-    allowed: Mask,
+    allowed: Bools,
     discount: float,
-    known: Mask,
-    order: Indices,
+    known: Bools,
+    order: Ints,
     values: Floats,
-    policy: Indices,
+    policy: Ints,
 ) -> None:
     """Values and actions in one pass, as if what leads away from the end left the agent in place.
 
@@ -116,12 +112,12 @@ def first_guess(
 @compiled
 def policy_rows(
     prob: Floats,
-    next_state: States,
-    terminated: Mask,
+    next_state: AnyInts,
+    terminated: Bools,
     mean_reward: Floats,
     discount: float,
-    order: Indices,
-    policy: Indices,
+    order: Ints,
+    policy: Ints,
 ) -> tuple[Floats, NDArray[np.int32], Floats, Floats]:
     """The rows that a policy uses, in the order of the sweep and with places in it for states.
 
@@ -185,10 +181,10 @@ def evaluate(
 @compiled
 def action_values(
     prob: Floats,
-    next_state: States,
-    terminated: Mask,
+    next_state: AnyInts,
+    terminated: Bools,
     mean_reward: Floats,
-    allowed: Mask,
+    allowed: Bools,
     discount: float,
     values: Floats,
 ) -> Floats:

@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mdp.array_types import AnyInts, Bools, Floats
+
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
@@ -48,11 +50,11 @@ class TransitionModel:
             reward is not finite. The message names state and action.
     """
 
-    prob: NDArray[np.float64]
-    next_state: NDArray[np.integer]
-    reward: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    initial: NDArray[np.float64]
+    prob: Floats
+    next_state: AnyInts
+    reward: Floats
+    terminated: Bools
+    initial: Floats
 
     def __post_init__(self) -> None:
         index_type = np.int32 if np.asarray(self.next_state).dtype == np.int32 else np.int64
@@ -119,20 +121,23 @@ class TransitionModel:
         return int(self.prob.shape[2])
 
     @cached_property
-    def expected_reward(self) -> NDArray[np.float64]:
+    def expected_reward(self) -> Floats:
         """The mean reward of one step, shape (S, A)."""
         return _read_only(np.einsum("sak,sak->sa", self.prob, self.reward))
 
     @cached_property
-    def reachable(self) -> NDArray[np.bool_]:
+    def reachable(self) -> Bools:
         """The states in which the agent may have to act, bool of shape (S,).
 
         These are the possible starting states and whatever transitions lead to, from one to the
         next, without ending the episode. The rows of all other states mean nothing.
         """
-        from mdp.graph import reachable_states
+        from mdp.reachability import reached_from
 
-        return _read_only(reachable_states(self))
+        allowed = np.ones((self.n_states, self.n_actions), np.bool_)
+        start = self.initial > 0
+        found = reached_from(start, self.prob, self.next_state, self.terminated, allowed)
+        return _read_only(found)
 
     def continuing(self, action: int) -> csr_array:
         """Probabilities of going from state to state by ``action`` without the episode ending.
@@ -183,7 +188,7 @@ class TransitionModel:
             raise ValueError(f"initial sums to {self.initial.sum()}, it must sum to one")
 
     @staticmethod
-    def _require(valid: NDArray[np.bool_], problem: str) -> None:
+    def _require(valid: Bools, problem: str) -> None:
         if not valid.all():
             state, action = np.argwhere(~valid)[0][:2]
             raise ValueError(f"state {state}, action {action} has {problem}")

@@ -11,12 +11,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import Bools
 from mdp.graph import end_components, steps_to_end
 from mdp.transition_model import TransitionModel
-
-Mask = NDArray[np.bool_]
 
 # Expected rewards are sums of products; closer to zero than this they are zero up to rounding.
 ROUNDING = 1e-12
@@ -36,10 +34,10 @@ class FinitePart:
             some such step costs nothing.
     """
 
-    states: Mask
-    allowed: Mask
-    resting: Mask
-    rest_actions: Mask
+    states: Bools
+    allowed: Bools
+    resting: Bools
+    rest_actions: Bools
     step_cost: float
 
     @classmethod
@@ -77,7 +75,7 @@ def finite_part(model: TransitionModel) -> FinitePart:
     return FinitePart(states, allowed, resting, rest_actions, step_cost)
 
 
-def _surely_ending(model: TransitionModel, allowed: Mask, resting: Mask) -> tuple[Mask, Mask]:
+def _surely_ending(model: TransitionModel, allowed: Bools, resting: Bools) -> tuple[Bools, Bools]:
     """The states from which some policy ends the episode, or comes to rest, with probability one.
 
     What has no way there is left out, and then what might lead to it, until nothing changes.
@@ -93,7 +91,7 @@ def _surely_ending(model: TransitionModel, allowed: Mask, resting: Mask) -> tupl
         allowed = allowed & ~(risky | dead)
 
 
-def _rest_actions(model: TransitionModel, endless: Mask) -> Mask:
+def _rest_actions(model: TransitionModel, endless: Bools) -> Bools:
     """The actions by which an agent can stay for ever at no cost, bool of shape (S, A).
 
     Raises:
@@ -115,7 +113,7 @@ def _rest_actions(model: TransitionModel, endless: Mask) -> Mask:
     return resting
 
 
-def _largest_gain(model: TransitionModel, inside: Mask) -> float:
+def _largest_gain(model: TransitionModel, inside: Bools) -> float:
     """The largest mean reward per step of staying in an end component, by linear programming.
 
     Puterman, Markov Decision Processes, 1994, section 8.8: the best stationary flow.

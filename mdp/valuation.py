@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import Bools, Floats, Ints
 from mdp.finite_horizon import finite_horizon_optimum
 from mdp.machine_code import compiled
 from mdp.policies import Policy, canonical_policy, chances_in
 from mdp.transition_model import TransitionModel
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 # Far above what a thousand steps round off, far below what a learner could tell apart.
 OPTIMAL_TOLERANCE = 1e-9
@@ -49,7 +45,7 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
     return values
 
 
-def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Mask]:
+def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Bools]:
     """The best that can be made of each state, and all the actions that begin it.
 
     Sutton and Barto, Reinforcement Learning, 2nd edition, section 3.6.
@@ -78,8 +74,8 @@ def optimal_choices(model: TransitionModel, horizon: int) -> tuple[Floats, Mask]
 @compiled
 def _returns_under_limit(
     prob: Floats,
-    next_state: Indices,
-    terminated: Mask,
+    next_state: Ints,
+    terminated: Bools,
     mean_reward: Floats,
     policy: Floats,
     horizon: int,

@@ -1,1 +1,1 @@
-"""From a specification to a finished run folder."""
+"""One run: from a specification to a finished run folder, and playing what was trained."""

@@ -1,4 +1,4 @@
-"""Mistakes of the user's, and the words in which they are told."""
+"""Mistakes of the user's, and how messages name them."""
 
 from __future__ import annotations
 

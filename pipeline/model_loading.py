@@ -36,6 +36,24 @@ def check_model_file(path: Path) -> None:
         raise UserError(f"{path} is no whole zip of an agent: it lacks parts that one has")
 
 
+def check_origin(path: Path, log_folder: Path, given: Path | None = None) -> None:
+    """Make sure that a zip of one of the library's agents lies where our own runs do.
+
+    Args:
+        path: the zip.
+        log_folder: the folder above all runs.
+        given: what to call the zip in a mistake; by default its path.
+
+    Raises:
+        UserError: if it lies elsewhere.
+    """
+    if not path.resolve().is_relative_to(log_folder.resolve()):
+        raise UserError(
+            f"{given or path} lies outside {log_folder}, and loading a zip of a library agent can "
+            "run code that is hidden in it: add --trust if you know where it comes from"
+        )
+
+
 def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) -> BaseAlgorithm:
     """Load an agent from its zip.
 

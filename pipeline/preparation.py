@@ -1,4 +1,4 @@
-"""All parts of a training run, made and fitted together before the first step."""
+"""All parts of a training run, made before its first step."""
 
 from __future__ import annotations
 
@@ -16,17 +16,13 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents import load_algorithm
 from agents.common.callback_horizons import EpisodeBudget
-from pipeline.callbacks import (
-    EpisodeCheckpoint,
-    EvaluationCallback,
-    ExponentialExploration,
-    StepCheckpoint,
-)
+from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.sampled import evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import ValueMapRecorder
+from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.model_loading import load_model
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
@@ -76,7 +72,7 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
 def set_up(
     spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
 ) -> Training:
-    """Make all parts of the training; ``undo`` is told how to take them back."""
+    """Make all parts of the training, and add to ``undo`` how to remove them again."""
     env = make_training_env(spec, run.path)
     undo.callback(env.close)
     model = _make_model(spec, env, kwargs)
@@ -84,29 +80,10 @@ def set_up(
         model.set_logger(Logger(folder=None, output_formats=[]))
     eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
     undo.callback(eval_env.close)
-    exact, is_bandit = exact_evaluator(spec), are_bandits(env)
-    evaluation = EvaluationCallback(
-        run,
-        eval_env,
-        exact
-        or partial(
-            evaluate,
-            env=eval_env,
-            n_episodes=spec.eval_episodes,
-            seed=evaluation_seed(spec.seed, 1),
-        ),
-        *_evaluation_intervals(spec, env.num_envs, is_judged_by_regret=exact is None and is_bandit),
-        value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
-    )
+    is_bandit = are_bandits(env)
+    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit)
     display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
-    callbacks: list[BaseCallback] = components.callbacks(
-        spec.hyperparams.callback, spec.gym_packages, run.path
-    )
-    _check_callbacks(spec, model, callbacks)
-    if spec.save_freq > 0:
-        callbacks.append(StepCheckpoint(spec.save_freq, run.path))
-    if spec.save_every_n_episodes > 0:
-        callbacks.append(EpisodeCheckpoint(spec.save_every_n_episodes, run.path))
+    callbacks = _named_callbacks(spec, run, model)
     pulls = _pull_recorder(model, run, console) if is_bandit else None
     if pulls is not None:
         callbacks.append(pulls)
@@ -116,6 +93,35 @@ def set_up(
     if spec.verbose > 0:
         callbacks.append(display)
     return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls)
+
+
+def _evaluation(
+    spec: TrainSpec, run: Run, eval_env: VecEnv, n_envs: int, is_bandit: bool
+) -> EvaluationCallback:
+    """The evaluations during training: exact ones where the environment's model is known."""
+    exact = exact_evaluator(spec)
+    seed = evaluation_seed(spec.seed, 1)
+    sampled = partial(evaluate, env=eval_env, n_episodes=spec.eval_episodes, seed=seed)
+    return EvaluationCallback(
+        run,
+        eval_env,
+        exact or sampled,
+        *_evaluation_intervals(spec, n_envs, is_judged_by_regret=exact is None and is_bandit),
+        value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
+    )
+
+
+def _named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[BaseCallback]:
+    """The callbacks that the hyperparameters name, and the checkpoints that are asked for."""
+    callbacks: list[BaseCallback] = components.callbacks(
+        spec.hyperparams.callback, spec.gym_packages, run.path
+    )
+    _check_callbacks(spec, model, callbacks)
+    if spec.save_freq > 0:
+        callbacks.append(StepCheckpoint(spec.save_freq, run.path))
+    if spec.save_every_n_episodes > 0:
+        callbacks.append(EpisodeCheckpoint(spec.save_every_n_episodes, run.path))
+    return callbacks
 
 
 def _pull_recorder(model: BaseAlgorithm, run: Run, console: Console) -> PullRecorder | None:
@@ -132,7 +138,7 @@ def is_unread(spec: TrainSpec) -> bool:
 
 
 def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
-    """Find out now what would end the training half-way."""
+    """Refuse now what would end the training half-way."""
     for callback in callbacks:
         if isinstance(callback, ExponentialExploration):
             callback.check_model(model)

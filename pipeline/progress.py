@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 
 import numpy as np
@@ -15,11 +16,38 @@ from rich.progress import (
 )
 
 from agents.common.callback_horizons import BlockCallback
-from agents.tabular.base import TabularAlgorithm
-from agents.tabular.engine_choice import must_compile
 
 SECONDS_BETWEEN_UPDATES = 0.1
 LINES_WITHOUT_TERMINAL = 10
+
+
+class CompilationNotice(logging.Handler):
+    """Says once that a loop is being compiled, which takes some seconds.
+
+    Args:
+        console: where to.
+    """
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(logging.INFO)
+        self.console = console
+        self.log = logging.getLogger("mdp.machine_code")
+        self.level_before = self.log.level
+
+    def listen(self) -> None:
+        """Begin to wait for something to be compiled."""
+        self.log.addHandler(self)
+        self.log.setLevel(logging.INFO)
+
+    def stop(self) -> None:
+        """Say no more; harmless when called again."""
+        self.log.removeHandler(self)
+        self.log.setLevel(self.level_before)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno == logging.INFO:
+            self.stop()
+            self.console.print("compiling the training loop (the first time, some seconds)")
 
 
 class ProgressDisplay(BlockCallback):
@@ -38,11 +66,11 @@ class ProgressDisplay(BlockCallback):
         self.started = 0.0
         self.updated = 0.0
         self.tenths_shown = 0
+        self.notice = CompilationNotice(console)
 
     def _on_training_start(self) -> None:
         self.started = self.updated = time.monotonic()
-        if isinstance(self.model, TabularAlgorithm) and must_compile(self.model):
-            self.console.print("compiling the training loop (the first time, some seconds)")
+        self.notice.listen()
         self.first_step = self.num_timesteps
         if self.live:
             self.bar = Progress(
@@ -68,7 +96,8 @@ class ProgressDisplay(BlockCallback):
         self.close()
 
     def close(self) -> None:
-        """Let go of the terminal; harmless when called again."""
+        """Give the terminal back; may be called again."""
+        self.notice.stop()
         if self.bar is not None:
             self.bar.stop()
             self.bar = None

@@ -1,4 +1,4 @@
-"""The pulls of a training on a bandit: a file of its run folder, and what they came to."""
+"""The pulls of a training on a bandit: a file of its run folder, and figures on them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LAST_PULLS = 100
 
 @dataclass(frozen=True)
 class PullSummary:
-    """What the pulls of a training came to.
+    """Figures on the pulls of a training.
 
     Attributes:
         n_pulls: how many there were, over all environments.
@@ -76,5 +76,5 @@ class PullRecorder(PullLog):
 
 
 def are_bandits(env: VecEnv) -> bool:
-    """Whether the environments have arms whose pulls can be told of."""
+    """Whether the environments have arms whose pulls can be recorded."""
     return env.has_attr("n_arms")

@@ -170,12 +170,21 @@ class Run:
             raise UserError(f"{self.info_path} is damaged: it must map names to values")
         return info
 
+    def recorded_spec(self) -> dict[str, Any]:
+        """What ``run.json`` says was asked for; empty where it says nothing.
+
+        Raises:
+            UserError: if the file is damaged.
+        """
+        spec = self.read_info().get("spec")
+        return spec if isinstance(spec, dict) else {}
+
     def update_info(self, **fields: Any) -> None:
         """Set fields of ``run.json``."""
         write_json(self.info_path, {**self.read_info(), **fields})
 
     def discard(self) -> None:
-        """Remove the folder, where nothing has come of the run, and those left empty by that."""
+        """Remove the folder of a run that left nothing, and those above it that are empty then."""
         shutil.rmtree(self.path, ignore_errors=True)
         for folder in list(self.path.parents)[:2]:
             try:

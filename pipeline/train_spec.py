@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ class TrainSpec:
     log_interval: int = -1
     verbose: int = 1
     progress: bool = False
-    gym_packages: tuple[str, ...] = field(default=())
+    gym_packages: tuple[str, ...] = ()
     unique_id: bool = False
     pictures: bool = True
 
@@ -70,3 +71,18 @@ class TrainSpec:
         for name in ("log_folder", "tensorboard_log", "trained_agent"):
             data[name] = None if data[name] is None else str(data[name])
         return data
+
+
+def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """A spec that a run folder recorded, maybe long ago, with the fields that a spec has today.
+
+    A field that came later gets its default: a new field must have one under which a run does what
+    it did before. A field that there is no more is left out.
+
+    Args:
+        recorded: what `TrainSpec.as_data` returned when the run was made.
+    """
+    known = TrainSpec("", "", Hyperparams(), {}, 0).as_data()
+    required = {key.name for key in fields(TrainSpec) if key.default is MISSING}
+    defaults = {key: value for key, value in known.items() if key not in required}
+    return {**defaults, **{key: recorded[key] for key in known if key in recorded}}

@@ -1,58 +1,51 @@
-"""From a spec to a finished run folder."""
+"""From a spec to a finished run folder: `prepare` makes all parts, `carry_out` trains."""
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
-from importlib.metadata import version
 from typing import Any
 from uuid import uuid4
 
 import torch as th
-import yaml
 from rich.console import Console
 
-from commands.run_output import print_header
-from pipeline.callbacks import save_model, save_normalization
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import value_map
-from pipeline.files import write_text
+from pipeline.model_saving import save_model, save_normalization
 from pipeline.pictures.learning_curve import draw_learning_curve
 from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.pull_recording import PullSummary, summarise_pulls
 from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
+from pipeline.run_record import recorded_versions, write_arguments, write_settings
 from pipeline.train_spec import TrainSpec
 
 FINAL_EVALUATION_EPISODES = 100
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
 
-RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
-
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a run has come to.
+    """What came out of a run.
 
     Attributes:
         run: its folder.
         state: ``"finished"`` or ``"interrupted"``.
         n_steps: environment steps that were run.
         seconds: time that they took, evaluations included.
-        final: evaluation of the agent at the end, by episodes that served nothing else; None where
+        final: evaluation of the agent at the end, by episodes used for nothing else; None where
             evaluation was turned off.
         best_return: mean return of the best evaluation during training, if there was one.
         best_timesteps: when that was.
         engine: for tabular agents, whether training was compiled, and if not, why.
-        pulls: on bandits, what the pulls of training came to; else None.
+        pulls: on bandits, figures on the pulls of training; else None.
     """
 
     run: Run
@@ -69,13 +62,18 @@ class Outcome:
 def train(
     spec: TrainSpec, console: Console, args: dict[str, Any], command: str, run: Run | None = None
 ) -> Outcome:
-    """Train the agent and leave a run folder.
+    """Train the agent and leave a run folder: `prepare`, then `carry_out`."""
+    return carry_out(prepare(spec, console, args, command, run))
 
-    Ctrl-C ends the training early; what has been learnt is saved all the same.
+
+def prepare(
+    spec: TrainSpec, console: Console, args: dict[str, Any], command: str, run: Run | None = None
+) -> Training:
+    """Make the run folder and all parts of the training.
 
     Args:
         spec: what to do.
-        console: where to report to.
+        console: where the training is to report to.
         args: the command's arguments, for the run folder.
         command: the command itself, likewise.
         run: the run folder, made already; by default a new one in the spec's log folder.
@@ -91,45 +89,36 @@ def train(
     with ExitStack() as undo, _library_errors_in_one_line():
         undo.callback(run.discard)
         training = set_up(spec, run, kwargs, console, undo)
-        _write_settings(training, args, command)
+        write_settings(run, spec, command)
+        write_arguments(run, spec, args)
+        run.update_info(
+            state=RUNNING,
+            env_name=run.env_name,
+            spec=spec.as_data(),
+            versions=recorded_versions(),
+        )
         undo.pop_all()
-    print_header(console, spec)
-    return _execute(training)
+    return training
 
 
 @contextmanager
 def _library_errors_in_one_line() -> Iterator[None]:
-    """Settings that only the library finds fault with, when it is handed them."""
+    """Errors of settings that only the library checks, when it gets them."""
     try:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError) as error:
         raise UserError(one_line(error)) from error
 
 
-def _write_settings(training: Training, args: dict[str, Any], command: str) -> None:
-    """Write what the run was asked to do, as rl_zoo3 does and as our own ``run.json``."""
-    run, spec = training.run, training.spec
-    write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
-    # rl_zoo3 takes this for the mapping that it makes of the flag, and puts it over config.yml.
-    args = {**args, "env_kwargs": spec.saved_hyperparams.get("env_kwargs")}
-    write_text(run.params_path / "args.yml", yaml.safe_dump(args))
-    write_text(run.params_path / "command.txt", command + "\n")
-    run.update_info(
-        state=RUNNING,
-        env_name=run.env_name,
-        spec=spec.as_data(),
-        versions=recorded_versions(),
-    )
+def carry_out(training: Training) -> Outcome:
+    """Train, and save, judge and draw what was learnt.
 
+    Ctrl-C ends the training early; what was learnt until then is saved all the same.
 
-@cache
-def recorded_versions() -> dict[str, str]:
-    """The versions that a run's results may depend on."""
-    packages = {package: version(package) for package in RECORDED_PACKAGES}
-    return {"python": platform.python_version(), **packages}
-
-
-def _execute(training: Training) -> Outcome:
+    Raises:
+        UserError: if the agent finds at its first step that it cannot work so; no folder is left
+            behind then.
+    """
     model = training.model
     started = time.monotonic()
     state = FINISHED
@@ -153,7 +142,7 @@ def _execute(training: Training) -> Outcome:
 
 
 def _give_up(training: Training, error: BaseException) -> None:
-    """Note the reason; or leave nothing, where the agent saw at once that it cannot work so.
+    """Note the reason; or remove the folder, where the agent failed before its first step.
 
     Raises:
         UserError: in that case.
@@ -191,33 +180,38 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
         evaluation.evaluate_now()
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
-    yardstick = None if final is None else final.yardstick
     pulls = _keep_pulls(training, state, title)
     if training.spec.pictures and (pulls is None or evaluation.evaluations_timesteps):
+        yardstick = None if final is None else final.yardstick
         draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
     _keep_value_map(training, title)
-    best = evaluation.best_mean_reward if evaluation.best_timesteps else None
-    engine = getattr(model, "engine_in_use", None)
-    run.update_info(
-        state=state,
-        n_timesteps=model.num_timesteps,
-        seconds=round(seconds, 3),
-        final=None if final is None else final.summary(),
-        best_mean_return=best,
-        best_timesteps=evaluation.best_timesteps,
-        engine=engine,
-        **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
-    )
-    return Outcome(
+    outcome = Outcome(
         run,
         state,
-        model.num_timesteps,
-        seconds,
-        final,
-        best,
-        evaluation.best_timesteps,
-        engine,
-        pulls,
+        n_steps=model.num_timesteps,
+        seconds=seconds,
+        final=final,
+        best_return=evaluation.best_mean_reward if evaluation.best_timesteps else None,
+        best_timesteps=evaluation.best_timesteps,
+        engine=getattr(model, "engine_in_use", None),
+        pulls=pulls,
+    )
+    _record(outcome)
+    return outcome
+
+
+def _record(outcome: Outcome) -> None:
+    """Write what came out into ``run.json``, the last file of a run."""
+    pulls = outcome.pulls
+    outcome.run.update_info(
+        state=outcome.state,
+        n_timesteps=outcome.n_steps,
+        seconds=round(outcome.seconds, 3),
+        final=None if outcome.final is None else outcome.final.summary(),
+        best_mean_return=outcome.best_return,
+        best_timesteps=outcome.best_timesteps,
+        engine=outcome.engine,
+        **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
     )
 
 
@@ -227,7 +221,7 @@ def _keep_pulls(training: Training, state: str, title: str) -> PullSummary | Non
     if recorder is None or not recorder.n_calls:
         return None
     if state == INTERRUPTED:
-        recorder.write()  # which the end of a training does by itself
+        recorder.write()  # as it does by itself where the training was not interrupted
     arrays = recorder.arrays()
     if training.spec.pictures:
         draw_pulls(training.run.pulls_picture_path, title, arrays)
@@ -235,7 +229,7 @@ def _keep_pulls(training: Training, state: str, title: str) -> PullSummary | Non
 
 
 def _keep_value_map(training: Training, title: str) -> None:
-    """Record and draw the policy that has come out, where evaluation is on and knows a map."""
+    """Record and draw the final policy, where evaluation is on and knows a map."""
     model, maps = training.model, training.evaluation.value_maps
     if maps is None or not training.evaluation.is_asked_for:
         return
@@ -246,7 +240,7 @@ def _keep_value_map(training: Training, title: str) -> None:
 
 
 def _final_evaluation(training: Training) -> Evaluation | None:
-    """Exact, or by episodes that have served nothing else; none where evaluation is off."""
+    """Exact, or by episodes that were used for nothing else; none where evaluation is off."""
     evaluator = training.evaluation.evaluator
     if not training.evaluation.is_asked_for:
         return None

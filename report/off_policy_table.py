@@ -2,51 +2,21 @@
 
 from __future__ import annotations
 
-import argparse
 import math
-from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
-from commands.study_output import WIDTH_WITHOUT_TERMINAL
 from experiments.off_policy.estimators import mean_reward
 from experiments.off_policy.logged_policies import (
     Comparison,
     Judged,
-    compare_policies,
-    read_logged,
-    read_policy,
 )
-from pipeline.errors import UserError
 from verdicts import Estimate, paired_difference
 
 # Where an estimate rests on fewer pulls, its interval is hardly one.
 FEW_PULLS = 100
 SHORT, MOST_DECIMALS = 3, 6
-
-
-def compare_on_log(args: argparse.Namespace) -> int:
-    """Judge the policies of ``--policy`` on the log of ``--logged``; the exit code.
-
-    Raises:
-        UserError: if one of them cannot be read, or they do not go together.
-    """
-    if not (args.logged and args.policy):
-        raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
-    if args.study or args.env or args.algos:
-        raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
-    data = read_logged(args.logged)
-    policies = [read_policy(Path(path), args.trust) for path in args.policy]
-    names = [policy.name for policy in policies]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise UserError(f"--policy names {twice} twice")
-    console = Console(highlight=False)
-    if not console.is_terminal:
-        console = Console(highlight=False, width=WIDTH_WITHOUT_TERMINAL)
-    print_comparison(console, compare_policies(data, policies))
-    return 0
 
 
 def print_comparison(console: Console, comparison: Comparison) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.results import StudyResults
+from experiments.study_results import StudyResults
 from pipeline.files import replacing
 
 

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
-from experiments.results import StudyResults, read_episodes
 from experiments.study_plan import PlannedRun
+from experiments.study_results import StudyResults, read_episodes
 from experiments.study_spec import file_name
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing
+from pipeline.filming import film_episode, write_film
+from pipeline.model_choice import ChosenModel
 from pipeline.model_loading import load_model
-from pipeline.playing import ChosenModel, Watcher, play_episodes, playing_env, write_film
+from pipeline.playing import playing_env
 
 MAX_STEPS = 500  # fifty seconds
 
@@ -49,7 +48,7 @@ def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
         path = folder / f"{name}_{episode}.gif"
         if not (path.exists() and path.stat().st_mtime >= checkpoint.stat().st_mtime):
             chosen = ChosenModel(checkpoint, planned.spec, planned.run)
-            frames = film_episode(chosen, evaluation_seed(planned.seed, 4), MAX_STEPS)
+            frames = episode_in_training(chosen, evaluation_seed(planned.seed, 4), MAX_STEPS)
             folder.mkdir(exist_ok=True)
             with replacing(path) as draft:
                 write_film(draft, frames)
@@ -67,7 +66,7 @@ def _checkpoints(planned: PlannedRun) -> Iterator[tuple[Path, int]]:
             yield path, n_episodes // every * every
 
 
-def film_episode(chosen: ChosenModel, seed: int, max_steps: int) -> list[Any]:
+def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[Any]:
     """The frames of an episode, in which the agent samples or explores as it did in training.
 
     Args:
@@ -88,10 +87,7 @@ def film_episode(chosen: ChosenModel, seed: int, max_steps: int) -> list[Any]:
     try:
         model = load_model(chosen.spec.algo, chosen.path, env)
         model.set_random_seed(seed)
-        watcher = Watcher(env, "rgb_array", Console(quiet=True))
-        limits = argparse.Namespace(n_episodes=1, n_timesteps=max_steps, stochastic=True)
-        for _ in play_episodes(model, env, limits, watcher.show):
-            pass
+        frames, _ = film_episode(model, env, max_steps, deterministic=False)
     finally:
         env.close()
-    return watcher.frames
+    return frames

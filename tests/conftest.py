@@ -47,9 +47,9 @@ def small_study():
 @pytest.fixture(scope="session")
 def do_study():
     """Does the runs of a study that are missing, in this process, and reads its results."""
-    from experiments.results import read_results
     from experiments.run_in_child import do_run, draft_path
     from experiments.study_plan import plan
+    from experiments.study_results import read_results
 
     def do(study, root):
         planned = plan(study, root)
@@ -66,9 +66,9 @@ def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
     from experiments.analysis import analyse
     from experiments.execution import failure_log
-    from experiments.results import read_results
     from experiments.run_in_child import do_run, draft_path
     from experiments.study_plan import plan
+    from experiments.study_results import read_results
     from pipeline.files import write_text
     from report.page import write_report
     from report.series.study_series import study_series
@@ -93,8 +93,8 @@ def report_study(tmp_path_factory):
 def one_environment(report_study):
     """The same with its first environment alone."""
     from experiments.analysis import analyse
-    from experiments.results import read_results
     from experiments.study_plan import plan
+    from experiments.study_results import read_results
 
     study = dataclasses.replace(
         report_study.study, environments=report_study.study.environments[:1]

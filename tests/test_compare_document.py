@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-import compare
+from commands.compare_agents import build_parser
 from commands.study_request import study_spec
 from experiments.study_files import _QUICK_VALUES, _STUDY_KEYS, read_study
 from experiments.study_plan import plan
 
-ROOT = Path(compare.__file__).parent
+ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "docs" / "compare.md").read_text()
 COMMANDS = re.findall(r"^python compare\.py (.*)$", TEXT, re.MULTILINE)
 
@@ -24,7 +24,7 @@ def blocks(language):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_can_be_carried_out(monkeypatch, tmp_path, command):
     monkeypatch.chdir(ROOT)
-    study = study_spec(compare.build_parser().parse_args(shlex.split(command)))
+    study = study_spec(build_parser().parse_args(shlex.split(command)))
     assert len(plan(study, tmp_path)) >= study.n_seeds
 
 

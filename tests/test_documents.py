@@ -6,13 +6,11 @@ from pathlib import Path
 
 import pytest
 
-import compare
-import enjoy
-import train
+from commands import compare_agents, enjoy_agent, train_agent
 from commands.study_request import study_spec
 from commands.train_request import train_spec
 
-ROOT = Path(train.__file__).parent
+ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 COMMAND = re.compile(r"python ((?:train|enjoy|compare)\.py [^`\n)#]*)")
 
@@ -43,7 +41,7 @@ def checkout(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("document", "command"), commands("train.py"))
 def test_train_commands_can_be_carried_out(checkout, document, command):
-    parser = train.build_parser()
+    parser = train_agent.build_parser()
     args = parser.parse_args(arguments(command))
     if args.list:
         return
@@ -54,14 +52,14 @@ def test_train_commands_can_be_carried_out(checkout, document, command):
 
 @pytest.mark.parametrize(("document", "command"), commands("enjoy.py"))
 def test_enjoy_commands_are_accepted(document, command):
-    args = enjoy.build_parser().parse_args(arguments(command))
+    args = enjoy_agent.build_parser().parse_args(arguments(command))
     assert args.env == "Warehouse-v0"
 
 
 @pytest.mark.parametrize(("document", "command"), commands("compare.py"))
 def test_compare_commands_are_accepted(monkeypatch, document, command):
     monkeypatch.chdir(ROOT)
-    args = compare.build_parser().parse_args(arguments(command))
+    args = compare_agents.build_parser().parse_args(arguments(command))
     assert bool(args.logged) == bool(args.policy)
     if not args.logged:
         assert study_spec(args).agents

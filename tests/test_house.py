@@ -1,4 +1,4 @@
-"""The project as a whole: start-up, imports, declared dependencies, sizes, stray paths."""
+"""The project as a whole: start-up, imports, names, declared dependencies, sizes, stray paths."""
 
 import ast
 import importlib.metadata
@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tempfile
 import tomllib
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -97,16 +98,93 @@ def test_every_imported_library_is_a_declared_dependency() -> None:
 def imported_libraries(path: Path) -> Iterator[str]:
     """Top-level names of the third-party modules that a file imports, anywhere in it."""
     own = {*PACKAGES, *(command.stem for command in ROOT.glob("*.py"))}
+    for name in imported_names(path):
+        if name not in own and name not in sys.stdlib_module_names:
+            yield name
+
+
+def imported_names(path: Path) -> set[str]:
+    """Top-level names of all modules that a file imports, anywhere in it."""
+    names: set[str] = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            names |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names = [node.module]
-        else:
-            continue
-        for top in {name.partition(".")[0] for name in names}:
-            if top not in own and top not in sys.stdlib_module_names:
-                yield top
+            names.add(node.module)
+    return {name.partition(".")[0] for name in names}
+
+
+def imported_modules(path: Path, modules: frozenset[str]) -> set[str]:
+    """Those of ``modules`` that a file imports: anywhere in it, and for types alone too."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            for alias in node.names:
+                inside = f"{node.module}.{alias.name}"
+                found.add(inside if inside in modules else node.module)
+    return (found & modules) - {module_name(path)}
+
+
+def import_graph() -> dict[str, set[str]]:
+    """The project's modules, each with those that it imports."""
+    files = {module_name(path): path for path in sources()}
+    modules = frozenset(files)
+    return {name: imported_modules(path, modules) for name, path in files.items()}
+
+
+def cycles(graph: dict[str, set[str]]) -> list[str]:
+    """A shortest way round through each group of modules that need each other."""
+    found: dict[frozenset[str], str] = {}
+    for start in sorted(graph):
+        ways = deque([[start]])
+        seen = set()
+        while ways:
+            way = ways.popleft()
+            if start in graph[way[-1]]:
+                found.setdefault(frozenset(way), " -> ".join([*way, start]))
+                break
+            following = sorted(graph[way[-1]] - seen)
+            seen |= set(following)
+            ways.extend([*way, name] for name in following)
+    return list(found.values())
+
+
+def test_cycles_are_found() -> None:
+    graph = {"a": {"b"}, "b": {"c", "d"}, "c": {"a"}, "d": {"e"}, "e": {"d"}, "f": {"a"}}
+    assert cycles(graph) == ["a -> b -> c -> a", "d -> e -> d"]
+
+
+def test_no_module_needs_one_that_needs_it() -> None:
+    assert "\n".join(cycles(import_graph())) == ""
+
+
+def test_imports_inside_functions_and_for_types_count() -> None:
+    graph = import_graph()
+    assert "commands.train_request" in graph["commands.train_agent"]  # inside a function
+    assert "pipeline.training" in graph["commands.run_output"]  # under TYPE_CHECKING
+    assert "commands.train_agent" in graph["train"]
+
+
+def test_no_two_modules_have_the_same_file_name() -> None:
+    places = defaultdict(list)
+    for path in sources():
+        places[path.stem].append(module_name(path))
+    del places["__init__"]
+    shared = [f"{name}: {', '.join(where)}" for name, where in places.items() if len(where) > 1]
+    assert "\n".join(shared) == ""
+
+
+def test_no_module_has_the_name_of_one_of_pythons_own() -> None:
+    parts = {part for path in sources() for part in module_name(path).split(".")}
+    assert parts & sys.stdlib_module_names == set()
+
+
+def test_only_commands_parse_arguments() -> None:
+    users = [module_name(path) for path in sources() if "argparse" in imported_names(path)]
+    assert users
+    assert [name for name in users if not name.startswith("commands.")] == []
 
 
 def test_constraints_pin_a_version_inside_each_declared_range() -> None:

@@ -9,13 +9,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import stats
 
-Floats = NDArray[np.float64]
-Counts = NDArray[np.int64]
+from verdicts.score_arrays import Counts, Floats
 
-# The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would be unsteady.
+# The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would vary too much.
 N_RESAMPLES = 10_000
 # Those over many seeds lie further in, and need fewer.
 ENOUGH_RESAMPLES = 1_000

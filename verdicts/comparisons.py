@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from verdicts.bootstrap import N_RESAMPLES, Floats
+from verdicts.bootstrap import N_RESAMPLES
 from verdicts.estimates import Estimate
 from verdicts.improvement import probability_of_improvement
 from verdicts.paired import (
@@ -21,6 +21,7 @@ from verdicts.paired import (
     paired_test,
 )
 from verdicts.power import seeds_for_equivalence, seeds_needed
+from verdicts.score_arrays import Floats
 
 Verdict = Literal["better", "worse", "equivalent", "undecided"]
 

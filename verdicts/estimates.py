@@ -11,13 +11,13 @@ from numpy.typing import ArrayLike
 
 from verdicts.bootstrap import (
     N_RESAMPLES,
-    Floats,
     as_columns,
     enough_resamples,
     interval_tail,
     percentile_interval,
     resample_counts,
 )
+from verdicts.score_arrays import Floats
 
 Statistic = Literal["mean", "median", "iqm"]
 

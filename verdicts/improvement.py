@@ -8,8 +8,6 @@ from scipy import stats
 
 from verdicts.bootstrap import (
     N_RESAMPLES,
-    Counts,
-    Floats,
     as_columns,
     check_confidence,
     interval_tail,
@@ -18,8 +16,9 @@ from verdicts.bootstrap import (
 )
 from verdicts.estimates import Estimate
 from verdicts.paired import SAME, differences, same_shape
+from verdicts.score_arrays import Counts, Floats
 
-# From here on the bootstrap and the normal interval are the same to the eye.
+# From here on the bootstrap and the normal interval look the same.
 MANY_SEEDS = 200
 
 

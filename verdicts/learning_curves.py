@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from verdicts.bootstrap import Floats, check_confidence
+from verdicts.bootstrap import check_confidence
 from verdicts.estimates import Estimate, Statistic, estimate
+from verdicts.score_arrays import Floats
 
 # As many points as a figure can show.
 _MOST_POINTS = 500

@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from verdicts.bootstrap import Floats, check_confidence
+from verdicts.bootstrap import check_confidence
 from verdicts.estimates import Estimate
+from verdicts.score_arrays import Floats
 
 # Exact returns of two policies that are equally good can differ in their last bits.
 SAME = 1e-12

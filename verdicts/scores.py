@@ -6,9 +6,9 @@ The same scale as `pipeline.evaluation.sampled.Yardstick`, for arrays.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from verdicts.score_arrays import Floats
 
 
 def gap_to_optimum(returns: ArrayLike, optimum: float) -> Floats:

@@ -14,26 +14,32 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from agents.bandits.base import BanditAlgorithm
-from agents.bandits.linear import LinearBanditAgent
-from agents.bandits.linear_rules import Regressions
-from agents.bandits.results import BatchResult
-from agents.bandits.rewards import check_kinds
-from agents.bandits.rollout import Moments, Pending, Pulls, Scratch, run_regressions, run_tables
+from agents.bandits.batch_result import BatchResult
+from agents.bandits.linear_agent import Regressions
+from agents.bandits.linear_bandits import LinearBanditAgent
+from agents.bandits.reward_checks import check_kinds
+from agents.bandits.score_agent import ScoreTables
 from agents.bandits.table_bandit import TableBandit
-from agents.bandits.tables import Tables
 from agents.bandits.thompson import Thompson
-from agents.bandits.worlds import NotBatchable, World, check_world, world_of
-from agents.common.schedules import ScheduleRow, schedule_row
+from agents.common.schedules import schedule_row
+from agents.compiled.bandit_model import (
+    BANDIT_ENV,
+    BanditModel,
+    PullRecord,
+    bandit_model,
+    check_bandit,
+)
+from agents.compiled.compile_envs import NotCompilable
+from agents.compiled.engine_choice import check_class
+from agents.compiled.env_state import COMPENSATED_SUM
+from agents.compiled.generators import handles_of
+from agents.compiled.loop import learn_from_last_step, run_block
+from agents.compiled.training_records import EPISODE
 from agents.registry import load_algorithm
 from envs.known_models import time_limit
+from mdp.array_types import Ints
 
 DEFAULT_MOMENTS = (10, 100, 1000)
-
-# Where the agents are defined whose rules are compiled; a subclass may change anything.
-_KNOWN_MODULES = tuple(
-    f"agents.bandits.{name}" for name in ("bounds", "linear", "preferences", "thompson", "values")
-)
 
 
 def run_batch(
@@ -57,15 +63,16 @@ def run_batch(
         moments: after how many pulls Thompson sampling's posteriors are kept, beside the last.
 
     Raises:
-        NotBatchable: saying why, where there is no compiled copy; `run_one_by_one` does it then.
+        NotCompilable: saying why, where there is no compiled copy; `run_one_by_one` does it then.
         ValueError: if an argument does not fit.
     """
     cls = load_algorithm(algorithm) if isinstance(algorithm, str) else algorithm
-    if not issubclass(cls, BanditAlgorithm) or cls.__module__ not in _KNOWN_MODULES:
-        raise NotBatchable(f"{cls.__name__} may act and learn in its own way")
+    if not issubclass(cls, TableBandit | LinearBanditAgent):
+        raise NotCompilable(f"{cls.__name__} acts and learns in Python")
+    check_class(cls)
     env = gym.make(env_id, **(env_kwargs or {}))
     try:
-        check_world(env)
+        check_bandit(env)
         agent: Any = cls(env=env, **(kwargs or {}))
         check_kinds(agent, agent.env)
         runs = Runs(agent, env, np.array(list(seeds), dtype=np.int64), pulls, moments)
@@ -84,24 +91,12 @@ def checked_pulls(env: gym.Env[Any, Any], pulls: int | None) -> int:
     """
     limit = time_limit(env)
     if limit is None:
-        raise NotBatchable("an episode never ends")
+        raise NotCompilable("an episode never ends")
     if pulls is None:
         return limit
     if not 1 <= pulls <= limit:
         raise ValueError(f"pulls must lie between 1 and {limit}, an episode, not {pulls}")
     return pulls
-
-
-def compiled_schedule(schedule: Any) -> ScheduleRow:
-    """The schedule as compiled code reads it.
-
-    Raises:
-        NotBatchable: if it is a Python function.
-    """
-    row = schedule_row(schedule)
-    if row is None:
-        raise NotBatchable("a schedule is a Python function")
-    return row
 
 
 def run_moments(moments: Sequence[int], n_pulls: int) -> tuple[int, ...]:
@@ -124,97 +119,86 @@ class Runs:
         self,
         agent: Any,
         env: gym.Env[Any, Any],
-        seeds: np.ndarray[Any, np.dtype[np.int64]],
+        seeds: Ints,
         pulls: int | None,
         moments: Sequence[int],
     ) -> None:
         self.agent, self.env, self.seeds = agent, env, seeds
         self.n_pulls = checked_pulls(env, pulls)
-        self.exploration = compiled_schedule(agent.exploration_schedule)
-        self.learning_rate = compiled_schedule(agent.lr_schedule)
-        self.settings = agent.settings
+        self.moments = run_moments(moments, self.n_pulls) if isinstance(agent, Thompson) else ()
+        bandit: Any = env.unwrapped
+        self.capacity = min(bandit.batch_size, self.n_pulls)
         shape = (len(seeds), self.n_pulls)
-        self.pulls = Pulls(
-            np.empty(shape, np.int16),
-            np.empty(shape, np.float32),
-            np.empty(shape),
-            np.empty(shape, np.int32),
-        )
+        self.arms = np.empty(shape, np.int16)
+        self.rewards = np.empty(shape, np.float32)
+        self.regrets = np.empty(shape)
+        self.contexts = np.empty(shape, np.int32)
         self.known = {
             name: np.repeat(value.numpy()[None], len(seeds), axis=0)
             for name, value in agent.policy.state_dict().items()
         }
-        self.moments = run_moments(moments, self.n_pulls)
-        self._make_room()
+        self.kept = {
+            name: np.empty((len(seeds), len(self.moments), *array.shape[1:]), array.dtype)
+            for name, array in self.known.items()
+        }
+        self.start = self._start_of_training()
 
-    def _make_room(self) -> None:
-        n_arms, bandit = self.agent.n_arms, self.env.unwrapped
-        n_features = getattr(bandit, "n_features", 0) or bandit.n_contexts  # type: ignore[attr-defined]
-        size = min(bandit.batch_size, self.n_pulls)  # type: ignore[attr-defined]
-        self.pending = Pending(
-            np.empty(size, np.int64),
-            np.empty((size, n_features)),
-            np.empty(size, np.int64),
-            np.empty(size),
-            np.empty(size),
-        )
-        self.scratch = Scratch(
-            np.empty(n_arms), np.empty(n_arms), np.empty(2), np.empty(n_features)
-        )
-        kept = isinstance(self.agent, Thompson)
-        shape = (len(self.seeds), len(self.moments) if kept else 0, 0, n_arms)
-        if isinstance(self.agent, TableBandit):
-            shape = (*shape[:2], len(self.agent.policy.scores), n_arms)
-        self.kept = Tables(np.empty(0), np.empty(shape), np.empty(shape, np.int64))
+    def _start_of_training(self) -> np.ndarray[Any, np.dtype[np.void]]:
+        """How far a training is at its first pull.
+
+        Raises:
+            NotCompilable: if a schedule is a Python function.
+        """
+        progress = self.agent.progress()
+        progress["total_timesteps"], progress["remaining"] = self.n_pulls, 1.0
+        for name, schedule in (
+            ("exploration", self.agent.exploration_schedule),
+            ("learning_rate", self.agent.lr_schedule),
+        ):
+            row = schedule_row(schedule)
+            if row is None:
+                raise NotCompilable("a schedule is a Python function")
+            progress[f"{name}_schedule"] = row
+        return np.asarray(progress)
 
     def run(self, index: int) -> None:
-        """One run."""
+        """One run, in blocks that end at the moments."""
         seed = int(self.seeds[index])
         self.env.reset(seed=seed)
-        world = world_of(self.env)
         self.agent.env = None
         self.agent.set_random_seed(seed)
-        rngs = self.env.unwrapped.np_random, self.agent.rng
-        pulls = Pulls(*(each[index] for each in self.pulls))
-        if isinstance(self.agent, LinearBanditAgent):
-            run_regressions(
-                world,
-                self.settings,
-                Regressions(**{name: each[index] for name, each in self.known.items()}),
-                self.exploration,
-                *rngs,
-                pulls,
-                self.pending,
-                self.scratch,
-            )
-        else:
-            self._run_tables(index, world, rngs, pulls)
-
-    def _run_tables(
-        self,
-        index: int,
-        world: World,
-        rngs: tuple[np.random.Generator, np.random.Generator],
-        pulls: Pulls,
-    ) -> None:
-        kept = self.kept.sums[index], self.kept.counts[index]
-        moments = np.array(self.moments[: len(kept[0])], dtype=np.int64)
-        run_tables(
-            world,
-            self.settings,
-            Tables(**{name: each[index] for name, each in self.known.items()}),
-            self.agent.ignore_context,
-            self.exploration,
-            self.learning_rate,
-            *rngs,
-            pulls,
-            self.pending,
-            Moments(moments, *kept),
-            self.scratch,
+        model = bandit_model(self.env)
+        handles = handles_of([self.env.unwrapped.np_random])
+        agent = self._compiled_agent(index, model)
+        record = PullRecord(
+            np.zeros(1, dtype=EPISODE),
+            self.arms[index],
+            self.rewards[index],
+            self.regrets[index],
+            self.contexts[index],
         )
+        envs, progress = np.zeros(1, dtype=BANDIT_ENV), self.start.copy()
+        envs["obs"] = model.row
+        done = 0
+        for moment, end in enumerate(self.moments or (self.n_pulls,)):
+            arguments = model, agent, envs, handles, progress[0], record, end - done, 2
+            run_block(*arguments, COMPENSATED_SUM)
+            learn_from_last_step(agent, envs, progress[0])
+            done = end
+            for name, array in self.kept.items():
+                if self.moments:
+                    array[index, moment] = self.known[name][index]
+
+    def _compiled_agent(self, index: int, model: BanditModel) -> Any:
+        known = {name: each[index] for name, each in self.known.items()}
+        rng = self.agent.rng
+        if isinstance(self.agent, LinearBanditAgent):
+            models = Regressions(**known)
+            return self.agent.compiled_agent(rng, models, self.capacity, model.vector)
+        return self.agent.compiled_agent(rng, ScoreTables(**known), self.capacity)
 
     def result(self) -> BatchResult:
-        """What all runs came to."""
+        """What came of all runs."""
         n_contexts = self.env.unwrapped.n_contexts  # type: ignore[attr-defined]
         estimates = coefficients = posteriors = None
         if isinstance(self.agent, LinearBanditAgent):
@@ -222,17 +206,17 @@ class Runs:
             if n_contexts > 0:
                 estimates = coefficients.transpose(0, 2, 1)
         else:
-            estimates = self.agent.estimates(Tables(**self.known))
+            estimates = self.agent.estimates(ScoreTables(**self.known))
         if isinstance(self.agent, Thompson):
-            posteriors = self.agent.posterior(self.kept)
+            posteriors = self.agent.posterior(ScoreTables(**self.kept))
         return BatchResult(
             self.seeds,
-            self.pulls.arms,
-            self.pulls.rewards,
-            self.pulls.regrets,
-            self.pulls.contexts if n_contexts > 1 else None,
+            self.arms,
+            self.rewards,
+            self.regrets,
+            self.contexts if n_contexts > 1 else None,
             estimates,
             coefficients,
-            self.moments if posteriors is not None else (),
+            self.moments,
             posteriors,
         )

@@ -11,9 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import Monitor
 
 from agents.bandits.batch import checked_pulls
-from agents.bandits.linear import LinearBanditAgent
+from agents.bandits.batch_result import BatchResult
+from agents.bandits.linear_bandits import LinearBanditAgent
 from agents.bandits.pull_log import PullLog
-from agents.bandits.results import BatchResult
 from agents.bandits.table_bandit import TableBandit
 from agents.registry import load_algorithm
 

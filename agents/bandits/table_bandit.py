@@ -10,12 +10,31 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.bandits.arguments import CommonArguments, check_space
-from agents.bandits.base import BanditAlgorithm, Pull
-from agents.bandits.policy import BanditPolicy
-from agents.bandits.steps import choose_arms, learn_from
-from agents.bandits.tables import Settings, Tables
-from agents.common.exploration import EPSILON_GREEDY
+from agents.bandits.bandit_algorithm import BanditAlgorithm, Pull
+from agents.bandits.score_agent import (
+    PULL,
+    Feedback,
+    ScoreAgent,
+    ScoreTables,
+    act_on_scores,
+    choose_arms,
+    learn_from_feedback,
+    learn_one,
+    no_probability,
+    nothing_before,
+)
+from agents.bandits.score_policy import BanditPolicy
+from agents.common.setting_checks import check_space
+from agents.common.signatures import LearningArguments
+from agents.compiled.generators import handles_of
+from agents.compiled.learning_algorithm import StepSize
+from mdp.array_types import Floats, Ints
+
+
+class TableArguments(LearningArguments, total=False):
+    """What the constructors of these agents take; see `TableBandit`."""
+
+    ignore_context: bool
 
 
 class TableBandit(BanditAlgorithm):
@@ -24,38 +43,39 @@ class TableBandit(BanditAlgorithm):
     Args:
         policy: ``"BanditPolicy"``.
         env: environment with `Discrete` observations, the contexts, or its id.
+        learning_rate: step size, for agents that have one.
         ignore_context: one row for all contexts: what a pooled A/B test does.
         kwargs: as in `BanditAlgorithm`.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"BanditPolicy": BanditPolicy}
     policy: BanditPolicy
+    parameters = {"ignore_context": np.bool_}  # noqa: RUF012
+
+    # What the training loops call; `choose_arm` and `learn_from_pull` are each algorithm's own.
+    act = act_on_scores
+    learn_from_step = learn_from_feedback
+    choice_probability = no_probability
+    before_counting = nothing_before
 
     def __init__(
         self,
         policy: str | type[BasePolicy] = "BanditPolicy",
         env: GymEnv | str | None = None,
+        learning_rate: StepSize = 0.0,
         ignore_context: bool = False,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Unpack[LearningArguments],
     ) -> None:
         self.ignore_context = ignore_context
-        super().__init__(policy, env, **kwargs)
+        super().__init__(policy, env, learning_rate, **kwargs)
 
     @property
     def initial_score(self) -> float:
         """Score of every arm at the start."""
         return 0.0
 
-    @property
-    def settings(self) -> Settings:
-        """What the compiled rules need to know of the agent."""
-        return Settings(self.rule, EPSILON_GREEDY, False, self.tie_scale, self._parameters())
-
-    def _parameters(self) -> tuple[float, float, float]:
-        """The numbers that the agent's rule takes."""
-        return 0.0, 0.0, 0.0
-
     def _check_arguments(self) -> None:
+        super()._check_arguments()
         check_space(self, "observations", self.observation_space)
 
     def _make_policy(self) -> BanditPolicy:
@@ -70,19 +90,37 @@ class TableBandit(BanditAlgorithm):
         )
         return made
 
-    def _contexts(self, obs: NDArray[Any]) -> NDArray[np.int64]:
+    def compiled_agent(
+        self, rng: np.random.Generator, tables: ScoreTables | None = None, capacity: int = 1
+    ) -> ScoreAgent:
+        """The agent as compiled functions see it.
+
+        Args:
+            rng: its generator.
+            tables: what it knows; by default what its policy holds.
+            capacity: pulls that may wait for their feedback.
+        """
+        return ScoreAgent(
+            self.settings()[0],
+            tables or self.policy.tables,
+            Feedback(np.zeros(capacity, dtype=PULL), np.zeros(1, dtype=np.int64)),
+            np.empty(self.n_arms),
+            np.empty(2),
+            handles_of([rng])[0],
+        )
+
+    def _contexts(self, obs: NDArray[Any]) -> Ints:
         rows = obs.astype(np.int64).reshape(-1)
         return np.zeros_like(rows) if self.ignore_context else rows
 
-    def _choose(
-        self, contexts: NDArray[np.int64], rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        return choose_arms(self.settings, self.policy.tables, contexts, self.exploration_rate, rng)
+    def _choose(self, contexts: Ints, rng: np.random.Generator) -> tuple[Ints, Floats]:
+        arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
+        choose_arms(self._agent(rng), contexts, self.progress()[0], arms, probabilities)
+        return arms, probabilities
 
     def _learn(self, pull: Pull) -> None:
-        rate = self.lr_schedule(self._current_progress_remaining)
-        learn_from(self.settings, self.policy.tables, *pull, rate)
+        learn_one(self._agent(self.rng), np.array([tuple(pull)], dtype=PULL)[0], self.progress()[0])
 
-    def estimates(self, tables: Tables) -> NDArray[np.float64]:
+    def estimates(self, tables: ScoreTables) -> Floats:
         """What the agent takes the arms' mean rewards for, shapes (..., contexts, arms)."""
         return tables.scores

@@ -2,24 +2,62 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.bandits import rewards
-from agents.bandits.arguments import (
-    TableArguments,
+from agents.bandits import reward_checks
+from agents.bandits.score_agent import ScoreAgent, ScoreTables
+from agents.bandits.table_bandit import TableArguments, TableBandit
+from agents.common.exploration import greedy_action
+from agents.common.setting_checks import (
     check_above_zero,
     check_finite,
     check_option,
+    settings_of,
 )
-from agents.bandits.table_bandit import TableBandit
-from agents.bandits.tables import BETA_THOMPSON, GAUSSIAN_THOMPSON, Settings, Tables
+from agents.compiled.generators import generator_of
+from mdp.array_types import Floats
+from mdp.machine_code import inlined
 
 Likelihood = Literal["bernoulli", "gaussian"]
+
+
+@inlined
+def sample_posteriors(agent: ScoreAgent, row: int, progress: Any) -> int:
+    """The arm whose draw from the posterior of its mean is the highest."""
+    settings, tables, rng = agent.settings, agent.tables, generator_of(agent.rng)
+    for arm in range(len(agent.arms)):
+        count = tables.counts[row, arm]
+        if settings.is_gaussian:
+            precision = settings.prior_precision + count * settings.reward_precision
+            deviation = 1.0 / math.sqrt(precision)
+            agent.arms[arm] = tables.scores[row, arm] + deviation * rng.standard_normal()
+        else:
+            successes = tables.sums[row, arm]
+            agent.arms[arm] = rng.beta(
+                settings.prior_successes + successes, settings.prior_failures + count - successes
+            )
+    return greedy_action(agent.arms, 0.0)
+
+
+@inlined
+def update_mean(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """The score is the mean of the posterior."""
+    settings, tables = agent.settings, agent.tables
+    total, count = tables.sums[pull.row, pull.arm], tables.counts[pull.row, pull.arm]
+    if settings.is_gaussian:
+        weighted = (
+            settings.prior_precision * settings.prior_mean + settings.reward_precision * total
+        )
+        precision = settings.prior_precision + settings.reward_precision * count
+        tables.scores[pull.row, pull.arm] = weighted / precision
+    else:
+        prior = settings.prior_successes + settings.prior_failures
+        tables.scores[pull.row, pull.arm] = (settings.prior_successes + total) / (prior + count)
 
 
 class Thompson(TableBandit):
@@ -38,7 +76,16 @@ class Thompson(TableBandit):
         kwargs: as in `TableBandit`.
     """
 
-    rule = BETA_THOMPSON
+    parameters = {  # noqa: RUF012
+        "is_gaussian": np.bool_,
+        "prior_successes": np.float64,
+        "prior_failures": np.float64,
+        "prior_mean": np.float64,
+        "prior_precision": np.float64,
+        "reward_precision": np.float64,
+    }
+    choose_arm = sample_posteriors
+    learn_from_pull = update_mean
 
     def __init__(
         self,
@@ -68,7 +115,7 @@ class Thompson(TableBandit):
     @property
     def rewards_known(self) -> str:
         """Those of a coin, unless they have normal noise."""
-        return rewards.ANY if self.is_gaussian else rewards.BINARY
+        return reward_checks.ANY if self.is_gaussian else reward_checks.BINARY
 
     @property
     def initial_score(self) -> float:
@@ -78,26 +125,23 @@ class Thompson(TableBandit):
         return self.prior_successes / (self.prior_successes + self.prior_failures)
 
     @property
-    def settings(self) -> Settings:
-        """With the rule of the likelihood."""
-        settings = super().settings
-        return settings._replace(rule=GAUSSIAN_THOMPSON) if self.is_gaussian else settings
+    def prior_precision(self) -> float:
+        """One over the variance of the normal prior."""
+        return self.prior_std**-2
+
+    @property
+    def reward_precision(self) -> float:
+        """One over the variance of the noise."""
+        return self.reward_std**-2
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_option("likelihood", self.likelihood, Likelihood)
-        check_finite([("prior_mean", self.prior_mean)])
-        check_above_zero(
-            (name, getattr(self, name))
-            for name in ("prior_successes", "prior_failures", "prior_std", "reward_std")
-        )
+        check_finite(settings_of(self, "prior_mean"))
+        names = ("prior_successes", "prior_failures", "prior_std", "reward_std")
+        check_above_zero(settings_of(self, *names))
 
-    def _parameters(self) -> tuple[float, float, float]:
-        if self.is_gaussian:
-            return self.prior_mean, self.prior_std**-2, self.reward_std**-2
-        return self.prior_successes, self.prior_failures, 0.0
-
-    def posterior(self, tables: Tables) -> NDArray[np.float64]:
+    def posterior(self, tables: ScoreTables) -> Floats:
         """What the agent believes of each arm's mean reward.
 
         Args:
@@ -107,9 +151,10 @@ class Thompson(TableBandit):
             The Beta distribution's two parameters, or mean and standard deviation of the normal
             one, shape (..., 2).
         """
-        first, second, third = self._parameters()
         sums, counts = tables.sums, tables.counts
         if not self.is_gaussian:
-            return np.stack([first + sums, second + counts - sums], axis=-1)
-        precision: Any = second + third * counts
-        return np.stack([(second * first + third * sums) / precision, precision**-0.5], axis=-1)
+            failures = self.prior_failures + counts - sums
+            return np.stack([self.prior_successes + sums, failures], axis=-1)
+        precision: Any = self.prior_precision + self.reward_precision * counts
+        weighted = self.prior_precision * self.prior_mean + self.reward_precision * sums
+        return np.stack([weighted / precision, precision**-0.5], axis=-1)

@@ -7,18 +7,23 @@ actions and what it learns from them.
 
 from __future__ import annotations
 
+import inspect
 from abc import abstractmethod
 from copy import deepcopy
 from dataclasses import dataclass
-from typing import Any, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 import numpy as np
+import torch as th
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from agents.common.model_files import JsonAlgorithm
+from agents.common.signatures import full_signature
 
 
 @dataclass(slots=True)
@@ -45,12 +50,60 @@ class Transitions:
 class OnlineAlgorithm(JsonAlgorithm):
     """Acts and learns one step at a time, with generators of its own.
 
-    Subclasses define `_setup_model`, which ends in a call of ``set_random_seed``, and
-    `_choose_actions`, and override `_learn_from` where they learn.
+    Subclasses define `_setup_model`, which calls ``set_random_seed``, and `_choose_actions`, and
+    override `_learn_from` where they learn.
+
+    Args:
+        policy: name of the policy.
+        env: environment, or its id.
+        learning_rate: step size, constant or scheduled.
+        policy_kwargs: further arguments of the policy.
+        stats_window_size: episodes over which logged statistics are averaged.
+        tensorboard_log: folder for TensorBoard, or None.
+        verbose: 0 silent, 1 information.
+        seed: seeds the agent's generators, its action space and its environments.
+        device: not used, as tables live on the CPU.
+        supported_action_spaces: classes of the spaces that the agent can act in; None for all.
     """
+
+    __signature__: ClassVar[inspect.Signature]
 
     rng: np.random.Generator
     predict_rng: np.random.Generator
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.__signature__ = full_signature(cls)
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        learning_rate: float | Schedule = 0.0,
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "cpu",
+        supported_action_spaces: tuple[type[spaces.Space[Any]], ...] | None = None,
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device="cpu",
+            support_multi_env=True,
+            seed=seed,
+            supported_action_spaces=supported_action_spaces,
+        )
+        if _init_setup_model:
+            self._setup_model()
 
     @abstractmethod
     def _choose_actions(self) -> NDArray[Any]:

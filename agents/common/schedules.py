@@ -8,6 +8,7 @@ evaluate them; `schedule_value` does so, and is the only place where the arithme
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
@@ -17,19 +18,34 @@ from mdp.machine_code import inlined
 LINEAR = 0.0
 EXPONENTIAL = 1.0
 
-ScheduleRow = tuple[float, float, float, float]
+
+class ScheduleRow(NamedTuple):
+    """A schedule as four numbers, which a record of compiled code holds as well.
+
+    Attributes:
+        kind: `LINEAR` or `EXPONENTIAL`.
+        start: the value at the first step.
+        end: the value from ``end_fraction`` on.
+        end_fraction: the share of training after which the value is ``end``.
+    """
+
+    kind: float
+    start: float
+    end: float
+    end_fraction: float
 
 
 @inlined
-def schedule_value(row: ScheduleRow, progress_remaining: float) -> float:
-    """Value of the schedule ``row`` = (kind, start, end, end_fraction)."""
-    kind, start, end, end_fraction = row
+def schedule_value(schedule: ScheduleRow, progress_remaining: float) -> float:
+    """Value of a schedule, where ``progress_remaining`` falls from 1 to 0."""
     elapsed = 1.0 - progress_remaining
-    if elapsed > end_fraction:
-        return end
-    if kind == LINEAR:
-        return start + elapsed * (end - start) / end_fraction
-    return start * math.exp(math.log(end / start) * elapsed / end_fraction)
+    if elapsed > schedule.end_fraction:
+        return schedule.end
+    if schedule.kind == LINEAR:
+        change = elapsed * (schedule.end - schedule.start)
+        return schedule.start + change / schedule.end_fraction
+    rate = math.log(schedule.end / schedule.start)
+    return schedule.start * math.exp(rate * elapsed / schedule.end_fraction)
 
 
 class ExponentialSchedule:
@@ -84,11 +100,13 @@ def epsilon_schedule(decay: str, start: float, end: float, end_fraction: float) 
 
 
 def _row(kind: float, schedule: ExponentialSchedule | LinearSchedule) -> ScheduleRow:
-    return kind, float(schedule.start), float(schedule.end), float(schedule.end_fraction)
+    return ScheduleRow(
+        kind, float(schedule.start), float(schedule.end), float(schedule.end_fraction)
+    )
 
 
 def schedule_row(schedule: float | Schedule) -> ScheduleRow | None:
-    """The schedule as (kind, start, end, end_fraction); None for a foreign function."""
+    """The schedule as four numbers; None for a foreign function."""
     if isinstance(schedule, FloatSchedule):
         return schedule_row(schedule.value_schedule)
     if isinstance(schedule, ConstantSchedule):
@@ -98,5 +116,5 @@ def schedule_row(schedule: float | Schedule) -> ScheduleRow | None:
     if isinstance(schedule, ExponentialSchedule):
         return _row(EXPONENTIAL, schedule)
     if isinstance(schedule, int | float):
-        return LINEAR, float(schedule), float(schedule), 1.0
+        return ScheduleRow(LINEAR, float(schedule), float(schedule), 1.0)
     return None

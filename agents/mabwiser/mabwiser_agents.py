@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Unpack
 
 import numpy as np
 from gymnasium import spaces
@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.bandits import rewards
-from agents.bandits.arguments import TieBreaking, check_at_least, check_share, check_space
-from agents.bandits.base import BanditAlgorithm, Pull
-from agents.bandits.policy import features
+from agents.bandits import reward_checks
+from agents.bandits.bandit_algorithm import BanditAlgorithm, Pull
+from agents.bandits.linear_policy import features
+from agents.common.setting_checks import check_at_least, check_share, check_space, settings_of
+from agents.common.signatures import CommonArguments, LearningArguments, TieBreaking
 from agents.mabwiser.mabwiser_policy import MABWiserPolicy
 
 SUMS = ("arm_to_sum", "arm_to_count", "arm_to_expectation")
@@ -39,7 +40,7 @@ class MABWiserAgent(BanditAlgorithm):
         policy: str | type[BasePolicy] = "MABWiserPolicy",
         env: GymEnv | str | None = None,
         tie_breaking: TieBreaking = "first",
-        **kwargs: Any,
+        **kwargs: Unpack[CommonArguments],
     ) -> None:
         super().__init__(policy, env, tie_breaking=tie_breaking, **kwargs)
 
@@ -48,6 +49,7 @@ class MABWiserAgent(BanditAlgorithm):
         """The library's learning policy."""
 
     def _check_arguments(self) -> None:
+        super()._check_arguments()
         if self.tie_breaking != "first":
             raise ValueError("tie_breaking must be first: MABWiser takes the first of equal arms")
         self._check_observations()
@@ -98,14 +100,14 @@ class MABWiserEpsilonGreedy(MABWiserAgent):
         policy: str | type[BasePolicy] = "MABWiserPolicy",
         env: GymEnv | str | None = None,
         exploration_initial_eps: float = 0.1,
-        **kwargs: Any,
+        **kwargs: Unpack[LearningArguments],
     ) -> None:
         self.exploration_initial_eps = exploration_initial_eps
         super().__init__(policy, env, **kwargs)
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_share([("exploration_initial_eps", self.exploration_initial_eps)])
+        check_share(settings_of(self, "exploration_initial_eps"))
 
     def _learning_policy(self) -> Any:
         from mabwiser.mab import LearningPolicy
@@ -130,14 +132,14 @@ class MABWiserUCB1(MABWiserAgent):
         policy: str | type[BasePolicy] = "MABWiserPolicy",
         env: GymEnv | str | None = None,
         c: float = 1.0,
-        **kwargs: Any,
+        **kwargs: Unpack[LearningArguments],
     ) -> None:
         self.c = c
         super().__init__(policy, env, **kwargs)
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_at_least(0, [("c", self.c)])
+        check_at_least(0, settings_of(self, "c"))
 
     def _learning_policy(self) -> Any:
         from mabwiser.mab import LearningPolicy
@@ -161,7 +163,7 @@ class MABWiserThompson(MABWiserAgent):
     @property
     def rewards_known(self) -> str:
         """Others would make its Beta distributions wrong without a word."""
-        return rewards.BINARY
+        return reward_checks.BINARY
 
     def _learning_policy(self) -> Any:
         from mabwiser.mab import LearningPolicy
@@ -186,14 +188,14 @@ class MABWiserLinUCB(MABWiserAgent):
         policy: str | type[BasePolicy] = "MABWiserPolicy",
         env: GymEnv | str | None = None,
         alpha: float = 1.0,
-        **kwargs: Any,
+        **kwargs: Unpack[LearningArguments],
     ) -> None:
         self.alpha = alpha
         super().__init__(policy, env, **kwargs)
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_at_least(0, [("alpha", self.alpha)])
+        check_at_least(0, settings_of(self, "alpha"))
 
     def _check_observations(self) -> None:
         space = self.observation_space

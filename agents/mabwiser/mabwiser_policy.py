@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
-from agents.bandits.policy import features
+from agents.bandits.linear_policy import features
 
 Floats = NDArray[np.float64]
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from envs.argument_checks import check_choice, check_whole_number
 from envs.bandit_rendering import Tally, render_chart, render_text
 from envs.rendering import ChartRenderer
+from mdp.array_types import Floats
 
 RENDER_MODES = ("ansi", "rgb_array", "human")
 MAX_PULLS = 10**9
@@ -127,7 +128,7 @@ class Bandit(gym.Env[Any, Any], ABC):
             self.render()
 
     @abstractmethod
-    def _true_means(self) -> NDArray[np.float64] | None:
+    def _true_means(self) -> Floats | None:
         """What each arm gives on average, one row for each of the tally's; None if not known."""
 
     @abstractmethod
@@ -173,7 +174,7 @@ class StochasticBandit(Bandit):
     def _pull(self, arm: int) -> float:
         """Draw the reward of an arm, and the next context."""
 
-    def _true_means(self) -> NDArray[np.float64] | None:
+    def _true_means(self) -> Floats | None:
         return np.array([self.expected_rewards()])
 
 

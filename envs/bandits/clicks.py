@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from envs import DEFAULT_PULLS
 from envs.argument_checks import check_numbers, check_table
 from envs.bandits.bandit import StochasticBandit
+from mdp.array_types import Floats
 from mdp.transition_model import TransitionModel
 
 # How far probabilities of segments may be from summing to one.
@@ -47,8 +47,8 @@ class ClickBandit(StochasticBandit):
 
     def __init__(
         self,
-        context_probabilities: NDArray[np.float64],
-        click_rates: NDArray[np.float64],
+        context_probabilities: Floats,
+        click_rates: Floats,
         *,
         pulls: int,
         batch_size: int = 1,
@@ -104,7 +104,7 @@ class ClickBandit(StochasticBandit):
             initial=self.context_probabilities,
         )
 
-    def _true_means(self) -> NDArray[np.float64]:
+    def _true_means(self) -> Floats:
         return self.means
 
     def _begin(self) -> None:

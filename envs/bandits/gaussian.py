@@ -1,4 +1,4 @@
-"""The ten-armed testbed and its kin."""
+"""The ten-armed testbed and variants of it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
 from envs import DEFAULT_PULLS
 from envs.argument_checks import check_number, check_numbers
 from envs.bandits.bandit import StochasticBandit, agreed_size
+from mdp.array_types import Floats
 
 
 class GaussianBandit(StochasticBandit):
@@ -91,7 +91,7 @@ class GaussianBandit(StochasticBandit):
         return self.given_means is None
 
     @property
-    def means(self) -> NDArray[np.float64]:
+    def means(self) -> Floats:
         """The means as they are now, shape (1, n_arms)."""
         return np.array([self._means])
 

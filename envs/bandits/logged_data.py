@@ -19,13 +19,11 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs.bandits.bandit import MAX_ARMS
+from mdp.array_types import Bools, Floats, Ints
 
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
 
 NUMBER = "a finite number"
-
-Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +44,7 @@ class LoggedData:
     source: str
     context_names: tuple[str, ...]
     contexts: Floats
-    arms: NDArray[np.int64]
+    arms: Ints
     rewards: Floats
     propensities: Floats | None
     categories: tuple[str, ...] | None = None
@@ -96,7 +94,7 @@ class LoggedData:
             raise ValueError(f"{self.source} has {self._described()}, the agent observes {space}")
         return self.contexts.astype(np.float32)
 
-    def _as_discrete(self, n_contexts: int) -> NDArray[np.int64]:
+    def _as_discrete(self, n_contexts: int) -> Ints:
         if n_contexts == 1 and not self.context_names:
             return np.zeros(len(self), np.int64)
         codes = self.contexts.astype(np.int64)
@@ -224,7 +222,7 @@ class _Table:
         return cls(path, list(lines), dict(zip(header, columns, strict=True)))
 
     def numbers(
-        self, name: str, wanted: str, valid: Callable[[Floats], Flags] = np.isfinite
+        self, name: str, wanted: str, valid: Callable[[Floats], Bools] = np.isfinite
     ) -> Floats:
         """A column as numbers, all of them finite and valid."""
         values = _as_floats(self.columns[name])

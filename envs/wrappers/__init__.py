@@ -4,9 +4,9 @@ The observation wrappers also map whole batches of observations (`map_observatio
 evaluation needs: it asks a policy for every state at once.
 """
 
+from envs.wrappers.changed_rewards import ScaleReward, TerminationReward
 from envs.wrappers.discretize import DiscretizeObservation
-from envs.wrappers.encodings import FlattenToDiscrete, OneHotObservation
-from envs.wrappers.rewards import ScaleReward, TerminationReward
+from envs.wrappers.observation_encodings import FlattenToDiscrete, OneHotObservation
 from envs.wrappers.time_limit import limit_by_pulls, limit_by_shortest_path
 
 __all__ = [

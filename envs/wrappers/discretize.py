@@ -13,7 +13,8 @@ from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import ArrayLike, NDArray
 
 from envs.argument_checks import check_whole_number
-from envs.wrappers.encodings import row_major
+from envs.wrappers.observation_encodings import row_major
+from mdp.array_types import Floats, Ints
 
 
 class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
@@ -69,7 +70,7 @@ class DiscretizeObservation(gym.ObservationWrapper[Any, Any, Any], RecordConstru
             index = index * bins + int(min(max(place, 0), bins - 1))
         return index
 
-    def map_observations(self, batch: NDArray[Any]) -> NDArray[np.int64]:
+    def map_observations(self, batch: NDArray[Any]) -> Ints:
         """The indices of many vectors of shape (n, dimensions), shape (n,)."""
         places = (batch[:, self.dims].astype(np.float64) - self.low) / (self.high - self.low)
         places = np.clip(np.floor(places * self.bins), 0, self.bins - 1).astype(np.int64)
@@ -98,7 +99,7 @@ def _chosen_dims(dims: Sequence[int] | None, n_dims: int) -> list[int]:
     return chosen
 
 
-def _per_dim(name: str, values: ArrayLike, dims: list[int]) -> NDArray[np.float64]:
+def _per_dim(name: str, values: ArrayLike, dims: list[int]) -> Floats:
     """One value for each of the dimensions that count."""
     try:
         return np.broadcast_to(np.asarray(values, np.float64), (len(dims),)).copy()

@@ -19,13 +19,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.off_policy.reward_models import CrossFit
+from mdp.array_types import Bools, Floats, Ints
 from verdicts import Estimate, paired_difference
-
-Floats = NDArray[np.float64]
-Arms = NDArray[np.int64]
 
 # By how many standard errors weights may miss their mean of 1 before the log is refused. Chance
 # does that only where next to none of what the policy does was logged.
@@ -55,7 +52,7 @@ class PolicyTerms:
 
 
 def evaluate_policy(
-    policy: Floats, arms: Arms, rewards: Floats, propensities: Floats, model: CrossFit
+    policy: Floats, arms: Ints, rewards: Floats, propensities: Floats, model: CrossFit
 ) -> PolicyTerms:
     """Judge a policy by all four estimators.
 
@@ -90,7 +87,7 @@ def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
     return paired_difference(terms, np.zeros_like(terms), confidence)
 
 
-def importance_weights(policy: Floats, arms: Arms, propensities: Floats) -> Floats:
+def importance_weights(policy: Floats, arms: Ints, propensities: Floats) -> Floats:
     """How much more often the policy makes each pull than the log did, shape (n,).
 
     Args:
@@ -126,7 +123,7 @@ def check_rewards(rewards: Floats, n_pulls: int) -> None:
     _refuse(~np.isfinite(rewards), "reward", rewards)
 
 
-def check_support(policy: Floats, arms: Arms, weights: Floats) -> None:
+def check_support(policy: Floats, arms: Ints, weights: Floats) -> None:
     """Refuse a log that does not show what the policy would do.
 
     Weights are expected to be 1 if the propensities are right and the log could choose every arm
@@ -210,7 +207,7 @@ def direct_method(policy: Floats, model: CrossFit) -> Floats:
 
 
 def doubly_robust(
-    policy: Floats, weights: Floats, arms: Arms, rewards: Floats, predicted: Floats
+    policy: Floats, weights: Floats, arms: Ints, rewards: Floats, predicted: Floats
 ) -> Floats:
     """The direct method, corrected by inverse propensities where the log shows the model to err.
 
@@ -240,7 +237,7 @@ def effective_sample_size(weights: Floats) -> float:
     return float(weights.sum()) ** 2 / squares if squares else 0.0
 
 
-def _refuse(wrong: NDArray[np.bool_], name: str, values: Floats) -> None:
+def _refuse(wrong: Bools, name: str, values: Floats) -> None:
     if wrong.any():
         place = int(np.flatnonzero(wrong)[0])
         wanted = {"reward": "finite", "propensity": "above 0 and at most 1"}.get(name, "1")

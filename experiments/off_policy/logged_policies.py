@@ -9,22 +9,26 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from commands.train_request import check_algorithm
 from envs.bandits import LoggedData, read_log
 from experiments.off_policy.estimators import PolicyTerms, check_rewards, evaluate_policy
 from experiments.off_policy.reward_models import CrossFit, cross_fit
+from mdp.array_types import Floats
+from pipeline.agent_checks import check_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import policy_matrix
-from pipeline.model_loading import check_model_file, hand_written_algorithm, load_model, run_of
-
-Floats = NDArray[np.float64]
+from pipeline.model_loading import (
+    check_model_file,
+    check_origin,
+    hand_written_algorithm,
+    load_model,
+    run_of,
+)
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
-_RUNS = Path("logs")
+_LOG_FOLDER = Path("logs")
 
 
 @dataclass(frozen=True)
@@ -104,20 +108,13 @@ def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
     zip_path = _final_model(path) if path.is_dir() else path
     check_model_file(zip_path)
     run = run_of(zip_path)
-    spec = {} if run is None else run.read_info().get("spec", {})
+    spec = {} if run is None else run.recorded_spec()
     hand_written = hand_written_algorithm(zip_path)
     algo = hand_written or spec.get("algo")
     if algo is None:
         raise UserError(f"{path} lies in no run folder: what agent it holds is not known")
-    if (
-        hand_written is None
-        and not trust
-        and not zip_path.resolve().is_relative_to(_RUNS.resolve())
-    ):
-        raise UserError(
-            f"{path} lies outside {_RUNS}, and loading a zip of a library agent can run code that "
-            "is hidden in it: add --trust if you know where it comes from"
-        )
+    if hand_written is None and not trust:
+        check_origin(zip_path, _LOG_FOLDER, given=path)
     settings = spec.get("hyperparams") or {}
     changed = next((key for key in _OBSERVATION_SETTINGS if settings.get(key)), None)
     if changed is not None:
@@ -158,8 +155,8 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
             rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, model)))
         except UserError as error:
             notes.append(str(error))
-    told = data.rewards
-    as_logged = PolicyTerms(told, told, told, told, effective=float(len(data)))
+    rewards = data.rewards
+    as_logged = PolicyTerms(rewards, rewards, rewards, rewards, effective=float(len(data)))
     if data.categories is not None:
         numbered = ", ".join(f"{i} {name}" for i, name in enumerate(data.categories))
         notes.append(f"{data.context_names[0]} was read as {numbered}")

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from mdp.array_types import Floats, Ints
 
 N_FOLDS = 5
 # The weight of the prior of each coefficient, in pulls.

@@ -18,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
-from agents.tabular.base import TabularAlgorithm
+from agents.tabular.tabular_algorithm import TabularAlgorithm
 from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
 from envs.layout import GridLayout, grid_layout
 from mdp import (
@@ -28,6 +28,7 @@ from mdp import (
     optimal_choices,
     policy_return,
 )
+from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec
@@ -52,7 +53,7 @@ class ExactEvaluator:
     model: TransitionModel
     observations: NDArray[Any]
     horizon: int
-    success: NDArray[np.bool_] | None
+    success: Bools | None
     yardstick: Yardstick
     layout: GridLayout | None = None
 
@@ -70,7 +71,7 @@ class ExactEvaluator:
         )
 
     @cached_property
-    def optimum(self) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def optimum(self) -> tuple[Floats, Bools]:
         """What each state is worth at best, shape (S,), and its optimal actions, shape (S, A)."""
         return optimal_choices(self.model, self.horizon)
 
@@ -107,7 +108,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
 
 def policy_matrix(
     agent: BaseAlgorithm, observations: NDArray[Any], deterministic: bool = True
-) -> NDArray[np.float64]:
+) -> Floats:
     """The agent's policy as probabilities of shape (S, A).
 
     Args:
@@ -132,7 +133,7 @@ def policy_matrix(
             distribution: Any = agent.policy.get_distribution(tensor).distribution
         return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
     if hasattr(agent, "exploration_rate"):
-        # DQN and its kin, QR-DQN too, which may not be installed and is no subclass of DQN.
+        # DQN and agents like it: QR-DQN too, which may not be installed and is no subclass of DQN.
         epsilon = float(agent.exploration_rate)
         greedy = policy_matrix(agent, observations)
         return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)

@@ -11,6 +11,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
+from mdp.array_types import Floats
+
 
 @dataclass(frozen=True)
 class Yardstick:
@@ -51,7 +53,7 @@ class Evaluation:
         yardstick: what to measure the return against, where it is known.
     """
 
-    returns: NDArray[np.float64]
+    returns: Floats
     lengths: NDArray[np.floating[Any] | np.integer[Any]]
     successes: NDArray[np.bool_ | np.floating[Any]] | None
     exact_std: float | None = None

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from envs.layout import GridLayout
 from mdp import state_values
+from mdp.array_types import Bools, Floats, Ints
 from mdp.graph import reachable_states
 from mdp.policies import actions_used
 from pipeline.evaluation.exact import ExactEvaluator
@@ -28,10 +28,6 @@ MAX_STATES = 2500
 # More than a slider can tell apart.
 MAX_MAPS = 400
 SECONDS_BETWEEN_WRITES = 1.0
-
-Floats = NDArray[np.float64]
-Actions = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,17 +48,17 @@ class ValueMap:
     """
 
     layout: GridLayout
-    matters: Mask
+    matters: Bools
     initial: Floats
     values: Floats
-    actions: Actions
-    visited: Mask
+    actions: Ints
+    visited: Bools
     optimal_values: Floats
-    optimal_actions: Mask
-    optimal_visited: Mask
+    optimal_actions: Bools
+    optimal_visited: Bools
 
     @property
-    def differs(self) -> Mask:
+    def differs(self) -> Bools:
         """The states where the agent's action is not among the optimal ones, bool (S,)."""
         chosen = self.optimal_actions[np.arange(len(self.actions)), self.actions]
         return self.matters & ~chosen
@@ -93,7 +89,7 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
     )
 
 
-def _deterministic_policy(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Actions | None:
+def _deterministic_policy(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
     """What the agent does at each step in each state, shape (1 or horizon, S)."""
     if evaluator.layout is None or evaluator.model.n_states > MAX_STATES:
         return None
@@ -117,7 +113,7 @@ class ValueMapRecorder:
     def __init__(self, path: Path, evaluator: ExactEvaluator) -> None:
         self.path = path
         self.evaluator = evaluator
-        self._maps: list[tuple[int, Floats, Actions]] = []
+        self._maps: list[tuple[int, Floats, Ints]] = []
         self._calls = 0
         self._stride = 1
         self._last_write = time.monotonic()

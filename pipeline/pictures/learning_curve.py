@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import Floats
 from pipeline.evaluation.sampled import Yardstick
 from pipeline.files import replacing
 from pipeline.run_folder import Run
@@ -25,7 +25,7 @@ MOVING_AVERAGE_EPISODES = 100
 MAX_POINTS = 5000
 
 
-def read_monitors(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def read_monitors(folder: Path) -> tuple[Floats, Floats]:
     """Training episodes of a run in the order in which they ended.
 
     Args:
@@ -51,7 +51,7 @@ def read_monitors(folder: Path) -> tuple[NDArray[np.float64], NDArray[np.float64
     return steps[order], returns[order]
 
 
-def moving_average(values: NDArray[np.float64], width: int) -> NDArray[np.float64]:
+def moving_average(values: Floats, width: int) -> Floats:
     """Mean of the last ``width`` values at each position, or of as many as there are."""
     sums = np.cumsum(np.insert(values, 0, 0.0))
     ends = np.arange(1, len(values) + 1)
@@ -59,7 +59,7 @@ def moving_average(values: NDArray[np.float64], width: int) -> NDArray[np.float6
     return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
 
-def _compress_outliers(axes: Axes, returns: NDArray[np.float64]) -> None:
+def _compress_outliers(axes: Axes, returns: Floats) -> None:
     """Use a symmetric logarithmic axis where early returns dwarf those at the end."""
     if not len(returns):
         return

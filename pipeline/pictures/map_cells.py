@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from envs.layout import GOAL, PRIZE, START, TRAP, WALL, GridLayout
 from envs.sprites import FLOOR, GREEN, INK, PALE_GREEN, PALE_RED, SHELF, WHITE, Colour
 from envs.sprites import ORANGE as AMBER
+from mdp.array_types import Bools, Floats, Ints
 from pipeline.evaluation.value_maps import ValueMap
 from pipeline.pictures.learning_curve import ORANGE
 
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap, Normalize
 
-Floats = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 BELOW: Colour = (222, 222, 222)
 BELOW_HATCH: Colour = (196, 196, 196)
@@ -51,13 +49,13 @@ class Policy:
 
     layout: GridLayout
     layer: int
-    matters: Mask
-    visited: Mask
-    differs: Mask
+    matters: Bools
+    visited: Bools
+    differs: Bools
     values: Floats
-    actions: Mask
+    actions: Bools
 
-    def places(self, chosen: Mask) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def places(self, chosen: Bools) -> tuple[Ints, Ints]:
         """Columns and rows of the chosen cells."""
         rows, columns = np.divmod(np.flatnonzero(chosen), self.layout.n_columns)
         return columns, rows
@@ -105,7 +103,7 @@ def draw_ground(axes: Axes, policy: Policy, scale: Normalize, colours: Colormap)
     )
 
 
-def is_below(values: Floats, scale: Normalize) -> Mask:
+def is_below(values: Floats, scale: Normalize) -> Bools:
     """Which values lie below the scale, and by more than rounding."""
     return np.asarray(scale(values) < -1e-9)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import Floats
 from pipeline.files import replacing
 from pipeline.pictures.learning_curve import BLUE, GREEN, MAX_POINTS, ORANGE, moving_average
 from pipeline.pull_recording import LAST_PULLS
@@ -56,6 +57,6 @@ def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> Non
         figure.savefig(draft, format="png")
 
 
-def _draw(axes: Axes, values: NDArray[np.float64], colour: str) -> None:
+def _draw(axes: Axes, values: Floats, colour: str) -> None:
     shown = np.unique(np.linspace(0, len(values) - 1, MAX_POINTS).round().astype(np.int64))
     axes.plot(shown + 1, values[shown], color=colour)

@@ -65,7 +65,7 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     _name_panels(pairs, found, layers)
     _explain(figure, found, scale, colours)
     figure.suptitle(title, x=0.01, ha="left")
-    # What stands inside the panels needs no room around them. Settled now, the layout is worked
+    # What stands inside the panels needs no room around them. Fixed now, the layout is worked
     # out once, and without asking hundreds of numbers for their size.
     engine = figure.get_layout_engine()
     assert engine is not None

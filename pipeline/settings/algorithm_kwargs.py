@@ -33,7 +33,7 @@ def build_algorithm_kwargs(
         algorithm: the agent's class.
         kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
         where: begins every error message.
-        extra_packages: packages that the user admits beside the usual ones.
+        extra_packages: packages that the user allows besides the usual ones.
 
     Raises:
         UserError: naming the argument, and what it must be.

@@ -30,6 +30,11 @@ _MODULE_ALIASES = {"nn": "torch.nn", "th": "torch", "sb3": "stable_baselines3", 
 _CLASS_ALIASES = {
     "RMSpropTFLike": "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
     "HerReplayBuffer": "stable_baselines3.her.her_replay_buffer.HerReplayBuffer",
+    # Where classes of ours were before: files that name them so are still read.
+    "envs.wrappers.encodings.FlattenToDiscrete": "envs.wrappers.FlattenToDiscrete",
+    "envs.wrappers.encodings.OneHotObservation": "envs.wrappers.OneHotObservation",
+    "envs.wrappers.rewards.ScaleReward": "envs.wrappers.ScaleReward",
+    "envs.wrappers.rewards.TerminationReward": "envs.wrappers.TerminationReward",
 }
 
 
@@ -42,7 +47,7 @@ def find_class(
         name: such as ``nn.Tanh`` or ``stable_baselines3.common.monitor.Monitor``.
         bases: it must be a subclass of one of these.
         where: begins every error message.
-        extra_packages: packages that the user admits beside the usual ones.
+        extra_packages: packages that the user allows besides the usual ones.
 
     Raises:
         UserError: if the name is not admitted, does not exist, or is no such class.

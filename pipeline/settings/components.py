@@ -60,7 +60,7 @@ def wrapper_factory(
 
     Args:
         spec: a dotted name, a mapping from it to arguments, a list of either, or None.
-        extra_packages: packages that the user admits beside the usual ones.
+        extra_packages: packages that the user allows besides the usual ones.
         where: begins every error message.
 
     Returns:
@@ -90,7 +90,7 @@ def callbacks(
 
     Args:
         spec: a dotted name, a mapping from it to arguments, a list of either, or None.
-        extra_packages: packages that the user admits beside the usual ones.
+        extra_packages: packages that the user allows besides the usual ones.
         save_path: given to callbacks that have a ``save_path`` and are not told another.
 
     Raises:
@@ -110,7 +110,7 @@ def build_value(
 
     Args:
         raw: a value as `pipeline.settings.hyperparams.check_algorithm_kwargs` leaves it.
-        extra_packages: packages that the user admits beside the usual ones.
+        extra_packages: packages that the user allows besides the usual ones.
         where: begins every error message.
 
     Raises:
@@ -164,7 +164,7 @@ def _components(
     Args:
         spec: in one of rl_zoo3's forms.
         base: what every class must derive from.
-        extra_packages: packages that the user admits.
+        extra_packages: packages that the user allows.
         where: begins every error message.
         n_inner: how many leading arguments a class is given when it is built.
         defaults: arguments for those classes that know them and are not told others.

@@ -68,7 +68,7 @@ def check_arguments(
 
     Args:
         kwargs: the arguments as they stand in a file or on the command line.
-        parameters: those that exist; ``**kwargs`` among them admits any name.
+        parameters: those that exist; with ``**kwargs`` among them any name is allowed.
         where: begins every error message.
         what: what an argument is called there.
         also_known: further names that a message may suggest.

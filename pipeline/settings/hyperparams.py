@@ -1,28 +1,20 @@
-"""Hyperparameters in rl_zoo3's format: read strictly, and never run.
+"""What an entry of hyperparameters says: checked strictly, and never run.
 
-One YAML file per algorithm maps environment ids to entries. An entry holds arguments of the
-algorithm's constructor, and the special keys that `Hyperparams` lists.
+An entry is in rl_zoo3's format, see `pipeline.settings.hyperparam_entries`. It holds arguments of
+the algorithm's constructor, and the special keys that `Hyperparams` lists.
 """
 
 from __future__ import annotations
 
 import inspect
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
-from pipeline.errors import UserError, did_you_mean, shown
+from pipeline.errors import UserError, shown
 from pipeline.settings.coercion import coerce
 from pipeline.settings.constructor_arguments import check_arguments, check_range
 from pipeline.settings.literals import contains_name
-from pipeline.settings.strict_yaml import read_yaml
-
-_FOLDER = Path(__file__).resolve().parents[2] / "hyperparams"
-_ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
-_TOP_LEVEL_KEY = re.compile(r"^([\w./-]+):", re.MULTILINE)
-_STAND_INS = ("default", "atari")
 
 # Constructor arguments that the command line sets, and how.
 _COMMAND_LINE = {
@@ -53,10 +45,6 @@ _KEYWORDS: Mapping[str, Mapping[str, Any]] = {
         "override_existing": bool,
     },
 }
-
-
-class NoEntryError(UserError):
-    """A file of hyperparameters says nothing about the environment."""
 
 
 @dataclass(frozen=True)
@@ -116,78 +104,12 @@ class Hyperparams:
 SPECIAL_KEYS = tuple(key.name for key in fields(Hyperparams) if key.name != "algorithm")
 
 
-def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> dict[str, Any]:
-    """Read the entry of an environment.
-
-    Args:
-        algo: the algorithm, whose file is ``hyperparams/<algo>.yml``.
-        env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts. The entry
-            ``atari`` stands in for Atari games without their own, ``default`` for all others.
-        path: another file to read.
-
-    Returns:
-        The entry as it stands there, see `split`.
-
-    Raises:
-        UserError: if the file cannot be read or is not of this format.
-        NoEntryError: if it has no entry that fits.
-    """
-    path = _path(algo, path)
-    if path.suffix == ".py":
-        raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
-    entries = read_yaml(path)
-    if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
-        raise UserError(f"{path}: must map environment ids to hyperparameters")
-    key = _find_entry(entries, env_id.partition(":")[2] or env_id)
-    if key is None:
-        hint = did_you_mean(env_id, [name for name in entries if name not in _STAND_INS], n=3)
-        raise NoEntryError(
-            f"{path}: no entry for {shown(env_id)}{' (' + hint + ')' if hint else ''}; "
-            "give hyperparameters with -params, or another file with --conf-file"
-        )
-    entry = entries[key]
-    if not (isinstance(entry, dict) and all(isinstance(name, str) for name in entry)):
-        raise UserError(f"{path}: the entry {key} must map names to values")
-    return entry
-
-
-def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:
-    if env_id in entries:
-        return env_id
-    if _ATARI_ID.fullmatch(env_id) and "atari" in entries:
-        return "atari"
-    return "default" if "default" in entries else None
-
-
-def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
-    """Ids of the environments that an algorithm's file has an entry for, in its order.
-
-    Empty where there is no such file. The stand-ins ``default`` and ``atari`` are left out.
-    """
-    path = _path(algo, path)
-    # The keys alone, by their place in the line: parsing all files would slow listing them down.
-    names = _TOP_LEVEL_KEY.findall(path.read_text("utf-8")) if path.is_file() else []
-    return [name for name in names if name not in _STAND_INS]
-
-
-def _path(algo: str, path: Path | str | None) -> Path:
-    return _FOLDER / f"{algo}.yml" if path is None else Path(path)
-
-
-def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry with ``changes`` put over it; one budget of training replaces the other."""
-    kept = dict(entry)
-    if not {"n_timesteps", "n_episodes"}.isdisjoint(changes):
-        kept.pop("n_timesteps", None)
-        kept.pop("n_episodes", None)
-    return {**kept, **changes}
-
-
 def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperparams:
     """Tell the special keys of an entry from the algorithm's arguments, and check them.
 
     Args:
-        entry: what `read_hyperparams` returned. A special key that is null counts as left out.
+        entry: as `pipeline.settings.hyperparam_entries.read_hyperparams` returns it. A special key
+            that is null counts as left out.
         where: begins every error message.
 
     Raises:

@@ -121,7 +121,7 @@ def _parse(text: str) -> ast.expr:
     if len(text) > _MAX_CHARACTERS:
         raise ValueError(f"longer than {_MAX_CHARACTERS} characters")
     with warnings.catch_warnings():
-        # An unknown escape such as "\d" is the user's own affair.
+        # An unknown escape such as "\d" is left as the user wrote it.
         warnings.simplefilter("ignore")
         return ast.parse(text, mode="eval").body
 

@@ -144,7 +144,7 @@ def _load(content: str | bytes) -> Any:
 
 
 def _check_size(value: Any) -> None:
-    """Refuse what a few anchors can unfold to: structures without end, or of billions of values."""
+    """Refuse what a few anchors can grow to: structures without end, or of billions of values."""
     pending = [(value, 0)]
     count = 0
     while pending:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import io
 import json
 import os
@@ -13,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from rich.console import Console
 
 from experiments.analysis import StudyAnalysis
 from experiments.study_plan import PlannedRun
@@ -21,8 +19,10 @@ from pipeline.environments import MISTAKES
 from pipeline.errors import UserError
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing, write_json
+from pipeline.filming import film_episode, write_film
+from pipeline.model_choice import ChosenModel
 from pipeline.model_loading import load_model
-from pipeline.playing import ChosenModel, Watcher, play_episodes, playing_env, write_film
+from pipeline.playing import playing_env
 from report.page.markup import data_uri
 from report.page.sections import Report, Section
 from report.wording import number
@@ -124,13 +124,11 @@ def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     try:
         model = load_model(planned.spec.algo, planned.run.model_path, env)
         env.seed(evaluation_seed(planned.seed, 3))
-        watcher = Watcher(env, "rgb_array", Console(quiet=True))
-        limits = argparse.Namespace(n_episodes=1, n_timesteps=MAX_STEPS, stochastic=False)
-        ended = list(play_episodes(model, env, limits, watcher.show))
+        frames, ended = film_episode(model, env, MAX_STEPS, deterministic=True)
     finally:
         env.close()
-    total_return, length = ended[0] if ended else (None, None)
-    return _shrunk(watcher.frames), {"return": total_return, "steps": length}
+    total_return, length = ended or (None, None)
+    return _shrunk(frames), {"return": total_return, "steps": length}
 
 
 def _shrunk(frames: list[Any]) -> list[Any]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from experiments.execution import failure_log
-from experiments.results import StudyResults
 from experiments.study_plan import PlannedRun
+from experiments.study_results import StudyResults
 from report.page.markup import setting
 from report.page.sections import Report, Section
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.analysis import EnvironmentAnalysis, mean_curve
-from experiments.results import StudyResults
+from experiments.analysis import EnvironmentAnalysis
+from experiments.seed_values import mean_curve
+from experiments.study_results import StudyResults
 from report.series.axis_scale import linear_up_to
 
 KINDS = ("evaluation", "training")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pandas as pd
 
-from experiments.results import StudyResults, read_episodes
+from experiments.study_results import StudyResults, read_episodes
 
 
 def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from experiments.pull_statistics import PullStatistics
-from experiments.results import StudyResults
+from experiments.study_results import StudyResults
 
 N_POINTS = 241
 

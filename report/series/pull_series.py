@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.pull_statistics import QUANTILES, PullStatistics
-from experiments.results import StudyResults
+from experiments.study_results import StudyResults
 from pipeline.environments import make_single_env
 from report.series.curve_series import Curve
 from report.series.posteriors import Belief, belief

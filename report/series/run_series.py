@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.analysis import EnvironmentAnalysis, values_over_seeds
-from experiments.results import StudyResults
+from experiments.analysis import EnvironmentAnalysis
+from experiments.seed_values import values_over_seeds
+from experiments.study_results import StudyResults
 from experiments.study_spec import AgentSpec
 from report.series.axis_scale import linear_up_to
 from report.series.curve_series import Curve

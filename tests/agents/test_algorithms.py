@@ -24,10 +24,10 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
 
-from agents import load_algorithm
+from agents import ALGORITHMS, load_algorithm
 from agents.common.schedules import ExponentialSchedule
 
-TABULAR = ["qlearning", "sarsa", "expected_sarsa", "double_qlearning"]
+TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
 HAND_WRITTEN = [*TABULAR, "random", "angle"]
 
 pytestmark = pytest.mark.filterwarnings(

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents import load_algorithm
-from agents.bandits.base import Pull
-from agents.bandits.choosing import kl_ucb_index, ucb_index
-from agents.bandits.kl import bernoulli_kl, kl_upper_bound
+from agents.bandits.bandit_algorithm import Pull
+from agents.bandits.kl_ucb import bernoulli_kl, kl_ucb_index, kl_upper_bound
+from agents.bandits.ucb import ucb_index
 
 ARMS = 3
 
@@ -89,8 +89,9 @@ def test_boltzmann_draws_by_the_softmax_of_the_estimates():
     ],
 )
 def test_ucb_index(kwargs, indices):
-    parameters = agent("ucb", **kwargs)._parameters()
-    values = [ucb_index(0.5, 4, 6, parameters), ucb_index(1.0, 1, 6, parameters)]
+    model = agent("ucb", **kwargs)
+    own = model.width, model.is_textbook
+    values = [ucb_index(0.5, 4, 6, *own), ucb_index(1.0, 1, 6, *own)]
     assert values[: len(indices)] == pytest.approx(indices, rel=1e-15)
 
 
@@ -120,7 +121,7 @@ def test_arms_not_tried_come_first(name):
     st.integers(2, 10**6),
 )
 def test_kl_ucb_index_solves_its_equation(mean, count, pulls):
-    index = kl_ucb_index(mean, count, pulls, (0.0, 0.0, 0.0))
+    index = kl_ucb_index(mean, count, pulls, 0.0)
     assert mean <= index < 1.0
     budget = math.log(pulls) / count
     if index < 1 - 1e-9:
@@ -135,7 +136,7 @@ def test_kl_ucb_where_it_has_a_closed_form():
         assert kl_upper_bound(0.0, budget) == pytest.approx(1 - math.exp(-budget), rel=1e-12)
         assert kl_upper_bound(1.0, budget) == 1.0
     assert kl_upper_bound(0.3, 0.0) == 0.3
-    with_c = kl_ucb_index(0.3, 10, 100, (3.0, 0.0, 0.0))
+    with_c = kl_ucb_index(0.3, 10, 100, 3.0)
     budget = (math.log(100) + 3 * math.log(math.log(100))) / 10
     assert with_c == pytest.approx(kl_upper_bound(0.3, budget), rel=1e-15)
 

@@ -31,8 +31,9 @@ from agents.common.callback_horizons import (
     members,
     unknown_callbacks,
 )
-from pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
+from pipeline.callbacks import EpisodeCheckpoint, StepCheckpoint
 from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.run_folder import Run
 
 ENGINES = ("interpreted", "compiled")

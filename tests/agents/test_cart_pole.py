@@ -10,27 +10,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.tabular.engine import COMPENSATED_SUM
-from agents.tabular.records import ENV
-from agents.tabular.simulator import bin_index, cart_pole_step
-from agents.tabular.stepping import add_to_return, begin_episode
-from agents.tabular.worlds import compile_world
+from agents.compiled.cart_pole import CART_POLE_ENV, STATE, bin_index, swing
+from agents.compiled.compile_envs import compile_envs
+from agents.compiled.env_state import COMPENSATED_SUM
+from agents.compiled.env_steps import add_to_return, begin_episode
 from envs.wrappers import DiscretizeObservation
 
-STATE = ["x", "x_dot", "theta", "theta_dot"]
 INTEGRATORS = ("euler", "semi-implicit euler")
 
 
 @numba.njit
 def step_each(records, world, terminated):
     for i in range(len(records)):
-        terminated[i] = cart_pole_step(records[i], world)
+        terminated[i] = swing(world, records[i])
 
 
 @numba.njit
-def bins_of(records, dims, bins, indices):
+def bins_of(records, world, indices):
     for i in range(len(records)):
-        indices[i] = bin_index(records[i], dims, bins)
+        indices[i] = bin_index(world, records[i])
 
 
 @numba.njit
@@ -49,7 +47,7 @@ def discretized(integrator="euler", **kwargs):
 
 
 def world_of(env):
-    return compile_world(DummyVecEnv([lambda: env]))
+    return compile_envs(DummyVecEnv([lambda: env]))
 
 
 def random_states(n, seed=0):
@@ -60,12 +58,12 @@ def random_states(n, seed=0):
 
 
 def compiled_steps(env, states, actions):
-    records = np.zeros(len(states), dtype=ENV)
+    records = np.zeros(len(states), dtype=CART_POLE_ENV)
     for name, column in zip(STATE, states.T, strict=True):
         records[name] = column
     records["action"] = actions
     terminated = np.empty(len(states), dtype=np.bool_)
-    step_each(records, world_of(env).cart_pole, terminated)
+    step_each(records, world_of(env), terminated)
     return np.stack([records[name] for name in STATE], axis=1), terminated
 
 
@@ -148,11 +146,11 @@ def test_bins_equal_the_wrappers(kwargs, dims):
     edges = np.concatenate([np.linspace(low, high, n + 1) for low, high, n in cuts])
     extremes = np.array([*edges, *np.nextafter(edges, 9), 0.0, -0.0, 1e30, -1e30, 5e-324])
     states = np.concatenate([states, np.repeat(extremes, 4).reshape(-1, 4)])
-    records = np.zeros(len(states), dtype=ENV)
+    records = np.zeros(len(states), dtype=CART_POLE_ENV)
     for name, column in zip(STATE, states.T, strict=True):
         records[name] = column
     indices = np.empty(len(states), dtype=np.int64)
-    bins_of(records, world.dims, world.bins, indices)
+    bins_of(records, world, indices)
     seen = states.astype(np.float32)
     assert indices.tolist() == [env.observation(state) for state in seen]
     np.testing.assert_array_equal(indices, env.map_observations(seen))
@@ -185,14 +183,14 @@ def plain_sum(values):
 @given(values=st.lists(FLOATS, max_size=40))
 def test_sums_by_either_rule(compensated, add_up, values):
     sums = np.empty(len(values))
-    running_sums(np.zeros(1, dtype=ENV)[0], np.array(values), compensated, sums)
+    running_sums(np.zeros(1, dtype=CART_POLE_ENV)[0], np.array(values), compensated, sums)
     assert sums.tolist() == [add_up(values[: i + 1]) for i in range(len(values))]
 
 
 @given(st.lists(FLOATS, max_size=40))
 def test_sums_as_this_python_does(values):
     sums = np.empty(len(values))
-    running_sums(np.zeros(1, dtype=ENV)[0], np.array(values), COMPENSATED_SUM, sums)
+    running_sums(np.zeros(1, dtype=CART_POLE_ENV)[0], np.array(values), COMPENSATED_SUM, sums)
     assert sums.tolist() == [sum(values[: i + 1]) for i in range(len(values))]
 
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
-from agents import load_algorithm
+from agents import ALGORITHMS, load_algorithm
 from agents.common.callback_horizons import EpisodeBudget
 from agents.common.schedules import ExponentialSchedule
 from envs.wrappers import DiscretizeObservation, FlattenToDiscrete, ScaleReward, TerminationReward
@@ -52,7 +52,7 @@ STEP_SIZES = {
 }
 FACTORS = (
     tuple(ENVS),
-    ("qlearning", "sarsa", "expected_sarsa", "double_qlearning"),
+    tuple(name for name, entry in ALGORITHMS.items() if entry.family == "tabular"),
     tuple(EXPLORATION),
     tuple(STEP_SIZES),
     ("random", "first"),

@@ -124,7 +124,7 @@ def test_an_agent_that_learns_in_its_own_way():
             pass
 
     model = Unteachable(env="FrozenLake-v1", seed=0).learn(100)
-    assert model.engine_in_use == "interpreted: Unteachable may act and learn in its own way"
+    assert model.engine_in_use == "interpreted: Unteachable has a _learn_from of its own in Python"
     assert int(model.policy.visit_counts.sum()) == 0
 
 

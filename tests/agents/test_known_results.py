@@ -10,7 +10,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401
 from agents.common.callback_horizons import EpisodeBudget
-from agents.tabular.algorithms import SARSA, QLearning
+from agents.tabular.q_learning import QLearning
+from agents.tabular.sarsa import SARSA
 from envs.known_models import transition_model
 from mdp import policy_return
 

@@ -13,7 +13,7 @@ from agents import ALGORITHMS, fitting_algorithms, load_algorithm
 DISCRETE = spaces.Discrete(4)
 BOX = spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "optimal"]
-TABULAR = ["qlearning", "sarsa", "expected_sarsa", "double_qlearning"]
+TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
 DEEP_Q = ["dqn", "double_dqn", "deep_qlearning"]
 
 

@@ -8,7 +8,9 @@ import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.tabular.algorithms import SARSA, DoubleQLearning, QLearning
+from agents.tabular.double_q_learning import DoubleQLearning
+from agents.tabular.q_learning import QLearning
+from agents.tabular.sarsa import SARSA
 
 STEPS = 300
 
@@ -79,4 +81,4 @@ def test_a_copy_made_during_training_is_independent(duplicate):
 def test_nothing_of_it_is_saved(tmp_path):
     model = trained(QLearning, Meddler(lambda model: model.save(tmp_path / "during.zip")))
     assert int(QLearning.load(tmp_path / "during.zip").policy.visit_counts.sum()) < STEPS
-    assert model._tables is None
+    assert model._workspace is None

@@ -8,7 +8,10 @@ from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents import load_algorithm
-from agents.tabular.algorithms import SARSA, DoubleQLearning, ExpectedSARSA, QLearning
+from agents.tabular.double_q_learning import DoubleQLearning
+from agents.tabular.expected_sarsa import ExpectedSARSA
+from agents.tabular.q_learning import QLearning
+from agents.tabular.sarsa import SARSA
 
 ALL = [QLearning, SARSA, ExpectedSARSA, DoubleQLearning]
 GREEDY = {"exploration_decay": "constant", "exploration_initial_eps": 0.0}
@@ -90,10 +93,9 @@ def test_sarsa_does_what_it_committed_to():
     committed = []
 
     class Recorder(SARSA):
-        def _commit_to_next_actions(self, transitions):
-            actions = super()._commit_to_next_actions(transitions)
-            committed.append((int(actions[0]), bool(transitions.dones[0])))
-            return actions
+        def _learn_from(self, transitions):
+            super()._learn_from(transitions)
+            committed.append((int(self._next_actions[0]), bool(transitions.dones[0])))
 
     tracer = Tracer()
     Recorder(env=Corridor(length=30), learning_rate=1.0, seed=0, **UNIFORM).learn(

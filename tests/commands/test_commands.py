@@ -17,8 +17,11 @@ import yaml
 import enjoy
 import train
 from commands.parsing import run_command
+from experiments.study_plan import plan
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
-from pipeline.playing import FRAMES_PER_SECOND
+from pipeline.filming import FRAMES_PER_SECOND
+from pipeline.settings import hyperparam_entries
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
@@ -367,7 +370,25 @@ def test_ctrl_c_saves_what_was_learnt(tmp_path):
     assert (run / "FrozenLake-v1.zip").exists()
 
 
-HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy")
+def test_a_file_of_one_default_entry_is_enough(type_command, monkeypatch, tmp_path):
+    """For listing, training, playing and comparing."""
+    folder = tmp_path / "hyperparams"
+    folder.mkdir()
+    (folder / "qlearning.yml").write_text("default:\n  n_timesteps: 60\n  policy: QTablePolicy\n")
+    monkeypatch.setattr(hyperparam_entries, "_FOLDER", folder)
+    code, out, err = type_command("train.py", "--list")
+    assert (code, err) == (0, "")
+    assert "qlearning" in out
+    choice = ["--algo", "qlearning", "--env", "FrozenLake-v1"]
+    assert type_command("train.py", *choice, "--seed", "0")[::2] == (0, "")
+    code, out, err = type_command("enjoy.py", *choice, "--render", "none", "--n-episodes", "2")
+    assert (code, err) == (0, "")
+    agent = AgentSpec("qlearning", "qlearning")
+    study = StudySpec("s", "S", (agent,), (EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1"),))
+    assert plan(study, tmp_path)[0].spec.hyperparams.n_timesteps == 60
+
+
+HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib")
 
 
 @pytest.mark.parametrize(

@@ -143,10 +143,10 @@ def test_statistics_are_those_of_the_batch(batches):
 
 
 def test_what_has_no_compiled_copy_goes_one_by_one(tmp_path, monkeypatch, do_study):
-    from agents.bandits.worlds import NotBatchable
+    from agents.compiled.compile_envs import NotCompilable
 
     def refuse(*args):
-        raise NotBatchable("of a reason")
+        raise NotCompilable("of a reason")
 
     expected = do_study(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "one")
     monkeypatch.setattr("experiments.bandit_batches.run_batch", refuse)

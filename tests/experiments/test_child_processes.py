@@ -10,7 +10,7 @@ import pytest
 
 from experiments.child_processes import (
     StoppedError,
-    WorkFailedError,
+    TaskFailedError,
     local_executor,
     stop_all,
     supervise,
@@ -80,7 +80,7 @@ def test_one_thread_in_each_process(chores):
 
 def test_an_exception_is_not_tried_again_and_its_traceback_is_kept(chores, tmp_path):
     clean_up = partial(chores.clean_up, str(tmp_path))
-    with pytest.raises(WorkFailedError) as error:
+    with pytest.raises(TaskFailedError) as error:
         supervise(chores.fail, str(tmp_path), "too\n  hot", clean_up=clean_up, tries=3)
     assert str(error.value) == "too hot"
     assert "Traceback" in error.value.details
@@ -98,10 +98,10 @@ def test_a_process_that_is_killed_costs_one_retry(chores, tmp_path):
 
 
 def test_a_process_that_always_dies_fails_with_the_signals_name(chores, tmp_path):
-    with pytest.raises(WorkFailedError, match=r"^its process died 2 times \(SIGKILL\)$"):
+    with pytest.raises(TaskFailedError, match=r"^its process died 2 times \(SIGKILL\)$"):
         supervise(chores.die, str(tmp_path), 9, clean_up=nothing)
     assert len(list(tmp_path.glob("try_*"))) == 2
-    with pytest.raises(WorkFailedError, match=r"^its process died 1 times \(exit code 3\)$"):
+    with pytest.raises(TaskFailedError, match=r"^its process died 1 times \(exit code 3\)$"):
         supervise(chores.leave, 3, clean_up=nothing, tries=1)
 
 

@@ -12,9 +12,10 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
-from experiments.analysis import analyse, mean_curve, values_over_seeds
-from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, read_results
+from experiments.analysis import analyse
+from experiments.seed_values import mean_curve, values_over_seeds
 from experiments.study_plan import plan
+from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, read_results
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
 from report.figures.figure_files import write_figures

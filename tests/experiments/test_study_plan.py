@@ -1,7 +1,7 @@
 """From a study to its runs: folders, seeds, settings, and what makes a run the same run."""
 
 import json
-from dataclasses import replace
+from dataclasses import MISSING, fields, replace
 from pathlib import Path
 
 import pytest
@@ -10,6 +10,7 @@ from experiments.study_plan import check_settings, plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.run_folder import FAILED, FINISHED
+from pipeline.train_spec import TrainSpec
 
 LAKE = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1", {"n_timesteps": 100})
 
@@ -180,6 +181,100 @@ def test_checkpoints_are_asked_of_the_first_seed_alone(tmp_path):
     # Without films, a run that has checkpoints is as good as one without.
     assert only(study_of("qlearning"), tmp_path).is_finished
     assert not only(study_of("qlearning", render_every=6), tmp_path).is_finished
+
+
+OPTIONAL = {key.name: key.default for key in fields(TrainSpec) if key.default is not MISSING}
+
+
+@pytest.mark.parametrize("name", OPTIONAL)
+def test_a_field_that_came_later_counts_as_its_default(tmp_path, name):
+    """So that a new field does not make finished studies run again."""
+    planned = only(study_of("qlearning"), tmp_path)
+    data = planned.spec.as_data()
+    planned = replace(planned, spec=replace(planned.spec, **{name: OPTIONAL[name]}))
+    record(planned, spec={key: value for key, value in data.items() if key != name})
+    assert planned.is_finished
+
+
+@pytest.mark.parametrize(
+    "wanted", [{"n_eval_envs": 7}, {"eval_freq": 50}, {"vec_env": "subproc"}, {"num_threads": 2}]
+)
+def test_a_field_that_came_later_counts_where_it_is_not_its_default(tmp_path, wanted):
+    planned = only(study_of("qlearning"), tmp_path)
+    data = planned.spec.as_data()
+    record(planned, spec={key: value for key, value in data.items() if key not in wanted})
+    assert planned.is_finished
+    assert not replace(planned, spec=replace(planned.spec, **wanted)).is_finished
+
+
+def test_a_field_that_there_is_no_more_does_not_count(tmp_path):
+    planned = only(study_of("qlearning"), tmp_path)
+    record(planned, spec={**planned.spec.as_data(), "eval_parallel": True})
+    assert planned.is_finished
+
+
+@pytest.mark.parametrize("name", ["algo", "env_id", "hyperparams", "seed"])
+def test_a_record_without_what_makes_a_run_is_of_another(tmp_path, name):
+    planned = only(study_of("qlearning"), tmp_path)
+    data = planned.spec.as_data()
+    record(planned, spec={key: value for key, value in data.items() if key != name})
+    assert not planned.is_finished
+
+
+@pytest.mark.parametrize("spec", [None, [], "qlearning", {}])
+def test_a_record_of_no_spec_is_of_another_run(tmp_path, spec):
+    planned = only(study_of("qlearning"), tmp_path)
+    record(planned, spec=spec)
+    assert not planned.is_finished
+
+
+# As the first version wrote it for one of a study's runs.
+FIRST_VERSION = """{
+  "state": "finished",
+  "env_name": "FrozenLake-v1",
+  "spec": {
+    "algo": "qlearning",
+    "env_id": "FrozenLake-v1",
+    "seed": 0,
+    "eval_freq": null,
+    "eval_episodes": 20,
+    "n_eval_envs": 10,
+    "save_freq": -1,
+    "save_every_n_episodes": -1,
+    "log_folder": "logs",
+    "tensorboard_log": null,
+    "trained_agent": null,
+    "vec_env": "dummy",
+    "device": "auto",
+    "num_threads": 1,
+    "log_interval": -1,
+    "verbose": 0,
+    "progress": false,
+    "gym_packages": [],
+    "unique_id": false,
+    "pictures": false,
+    "hyperparams": {"policy": "QTablePolicy", "learning_rate": 0.5, "n_timesteps": 500}
+  },
+  "versions": {"python": "3.11.7", "rl-yardstick": "0.1.0", "stable-baselines3": "2.9.2"},
+  "n_timesteps": 500,
+  "seconds": 0.596,
+  "final": {"mean_return": 0.5, "std_return": 0.5, "mean_length": 12.0, "success_rate": 0.5,
+            "exact": true, "n_episodes": null},
+  "best_mean_return": 0.5,
+  "best_timesteps": 250,
+  "engine": "compiled"
+}"""
+
+
+def test_a_run_of_the_first_version_is_finished(tmp_path):
+    settings = {"policy": "QTablePolicy", "learning_rate": 0.5, "n_timesteps": 500}
+    agent = AgentSpec("qlearning", "qlearning", settings, tuned=False)
+    environment = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1")
+    planned = only(study_of(agent, environments=(environment,)), tmp_path)
+    planned.path.mkdir(parents=True)
+    planned.run.info_path.write_text(FIRST_VERSION)
+    assert planned.is_finished
+    assert not replace(planned, spec=replace(planned.spec, seed=1)).is_finished
 
 
 def test_a_damaged_record_is_named(tmp_path):

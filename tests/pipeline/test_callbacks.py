@@ -25,11 +25,11 @@ from agents import load_algorithm
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import (
     EpisodeCheckpoint,
-    EvaluationCallback,
     ExponentialExploration,
     StepCheckpoint,
 )
 from pipeline.evaluation.sampled import Evaluation, evaluate
+from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.run_folder import Run
 
 TINY_DQN = {

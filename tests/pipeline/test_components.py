@@ -28,8 +28,10 @@ from torch import nn, optim
 
 from agents import load_algorithm
 from agents.common.schedules import ExponentialSchedule
+from envs.wrappers import FlattenToDiscrete, OneHotObservation, ScaleReward, TerminationReward
 from pipeline.errors import UserError
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.settings.class_names import find_class
 from pipeline.settings.coercion import ScheduleSpec
 from pipeline.settings.components import (
     build_value,
@@ -37,7 +39,8 @@ from pipeline.settings.components import (
     vec_wrapper_factory,
     wrapper_factory,
 )
-from pipeline.settings.hyperparams import component_specs, read_hyperparams, split
+from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparams import component_specs, split
 from pipeline.settings.literals import DottedName
 
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
@@ -382,3 +385,16 @@ def test_reading_needs_no_heavy_library() -> None:
 def test_wrapping_does_not_need_rl_zoo3() -> None:
     assert isinstance(wrapped({CLIP: {"max_reward": 1}}), TransformReward)
     assert "rl_zoo3" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("before", "now"),
+    [
+        ("envs.wrappers.encodings.FlattenToDiscrete", FlattenToDiscrete),
+        ("envs.wrappers.encodings.OneHotObservation", OneHotObservation),
+        ("envs.wrappers.rewards.ScaleReward", ScaleReward),
+        ("envs.wrappers.rewards.TerminationReward", TerminationReward),
+    ],
+)
+def test_files_that_name_a_class_where_it_was_before_are_read(before, now):
+    assert find_class(before, (gym.Wrapper,), "here") is now

@@ -21,14 +21,16 @@ from pipeline.errors import UserError
 from pipeline.settings.coercion import ScheduleSpec, coerce, parse_schedule
 from pipeline.settings.components import build_value
 from pipeline.settings.constructor_arguments import RANGES, constructor_parameters
-from pipeline.settings.hyperparams import (
-    ComponentSpec,
-    Hyperparams,
+from pipeline.settings.hyperparam_entries import (
     NoEntryError,
-    check_algorithm_kwargs,
     entry_names,
     override,
     read_hyperparams,
+)
+from pipeline.settings.hyperparams import (
+    ComponentSpec,
+    Hyperparams,
+    check_algorithm_kwargs,
     split,
 )
 from pipeline.settings.literals import DottedName

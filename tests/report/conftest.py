@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from verdicts import Estimate, Summary, ThresholdSummary
 

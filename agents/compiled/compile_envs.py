@@ -1,0 +1,166 @@
+"""From the environments of a training to the compiled ones that stand for them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from numpy.typing import NDArray
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from agents.compiled.cart_pole import CartPole
+from agents.compiled.finite_model import OUTCOME, FiniteModel
+from envs.known_models import (
+    observations_of_states,
+    success_outcomes,
+    time_limit,
+    transition_model,
+)
+from envs.wrappers import (
+    DiscretizeObservation,
+    FlattenToDiscrete,
+    ScaleReward,
+    TerminationReward,
+)
+from mdp.transition_model import TransitionModel
+
+Env = gym.Env[Any, Any]
+World = FiniteModel | CartPole
+
+# Wrappers whose work the engine does itself, or that have none to do.
+COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
+CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
+MODEL_WRAPPERS = {FlattenToDiscrete, ScaleReward, TerminationReward, *COMMON_WRAPPERS}
+
+
+class NotCompilable(ValueError):  # noqa: N818  # no error: the interpreted loop takes over
+    """Why there is no compiled counterpart, of environments or of an agent."""
+
+
+def layers(env: Env) -> list[Env]:
+    """The environment and what it wraps, the outermost first."""
+    chain = [env]
+    while isinstance(env, gym.Wrapper):
+        env = env.env
+        chain.append(env)
+    return chain
+
+
+def monitor_of(env: Env) -> Monitor | None:
+    """The Monitor around the environment, if there is one."""
+    return next((layer for layer in layers(env) if isinstance(layer, Monitor)), None)
+
+
+def compile_envs(vec_env: VecEnv) -> World:
+    """The compiled counterpart of environments that are all alike.
+
+    Raises:
+        NotCompilable: where there is none; the message says why.
+    """
+    if type(vec_env) is not DummyVecEnv:
+        raise NotCompilable(f"{type(vec_env).__name__} is not DummyVecEnv")
+    for env in vec_env.envs:
+        if env.render_mode == "human":
+            raise NotCompilable("the environment is shown on the screen")
+        _check_monitor(env)
+    first, *others = vec_env.envs
+    world = _world_of(first)
+    for other in others:
+        kinds = [[type(layer) for layer in layers(env)] for env in (first, other)]
+        if kinds[0] != kinds[1] or not _are_equal(world, _world_of(other)):
+            raise NotCompilable("the environments are not alike")
+    return world
+
+
+def _world_of(env: Env) -> World:
+    if isinstance(env.unwrapped, CartPoleEnv):
+        return _cart_pole(env)
+    return _finite_model(env)
+
+
+def _are_equal(world: World, other: World) -> bool:
+    fields: Iterable[tuple[Any, Any]] = zip(world, other, strict=True)
+    return all(np.array_equal(ours, theirs) for ours, theirs in fields)
+
+
+def _check_monitor(env: Env) -> None:
+    monitor = monitor_of(env)
+    if monitor is None:
+        return
+    if any(isinstance(layer, Monitor) for layer in layers(monitor.env)):
+        raise NotCompilable("there is more than one Monitor")
+    if monitor.info_keywords or monitor.reset_keywords:
+        raise NotCompilable("Monitor records further keys")
+    if time_limit(monitor.env) != time_limit(env):
+        raise NotCompilable("a time limit lies outside Monitor")
+
+
+def _finite_model(env: Env) -> FiniteModel:
+    model = transition_model(env)
+    observations = observations_of_states(env)
+    if model is None or observations is None:
+        raise NotCompilable("the environment's transition model is not known")
+    if not np.issubdtype(observations.dtype, np.integer) or observations.ndim != 1:
+        raise NotCompilable("the observations are not single numbers")
+    # A wrapper may leave the dynamics alone and yet have to see every step, to film it say.
+    watching = {type(layer) for layer in layers(env)[:-1]} - MODEL_WRAPPERS
+    if watching:
+        names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
+        raise NotCompilable(f"{names} must see every step")
+    monitor = monitor_of(env)
+    seen_by_monitor = model if monitor is None else transition_model(monitor.env)
+    assert seen_by_monitor is not None
+    starts = np.flatnonzero(model.initial)
+    return FiniteModel(
+        time_limit=time_limit(env) or 0,
+        outcomes=_outcomes(env, model, seen_by_monitor),
+        starts=starts,
+        start_cumulative=np.cumsum(model.initial)[starts],
+        observation=observations.astype(np.int64),
+    )
+
+
+def _outcomes(env: Env, model: TransitionModel, seen_by_monitor: TransitionModel) -> NDArray[Any]:
+    outcomes = np.zeros(model.prob.shape, dtype=OUTCOME)
+    outcomes["cumulative"] = np.cumsum(model.prob, axis=2)
+    outcomes["reward"] = seen_by_monitor.reward
+    # A VecEnv hands rewards on in single precision.
+    outcomes["agent_reward"] = model.reward.astype(np.float32)
+    outcomes["next_state"] = model.next_state
+    outcomes["terminated"] = model.terminated
+    success = success_outcomes(env)
+    if success is not None:
+        outcomes["success"] = success
+    return outcomes
+
+
+def _cart_pole(env: Env) -> CartPole:
+    chain = layers(env)
+    wrappers = [layer for layer in chain if isinstance(layer, DiscretizeObservation)]
+    base = chain[-1]
+    assert isinstance(base, CartPoleEnv)
+    if len(wrappers) != 1 or {type(layer) for layer in chain[:-1]} - CART_POLE_WRAPPERS:
+        raise NotCompilable("CartPole compiles under DiscretizeObservation and Monitor alone")
+    if type(base) is not CartPoleEnv or base._sutton_barto_reward:
+        raise NotCompilable("CartPole compiles with its default reward alone")
+    wrapper = wrappers[0]
+    return CartPole(
+        time_limit=time_limit(env) or 0,
+        gravity=float(base.gravity),
+        masspole=float(base.masspole),
+        total_mass=float(base.total_mass),
+        length=float(base.length),
+        polemass_length=float(base.polemass_length),
+        force_mag=float(base.force_mag),
+        tau=float(base.tau),
+        semi_implicit=base.kinematics_integrator != "euler",
+        x_threshold=float(base.x_threshold),
+        theta_threshold=float(base.theta_threshold_radians),
+        dims=np.array(wrapper.dims, dtype=np.int64),
+        bins=np.stack((wrapper.bins, wrapper.low, wrapper.high), axis=1).astype(np.float64),
+    )

@@ -1,0 +1,177 @@
+"""Drives the compiled loop, and keeps the rest of the training from noticing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents.common.callback_horizons import EpisodeBudget, horizon, members, pass_over
+from agents.common.schedules import schedule_row
+from agents.compiled.compile_envs import World
+from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
+from agents.compiled.episodes import Episodes, record_in_monitors
+from agents.compiled.generators import handles_of
+from agents.compiled.interrupts import interrupts_held
+from agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
+from agents.compiled.training_records import EPISODE, PROGRESS
+
+MAX_BLOCK_STEPS = 65_536
+
+
+class CompiledEngine:
+    """One call of ``learn`` on the compiled loop.
+
+    Args:
+        agent: the algorithm, whose tables and generator are used in place.
+        world: the compiled counterpart of its environments.
+        callback: what is told of the steps.
+        log_interval: episodes between two log records, or None.
+    """
+
+    def __init__(
+        self, agent: Any, world: World, callback: BaseCallback, log_interval: int | None
+    ) -> None:
+        assert isinstance(agent.env, DummyVecEnv)
+        self.agent = agent
+        self.world = world
+        self.callback = callback
+        self.log_interval = log_interval
+        self.reports_success = ["is_success" in (info or {}) for info in agent.env.reset_infos]
+        self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
+        self.states = EnvStates(agent.env, world)
+        self.envs = self.states.records
+        self.handles = handles_of([env.unwrapped.np_random for env in agent.env.envs])
+        self.progress = np.zeros(1, dtype=PROGRESS)
+        self.log = EpisodeLog(
+            np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
+            np.empty((self.block_steps, agent.n_envs)),
+        )
+        self.learner = agent.compiled_agent(agent.rng)
+        self._read()
+
+    def run(self, total_timesteps: int) -> None:
+        """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
+        with interrupts_held() as interrupted:
+            try:
+                while self.agent.num_timesteps < total_timesteps:
+                    if not self._run_block(total_timesteps) or interrupted():
+                        break
+            finally:
+                self._take_over_position()
+                self.states.write()
+
+    def _run_block(self, total_timesteps: int) -> bool:
+        agent = self.agent
+        self.callback.on_rollout_start()
+        ahead = horizon(self.callback)
+        steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
+        episodes_to_log = (
+            ahead.episodes
+            if self.log_interval is None
+            else self.log_interval - agent._episode_num % self.log_interval
+        )
+        n_steps = run_block(
+            self.world,
+            self.learner,
+            self.envs,
+            self.handles,
+            self.progress[0],
+            self.log,
+            min(ahead.calls, steps_left, self.block_steps),
+            min(ahead.episodes, episodes_to_log),
+            COMPENSATED_SUM,
+        )
+        episodes = Episodes.of(self.log.episodes[: self.progress[0]["logged_episodes"]])
+        keep_going = self._tell(episodes, n_steps)
+        learn_from_last_step(self.learner, self.envs, self.progress[0])
+        last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
+        self._take_over_counts(1, len(episodes.envs) - last_step)
+        self.callback.on_rollout_end()
+        return keep_going
+
+    def _tell(self, episodes: Episodes, n_steps: int) -> bool:
+        """Monitor, statistics and callbacks; False once a callback asks to stop."""
+        agent = self.agent
+        self.states.keep_rewards(episodes, self.log.rewards[:n_steps])
+        times = record_in_monitors(self.states.monitors, episodes)
+        for monitor in self.states.monitors:
+            if monitor is not None:
+                monitor.total_steps += n_steps
+        # The statistics hear of the last step after the callbacks, as in the interpreted loop.
+        earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
+        self._update_statistics(episodes, 0, earlier, times)
+        agent.num_timesteps += n_steps * agent.n_envs
+        # Callbacks come before the last step is learnt from: until then the counters end before it.
+        self._take_over_counts(n_steps - 1, earlier)
+        pass_over(self.callback, n_steps - 1, earlier)
+        self.callback.update_locals(self._last_step(episodes, earlier, times))
+        keep_going = self.callback.on_step()
+        self._update_statistics(episodes, earlier, len(episodes.envs), times)
+        return keep_going
+
+    def _update_statistics(
+        self, episodes: Episodes, start: int, stop: int, times: list[float]
+    ) -> None:
+        agent = self.agent
+        remembered = slice(max(start, stop - agent._stats_window_size), stop)
+        if self.states.monitors[0] is not None:
+            agent.ep_info_buffer.extend(episodes.infos(remembered, times))
+        if self.reports_success[0]:
+            agent.ep_success_buffer.extend(episodes.successes[remembered].tolist())
+
+    def _last_step(self, episodes: Episodes, earlier: int, times: list[float]) -> dict[str, Any]:
+        """What callbacks read of the last step, under the names of the interpreted loop."""
+        envs = self.envs
+        infos: list[dict[str, Any]] = [
+            {"TimeLimit.truncated": bool(done and not terminated)}
+            for done, terminated in zip(envs["done"], envs["terminated"], strict=True)
+        ]
+        last = slice(earlier, None)
+        for env, info in zip(
+            episodes.envs[last].tolist(), episodes.infos(last, times), strict=True
+        ):
+            infos[env].update(episode=info, terminal_observation=int(envs["next_obs"][env]))
+        return {
+            "actions": envs["action"].copy(),
+            "new_obs": envs["new_obs"].copy(),
+            "rewards": envs["reward"].astype(np.float32),
+            "dones": envs["done"].copy(),
+            "infos": infos,
+        }
+
+    def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
+        """Let the algorithm's own counters follow, and log where it is time to."""
+        agent = self.agent
+        agent._current_progress_remaining = float(self.progress[0]["remaining"])
+        agent._n_updates += n_steps * agent.n_envs
+        self._take_over_position()
+        if n_episodes:
+            agent._count_episodes(n_episodes, self.log_interval)
+
+    def _take_over_position(self) -> None:
+        self.agent._last_obs = self.envs["obs"].copy()
+        self.agent.take_over(self.envs, self.progress)
+
+    def _read(self) -> None:
+        """Take over the state of agent and environments."""
+        agent, progress = self.agent, self.progress[0]
+        budgets = (m for m in members(self.callback) if isinstance(m, EpisodeBudget))
+        for budget in budgets:
+            progress["episode_budget"] = budget.n_episodes
+            progress["budget_episodes"] = budget.episodes_seen
+        progress["num_timesteps"] = agent.num_timesteps
+        progress["total_timesteps"] = agent._total_timesteps
+        progress["remaining"] = remaining = agent._current_progress_remaining
+        progress["episodes"] = agent._episode_num
+        for name, schedule in (
+            ("exploration", agent.exploration_schedule),
+            ("learning_rate", agent.lr_schedule),
+        ):
+            progress[f"{name}_schedule"] = schedule_row(schedule)
+            progress[name] = schedule(remaining)
+        self.envs["obs"] = agent._last_obs
+        agent.hand_over(self.envs, self.progress)
+        self.states.read()

@@ -1,0 +1,81 @@
+"""Whether a training runs compiled or interpreted."""
+
+from __future__ import annotations
+
+from types import FunctionType
+from typing import Any, Literal
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from agents.common.callback_horizons import unknown_callbacks
+from agents.common.schedules import schedule_row
+from agents.compiled.compile_envs import NotCompilable, World, compile_envs
+from agents.compiled.engine import CompiledEngine
+from agents.compiled.learning_algorithm import LearningAlgorithm
+
+EngineChoice = Literal["auto", "compiled", "interpreted"]
+
+# What a class may say anew in Python: all of it ends up in the settings, schedules and tables that
+# compiled functions are handed.
+SETTINGS = (
+    "__init__",
+    "_check_arguments",
+    "_make_exploration_schedule",
+    "_make_policy",
+    "strategy",
+    "tie_scale",
+    "averages_samples",
+)
+
+
+def choose_engine(
+    agent: Any, callback: BaseCallback, log_interval: int | None
+) -> CompiledEngine | None:
+    """The compiled engine where the agent wants it and it can be had; None for interpreting.
+
+    The choice and its reason are left in ``agent.engine_in_use``.
+
+    Raises:
+        ValueError: if the agent insists on compiled and it cannot be had.
+    """
+    if agent.engine == "interpreted":
+        agent.engine_in_use = "interpreted: asked for"
+        return None
+    try:
+        world = _world_for(agent, callback)
+    except NotCompilable as reason:
+        if agent.engine == "compiled":
+            raise ValueError(f"engine: compiled is not possible: {reason}") from None
+        agent.engine_in_use = f"interpreted: {reason}"
+        return None
+    agent.engine_in_use = "compiled"
+    return CompiledEngine(agent, world, callback, log_interval)
+
+
+def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> World:
+    check_class(type(agent))
+    unknown = unknown_callbacks(callback)
+    if unknown:
+        raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
+    for schedule in (agent.exploration_schedule, agent.lr_schedule):
+        if schedule_row(schedule) is None:
+            raise NotCompilable("a schedule is a Python function")
+    assert agent.env is not None
+    return compile_envs(agent.env)
+
+
+def check_class(algorithm: type) -> None:
+    """Make sure that compiled functions do all that the algorithm does at a step.
+
+    Raises:
+        NotCompilable: naming what a class of its own does in Python instead.
+    """
+    order = algorithm.__mro__
+    for place, cls in enumerate(order[: order.index(LearningAlgorithm)]):
+        if cls.__module__.startswith("agents."):
+            continue
+        for name, value in vars(cls).items():
+            in_python = isinstance(value, FunctionType | property | classmethod | staticmethod)
+            replaces = any(name in vars(above) for above in order[place + 1 :])
+            if in_python and replaces and name not in SETTINGS:
+                raise NotCompilable(f"{algorithm.__name__} has a {name} of its own in Python")

@@ -1,0 +1,131 @@
+"""What tabular and bandit agents share: step sizes, exploration, ties, and a record of settings."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, Unpack, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import FloatSchedule
+
+from agents.common.exploration import EPSILON_GREEDY
+from agents.common.online import OnlineAlgorithm
+from agents.common.setting_checks import check_learning_rate, check_option
+from agents.common.signatures import CommonArguments, TieBreaking
+from agents.common.step_sizes import SAMPLE_AVERAGE
+from agents.compiled.dispatch import settings_dtype
+from agents.compiled.training_records import PROGRESS
+
+StepSize = float | Schedule | Literal["sample_average"]
+
+
+class LearningAlgorithm(OnlineAlgorithm):
+    """Learns with a step size, explores by a schedule, and breaks ties between best actions.
+
+    How it acts and learns stands in compiled functions, which are attributes of the class. They are
+    handed a record of the agent's settings: those that a class names in ``parameters``, and those
+    of the classes above it.
+
+    Args:
+        policy: name of the policy.
+        env: environment, or its id.
+        learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N.
+        tie_breaking: which of several best actions to take while learning: a random one, or the
+            first, as NumPy's argmax does. `predict` takes the first.
+        policy_kwargs: further arguments of the policy.
+        kwargs: as in `OnlineAlgorithm`.
+
+    Attributes:
+        parameters: types of the settings that compiled functions read, by the names of the agent's
+            attributes.
+        settings_type: the type of the record.
+    """
+
+    parameters: ClassVar[Mapping[str, Any]] = {
+        "tie_scale": np.float64,
+        "averages_samples": np.bool_,
+        "strategy": np.int64,
+    }
+    settings_type: ClassVar[np.dtype[np.void]]
+
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule")
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        learning_rate: StepSize = 0.0,
+        tie_breaking: TieBreaking = "random",
+        policy_kwargs: dict[str, Any] | None = None,
+        **kwargs: Unpack[CommonArguments],
+    ) -> None:
+        self.tie_breaking = tie_breaking
+        self.exploration_schedule: Schedule = FloatSchedule(0.0)
+        super().__init__(policy, env, cast(Any, learning_rate), policy_kwargs, **kwargs)
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        above = [vars(base).get("parameters", {}) for base in reversed(cls.__mro__)]
+        fields = {name: kind for parameters in above for name, kind in parameters.items()}
+        cls.settings_type = settings_dtype(cls, fields)
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        check_option("tie_breaking", self.tie_breaking, TieBreaking)
+        check_learning_rate(self.learning_rate)
+        self.lr_schedule = FloatSchedule(1.0 if self.averages_samples else self.learning_rate)
+        self.exploration_schedule = self._make_exploration_schedule()
+        self.set_random_seed(self.seed)
+        self.policy = self._make_policy()
+
+    @abstractmethod
+    def _check_arguments(self) -> None:
+        """Refuse what does not work out, before anything is made of it."""
+
+    @abstractmethod
+    def _make_policy(self) -> BasePolicy:
+        """The policy at the start."""
+
+    def _make_exploration_schedule(self) -> Schedule:
+        """How much to explore, by the progress remaining."""
+        return FloatSchedule(0.0)
+
+    @property
+    def tie_scale(self) -> float:
+        """1 to break ties at random, 0 to take the first."""
+        return float(self.tie_breaking == "random")
+
+    @property
+    def averages_samples(self) -> bool:
+        """Whether the step size is 1/N."""
+        return bool(cast(Any, self.learning_rate) == SAMPLE_AVERAGE)
+
+    @property
+    def strategy(self) -> int:
+        """How the agent explores around its values, one of `agents.common.exploration`."""
+        return EPSILON_GREEDY
+
+    @property
+    def exploration_rate(self) -> float:
+        """How much the agent explores now; 0 for agents that explore by a rule of their own."""
+        return self.exploration_schedule(self._current_progress_remaining)
+
+    def settings(self) -> NDArray[np.void]:
+        """The record of the agent's settings, alone in an array."""
+        settings = np.zeros(1, dtype=self.settings_type)
+        for name in self.settings_type.names[1:]:  # type: ignore[index]  # the first is the class
+            settings[name] = getattr(self, name)
+        return settings
+
+    def progress(self) -> NDArray[np.void]:
+        """The record of how far the training is, alone in an array."""
+        progress = np.zeros(1, dtype=PROGRESS)
+        remaining = self._current_progress_remaining
+        progress["exploration"] = self.exploration_schedule(remaining)
+        progress["learning_rate"] = self.lr_schedule(remaining)
+        progress["episodes"] = self._episode_num
+        return progress

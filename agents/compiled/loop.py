@@ -1,0 +1,152 @@
+"""The compiled training loop: many steps of acting and learning in one call.
+
+It does what the interpreted loop of `OnlineAlgorithm` does, in the same order, with the same
+functions and the same random numbers, so that both end in the same bits. What depends on the agent,
+the environment or the log is looked up by type (`agents.compiled.dispatch`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
+
+from agents.common.schedules import schedule_value
+from agents.compiled.dispatch import by_type
+from agents.compiled.env_steps import begin_episode, end_step
+from mdp.array_types import Floats
+from mdp.machine_code import inlined, kernel
+
+
+@by_type
+def act(agent: Any, env: Any, progress: Any) -> None:
+    """Choose ``env.action`` for ``env.obs``."""
+
+
+@by_type
+def learn_from_step(agent: Any, envs: Any, progress: Any) -> None:
+    """Learn from the step that all environments have taken, and move on to where it has led."""
+
+
+@by_type
+def step(world: Any, env: Any, handle: Any) -> None:
+    """Take one step of an environment, whose generator the handle stands for."""
+
+
+@by_type
+def reset(world: Any, env: Any, handle: Any) -> None:
+    """Begin another episode."""
+
+
+@by_type
+def note_step(log: Any, env: Any, i: int, step: int) -> None:
+    """Write down what environment ``i`` has done."""
+
+
+class EpisodeLog(NamedTuple):
+    """What Monitor and the logger are told of a block.
+
+    Attributes:
+        episodes: records of type `EPISODE`, filled with those that end, shape (capacity,).
+        rewards: filled with what Monitor sees, shape (steps, n_envs).
+    """
+
+    episodes: NDArray[Any]
+    rewards: Floats
+
+    @inlined
+    def note_step(self, env: Any, i: int, step: int) -> None:
+        """Write down the reward."""
+        self.rewards[step, i] = env.monitor_reward
+
+
+@inlined
+def note_episode(episodes: Any, env: Any, progress: Any, i: int, step: int) -> None:
+    """Append the episode that has just ended in environment ``i``."""
+    entry = episodes[progress.logged_episodes]
+    entry.env = i
+    entry.step = step
+    entry.episode_return = env.episode_return + env.compensation
+    entry.length = env.elapsed
+    entry.success = env.success
+    progress.logged_episodes += 1
+
+
+@inlined
+def advance(progress: Any, n_done: int) -> None:
+    """How much of the training remains, and what the schedules say to that."""
+    if progress.episode_budget > 0:
+        progress.budget_episodes += n_done
+        share_done = max(float(progress.budget_episodes), 1e-9) / progress.episode_budget
+        progress.total_timesteps = progress.num_timesteps / share_done
+    progress.remaining = 1.0 - float(progress.num_timesteps) / progress.total_timesteps
+    progress.exploration = schedule_value(progress.exploration_schedule, progress.remaining)
+    progress.learning_rate = schedule_value(progress.learning_rate_schedule, progress.remaining)
+
+
+@inlined
+def learn_and_count(agent: Any, envs: Any, progress: Any) -> None:
+    """What the interpreted loop does between two steps."""
+    n_done = 0
+    for i in range(len(envs)):
+        n_done += envs[i].done
+    advance(progress, n_done)
+    learn_from_step(agent, envs, progress)
+    progress.episodes += n_done
+
+
+@kernel
+def learn_from_last_step(agent: Any, envs: Any, progress: Any) -> None:
+    """Learn from the step that `run_block` has left."""
+    learn_and_count(agent, envs, progress)
+
+
+@kernel
+def run_block(
+    world: Any,
+    agent: Any,
+    envs: Any,
+    handles: Any,
+    progress: Any,
+    log: Any,
+    n_steps: int,
+    max_episodes: int,
+    compensated: bool,
+) -> int:
+    """Act for ``n_steps``, learning after each of them but the last.
+
+    The last step is left to be learnt from by `learn_from_last_step`, since callbacks come before
+    that.
+
+    Args:
+        world: the dynamics.
+        agent: how it acts and learns.
+        envs: a record for each environment, with the state that the world needs, shape (n,).
+        handles: of the environments' generators, shape (n,).
+        progress: a record of type `PROGRESS`.
+        log: what is written down.
+        n_steps: steps of every environment.
+        max_episodes: stop after the step on which so many episodes have ended.
+        compensated: how Python's `sum` adds.
+
+    Returns:
+        The number of steps taken.
+    """
+    progress.logged_episodes = 0
+    for t in range(n_steps):
+        for i in range(len(envs)):
+            act(agent, envs[i], progress)
+        for i in range(len(envs)):
+            env = envs[i]
+            step(world, env, handles[i])
+            end_step(env, world.time_limit, compensated)
+            note_step(log, env, i, t)
+            if env.done:
+                note_episode(log.episodes, env, progress, i, t)
+                begin_episode(env)
+                reset(world, env, handles[i])
+        progress.num_timesteps += len(envs)
+        if t == n_steps - 1 or progress.logged_episodes >= max_episodes:
+            return t + 1
+        learn_and_count(agent, envs, progress)
+    return n_steps

@@ -1,0 +1,273 @@
+"""What all tabular agents share: their arguments, their tables, and how they act and learn."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Unpack
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import FloatSchedule
+
+from agents.common.exploration import STRATEGIES, action_probabilities, draws_per_choice
+from agents.common.online import Transitions
+from agents.common.schedules import epsilon_schedule
+from agents.common.setting_checks import (
+    check_above_zero,
+    check_epsilons,
+    check_option,
+    check_share,
+    check_space,
+    settings_of,
+)
+from agents.common.signatures import CommonArguments, ExplorationDecay, TieBreaking
+from agents.compiled.engine_choice import EngineChoice, choose_engine
+from agents.compiled.generators import handles_of
+from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
+from agents.compiled.training_records import UNDECIDED
+from agents.tabular.q_table_policy import QTablePolicy
+from agents.tabular.tabular_arguments import ExplorationStrategy
+from agents.tabular.temporal_difference import (
+    Room,
+    Tables,
+    TabularAgent,
+    act_on_values,
+    no_commitment,
+    td_learning,
+)
+from agents.tabular.workspace import Workspace
+from mdp.array_types import Floats, Ints
+
+
+class TabularAlgorithm(LearningAlgorithm):
+    """Temporal-difference control on a table of action values.
+
+    Args:
+        policy: ``"QTablePolicy"``.
+        env: environment with `Discrete` observations and actions, or its id.
+        learning_rate: step size, constant or scheduled, or ``"sample_average"`` for 1/N(s, a).
+        gamma: discount factor.
+        exploration: ``"epsilon_greedy"``; ``"boltzmann"`` (softmax of value / temperature); or
+            ``"gaussian_noise"`` (greedy in value + noise_std / (episode + 1) * normal noise, the
+            episodes counted over all environments).
+        exploration_fraction: share of training over which epsilon falls.
+        exploration_initial_eps: epsilon at the start.
+        exploration_final_eps: epsilon at the end of that share.
+        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
+        temperature: of ``"boltzmann"``, above 0, constant or scheduled.
+        noise_std: of ``"gaussian_noise"``, constant or scheduled.
+        tie_breaking: as in `LearningAlgorithm`.
+        initial_q: value of every entry of the table at the start; high values are optimistic.
+        initial_q_std: standard deviation of normal noise on the entries at the start.
+        skip_terminal_update: learn nothing from the step that terminates an episode, a common
+            omission in hand-written programs, here to reproduce their results.
+        engine: ``"compiled"`` trains on a compiled copy of the environments, to the same bits and
+            a hundred times faster, and is refused where there is none; ``"interpreted"`` calls
+            them step by step; ``"auto"`` compiles where it can.
+        policy_kwargs: further arguments of the policy.
+        kwargs: as in `OnlineAlgorithm`.
+
+    Raises:
+        ValueError: if an argument lies outside its range or a space does not fit.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
+    policy: QTablePolicy
+    n_tables: ClassVar[int] = 1
+    parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
+
+    # What the training loops call; `next_value` is each algorithm's own.
+    act = act_on_values
+    learn_from_step = td_learning
+    commit = no_commitment
+
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_workspace")
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "QTablePolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: StepSize = 0.1,
+        gamma: float = 0.99,
+        exploration: ExplorationStrategy = "epsilon_greedy",
+        exploration_fraction: float = 0.5,
+        exploration_initial_eps: float = 1.0,
+        exploration_final_eps: float = 0.05,
+        exploration_decay: ExplorationDecay = "linear",
+        temperature: float | Schedule = 1.0,
+        noise_std: float | Schedule = 1.0,
+        tie_breaking: TieBreaking = "random",
+        initial_q: float = 0.0,
+        initial_q_std: float = 0.0,
+        skip_terminal_update: bool = False,
+        engine: EngineChoice = "auto",
+        policy_kwargs: dict[str, Any] | None = None,
+        **kwargs: Unpack[CommonArguments],
+    ) -> None:
+        self.gamma = gamma
+        self.exploration = exploration
+        self.exploration_fraction = exploration_fraction
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_decay = exploration_decay
+        self.temperature = temperature
+        self.noise_std = noise_std
+        self.initial_q = initial_q
+        self.initial_q_std = initial_q_std
+        self.skip_terminal_update = skip_terminal_update
+        self.engine = engine
+        self.engine_in_use = ""
+        self.mean_td_error = 0.0
+        self._next_actions: Ints = np.empty(0, dtype=np.int64)
+        self._workspace: Workspace | None = None
+        super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
+
+    def _check_arguments(self) -> None:
+        check_space(self, "observations", self.observation_space)
+        check_space(self, "actions", self.action_space)
+        check_option("exploration", self.exploration, ExplorationStrategy)
+        check_option("engine", self.engine, EngineChoice)
+        check_epsilons(self)
+        check_share(settings_of(self, "gamma"))
+        check_above_zero(settings_of(self, "temperature"))
+
+    def _make_policy(self) -> QTablePolicy:
+        policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            n_tables=self.n_tables,
+            **self.policy_kwargs,
+        )
+        noise = self.rng.standard_normal(policy.q_tables.shape)
+        policy.q_tables.copy_(th.from_numpy(self.initial_q + self.initial_q_std * noise))
+        return policy
+
+    def _make_exploration_schedule(self) -> Schedule:
+        if self.exploration == "boltzmann":
+            return FloatSchedule(self.temperature)
+        if self.exploration == "gaussian_noise":
+            return FloatSchedule(self.noise_std)
+        return epsilon_schedule(
+            self.exploration_decay,
+            self.exploration_initial_eps,
+            self.exploration_final_eps,
+            self.exploration_fraction,
+        )
+
+    @property
+    def strategy(self) -> int:
+        """How the agent explores around its values, one of `agents.common.exploration`."""
+        return STRATEGIES[self.exploration]
+
+    @property
+    def exploration_rate(self) -> float:
+        """How much the agent explores now: epsilon, temperature or standard deviation."""
+        rate = super().exploration_rate
+        if self.exploration == "gaussian_noise":
+            return rate / (self._episode_num + 1)
+        return rate
+
+    def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
+        """The agent as compiled functions see it, its tables in the memory of its policy."""
+        values = self.policy.q_tables.numpy()
+        n_actions = values.shape[2]
+        n_draws = draws_per_choice(self.strategy, n_actions)
+        return TabularAgent(
+            self.settings()[0],
+            Tables(values, self.policy.visit_counts.numpy()),
+            Room(np.empty(n_actions), np.empty(n_draws)),
+            handles_of([rng])[0],
+        )
+
+    def _begin_episodes(self) -> None:
+        self._next_actions = np.full(self.n_envs, UNDECIDED)
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        engine = choose_engine(self, callback, log_interval)
+        if engine is not None:
+            engine.run(total_timesteps)
+            return
+        self._workspace = self._make_workspace(self.rng, self.n_envs)
+        try:
+            super()._run(total_timesteps, callback, log_interval)
+        finally:
+            self._workspace = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy's arrays would no longer be its policy's.
+        return {**self.__dict__, "_workspace": None}
+
+    def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Write what the compiled loop goes on from into its records."""
+        envs["next_action"] = self._next_actions
+        progress["mean_td_error"] = self.mean_td_error
+
+    def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Go on from where the compiled loop is."""
+        self._next_actions = envs["next_action"].copy()
+        self.mean_td_error = float(progress["mean_td_error"][0])
+
+    def _present_workspace(self) -> Workspace:
+        """The one of the training under way, up to date."""
+        workspace = self._workspace or self._make_workspace(self.rng, self.n_envs)
+        remaining = self._current_progress_remaining
+        workspace.note_progress(
+            self.exploration_schedule(remaining), self.lr_schedule(remaining), self._episode_num
+        )
+        return workspace
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> Workspace:
+        return Workspace(self.compiled_agent(rng), rng, n)
+
+    def _choose_actions(self) -> Ints:
+        return self._present_workspace().act(self._last_obs, self._next_actions)
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        self.mean_td_error = self._present_workspace().learn(transitions, self._next_actions)
+        self._n_updates += self.n_envs
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The greedy action, or an exploring one unless ``deterministic``, as DQN has it.
+
+        Takes one state index or an array of shape (n,), and returns actions of the same shape and
+        ``state``; ``episode_start`` is not used.
+        """
+        if deterministic:
+            return super().predict(observation, state, episode_start, deterministic)
+        obs = np.asarray(observation, dtype=np.int64)
+        workspace = self._make_workspace(self.predict_rng, obs.size)
+        rate = self.exploration_schedule(self._current_progress_remaining)
+        workspace.note_progress(rate, 0.0, self._episode_num)
+        actions = workspace.act(obs.reshape(-1), np.full(obs.size, UNDECIDED))
+        return actions.reshape(obs.shape), state
+
+    def action_probabilities(self) -> Floats:
+        """What the exploring policy does now, shape (S, A).
+
+        Raises:
+            ValueError: for Gaussian noise, whose probabilities have no closed form.
+        """
+        return action_probabilities(
+            self.strategy,
+            self.policy.q_table,
+            self.exploration_rate,
+            random_ties=self.tie_breaking == "random",
+        )
+
+    def _record_training(self) -> None:
+        self.logger.record("rollout/exploration_rate", self.exploration_rate)
+        self.logger.record("train/mean_absolute_td_error", self.mean_td_error)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if not self.averages_samples:
+            rate = self.lr_schedule(self._current_progress_remaining)
+            self.logger.record("train/learning_rate", rate)

@@ -1,0 +1,192 @@
+"""Acting on a table of action values, and moving its entries towards their targets.
+
+Compiled functions, shared by the interpreted and the compiled training loop. An update bootstraps
+from ``values`` of shape (T, S, A): one table, or two for double Q-learning. Termination is folded
+into the discount, which is 0 then, so that a truncated episode still bootstraps. What an algorithm
+adds is `next_value`, and `commit` where it decides on its next action before the update.
+
+Source: Sutton and Barto (2nd edition), chapter 6.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from agents.common.exploration import GAUSSIAN_NOISE, choose_action
+from agents.common.step_sizes import step_size
+from agents.compiled.dispatch import by_type
+from agents.compiled.generators import generator_of
+from agents.compiled.loop import act, learn_from_step
+from agents.compiled.training_records import UNDECIDED
+from mdp.array_types import Floats, Ints
+from mdp.machine_code import inlined, kernel
+
+
+class Tables(NamedTuple):
+    """What an agent knows, in the memory of its policy.
+
+    Attributes:
+        values: action values, shape (T, S, A).
+        visit_counts: updates of each entry so far, shape (T, S, A).
+    """
+
+    values: Floats
+    visit_counts: Ints
+
+
+class Room(NamedTuple):
+    """Where numbers are worked out; what it holds between two calls means nothing.
+
+    Attributes:
+        values: a number for each action, shape (A,).
+        draws: the random numbers of one choice, shape (draws_per_choice,).
+    """
+
+    values: Floats
+    draws: Floats
+
+
+class TabularAgent(NamedTuple):
+    """An agent as compiled functions see it.
+
+    Attributes:
+        settings: a record of the type that its class has.
+        tables: what it knows.
+        room: for its work.
+        rng: a handle of its generator.
+    """
+
+    settings: Any
+    tables: Tables
+    room: Room
+    rng: Any
+
+
+@by_type
+def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
+    """What follows the step, as the target of the update of ``table`` has it.
+
+    ``agent.room.values`` holds the values of that table in ``env.next_obs``; ``env.uniform`` is a
+    number in [0, 1), uniform where there are several tables.
+    """
+    raise NotImplementedError
+
+
+@by_type
+def commit(agent: TabularAgent, env: Any, progress: Any) -> None:
+    """Decide on ``env.next_action`` where the update needs it."""
+
+
+@inlined
+def no_commitment(agent: TabularAgent, env: Any, progress: Any) -> None:
+    """The next action is chosen when it is due."""
+
+
+@inlined
+def exploration_rate(agent: TabularAgent, progress: Any) -> float:
+    """How much to explore now: epsilon, temperature or standard deviation."""
+    if agent.settings.strategy == GAUSSIAN_NOISE:
+        return float(progress.exploration / (progress.episodes + 1))
+    return float(progress.exploration)
+
+
+@inlined
+def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
+    """An action by the mean of the tables' values."""
+    settings, tables, room = agent.settings, agent.tables, agent.room
+    rng = generator_of(agent.rng)
+    for k in range(len(room.draws)):
+        if settings.strategy == GAUSSIAN_NOISE:
+            room.draws[k] = rng.standard_normal()
+        else:
+            room.draws[k] = rng.random()
+    for action in range(len(room.values)):
+        room.values[action] = tables.values[0, obs, action]
+        if tables.values.shape[0] > 1:
+            room.values[action] = 0.5 * (room.values[action] + tables.values[1, obs, action])
+    rate = exploration_rate(agent, progress)
+    return choose_action(settings.strategy, room.values, rate, settings.tie_scale, room.draws)
+
+
+@inlined
+def act_on_values(agent: TabularAgent, env: Any, progress: Any) -> None:
+    """Do what was committed to, or choose."""
+    env.action = env.next_action
+    env.next_action = UNDECIDED
+    if env.action == UNDECIDED:
+        env.action = choose(agent, env.obs, progress)
+
+
+@inlined
+def update(agent: TabularAgent, env: Any, progress: Any) -> float:
+    """Move one entry towards its target, and return the TD error.
+
+    ``env.uniform`` decides which of two tables is updated.
+    """
+    settings, tables, room = agent.settings, agent.tables, agent.room
+    table = int(env.uniform * tables.values.shape[0])
+    for action in range(len(room.values)):
+        room.values[action] = tables.values[table, env.next_obs, action]
+    discount = 0.0 if env.terminated else settings.gamma
+    target = env.reward + discount * next_value(agent, env, progress, table)
+    tables.visit_counts[table, env.obs, env.action] += 1
+    count = tables.visit_counts[table, env.obs, env.action]
+    size = step_size(progress.learning_rate, settings.averages_samples, count)
+    td_error = target - tables.values[table, env.obs, env.action]
+    tables.values[table, env.obs, env.action] += size * td_error
+    return float(td_error)
+
+
+@inlined
+def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
+    """All commitments, then all random numbers of the updates, then the updates in order."""
+    for i in range(len(envs)):
+        commit(agent, envs[i], progress)
+    if agent.tables.values.shape[0] > 1:
+        for i in range(len(envs)):
+            envs[i].uniform = generator_of(agent.rng).random()
+    total_error = 0.0
+    for i in range(len(envs)):
+        env = envs[i]
+        if not (env.terminated and agent.settings.skip_terminal_update):
+            total_error += abs(update(agent, env, progress))
+        env.obs = env.new_obs
+        if env.done:
+            env.next_action = UNDECIDED
+    progress.mean_td_error = total_error / len(envs)
+
+
+# Python hands over arrays one by one, which costs it less than to take tuples of them apart.
+
+
+@kernel
+def act_in_all(
+    settings: Any,
+    envs: Any,
+    progress: Any,
+    values: Floats,
+    visit_counts: Ints,
+    room: Floats,
+    draws: Floats,
+    rng: Any,
+) -> None:
+    """`act` in each environment, for the interpreted loop."""
+    agent = TabularAgent(settings[0], Tables(values, visit_counts), Room(room, draws), rng[0])
+    for i in range(len(envs)):
+        act(agent, envs[i], progress[0])
+
+
+@kernel
+def learn_from_all(
+    settings: Any,
+    envs: Any,
+    progress: Any,
+    values: Floats,
+    visit_counts: Ints,
+    room: Floats,
+    draws: Floats,
+    rng: Any,
+) -> None:
+    """`learn_from_step` of all environments, for the interpreted loop."""
+    agent = TabularAgent(settings[0], Tables(values, visit_counts), Room(room, draws), rng[0])
+    learn_from_step(agent, envs, progress[0])

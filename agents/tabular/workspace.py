@@ -1,0 +1,81 @@
+"""What compiled functions work on while the interpreted loop steps the environments."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from agents.common.online import Transitions
+from agents.compiled.generators import handles_of
+from agents.compiled.training_records import ENV, PROGRESS
+from agents.tabular.temporal_difference import TabularAgent, act_in_all, learn_from_all
+from mdp.array_types import Ints
+
+
+class Workspace:
+    """Records of n environments, of how far the training is, and of the agent.
+
+    Args:
+        agent: whose settings and tables are worked on in place.
+        rng: its generator, or another one to choose by.
+        n: number of environments, or of observations.
+    """
+
+    def __init__(self, agent: TabularAgent, rng: np.random.Generator, n: int) -> None:
+        self.envs = np.zeros(n, dtype=ENV)
+        self.progress = np.zeros(1, dtype=PROGRESS)
+        # In the order that `act_in_all` and `learn_from_all` take them in.
+        self.arrays = (
+            np.array([agent.settings]),
+            self.envs,
+            self.progress,
+            *agent.tables,
+            *agent.room,
+            handles_of([rng]),
+        )
+        # Looked up once: finding a field takes longer than filling it.
+        self.fields = {name: self.envs[name] for name in ENV.names or ()}
+
+    def note_progress(self, exploration: float, learning_rate: float, episodes: int) -> None:
+        """Set how much to explore, the step size, and how many episodes have ended."""
+        progress = self.progress
+        progress["exploration"] = exploration
+        progress["learning_rate"] = learning_rate
+        progress["episodes"] = episodes
+
+    def act(self, obs: Any, next_actions: Ints) -> Ints:
+        """An action for each observation, the one that was committed to where there is one.
+
+        Args:
+            obs: observations, shape (n,).
+            next_actions: commitments, or `UNDECIDED`, which they all are afterwards; shape (n,).
+        """
+        fields = self.fields
+        fields["obs"][:] = obs
+        fields["next_action"][:] = next_actions
+        act_in_all(*self.arrays)
+        next_actions[:] = fields["next_action"]
+        actions: Ints = fields["action"].copy()
+        return actions
+
+    def learn(self, transitions: Transitions, next_actions: Ints) -> float:
+        """Learn from a step of each environment.
+
+        Args:
+            transitions: the steps.
+            next_actions: filled in with what the agent commits to, shape (n,).
+
+        Returns:
+            The mean absolute TD error.
+        """
+        fields = self.fields
+        fields["obs"][:] = transitions.obs
+        fields["action"][:] = transitions.actions
+        fields["reward"][:] = transitions.rewards
+        fields["terminated"][:] = transitions.terminated
+        fields["done"][:] = transitions.dones
+        fields["next_obs"][:] = transitions.next_obs
+        learn_from_all(*self.arrays)
+        next_actions[:] = fields["next_action"]
+        return float(self.progress["mean_td_error"][0])

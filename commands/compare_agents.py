@@ -1,0 +1,100 @@
+"""``compare.py``: its flags, and what it does."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from commands.parsing import OneLineParser, command_line
+
+EPILOG = """\
+examples:
+  python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
+  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --n-episodes 500
+  python compare.py studies/warehouse-learning-rate.yml
+  python compare.py studies/warehouse-learning-rate.yml --quick
+  python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
+
+The same command again does the runs that are missing, and no other.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The flags; those of single runs mean what they mean to train.py."""
+    parser = OneLineParser(
+        prog="compare.py",
+        description="Compare agents on environments over seeds: tables, figures, and a page.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("study", nargs="?", metavar="STUDY.yml", help="a study file, instead of --env and --algos")
+    add("--env", nargs="+", default=[], metavar="ID", help="environments")
+    add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (see train.py --list)")
+    add("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: the study's, or 10)")
+    add("-n", "--n-timesteps", type=int, metavar="N", help="environment steps of each run")
+    add("--n-episodes", type=int, metavar="N", help="episodes instead of steps")
+    add(
+        "-params",
+        "--hyperparams",
+        nargs="+",
+        default=[],
+        metavar="KEY:VALUE",
+        help="hyperparameters to change in every agent",
+    )
+    add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
+    add(
+        "--quick",
+        action="store_true",
+        dest="is_quick",
+        help="few seeds and a small budget, for a first look",
+    )
+    _add_output_flags(parser)
+    _add_log_flags(parser)
+    return parser
+
+
+def _add_log_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
+    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
+    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
+    add("--trust", action="store_true", help="load a library zip from outside logs/")
+
+
+def _add_output_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("judgement and output").add_argument
+    add("--metric", help="what verdicts are about: final, best, area, regret, ...")
+    add("--margin", type=float, help="difference within which agents count as equivalent")
+    add("--episodes-table", type=int, metavar="N", help="average, min, max of every N episodes")
+    add("--render-every", type=int, default=0, metavar="N", help="film an episode every N of them")
+    add("-j", "--jobs", type=int, default=0, metavar="N", help="runs at once (default: all cores)")
+    add("--name", help="name of the study's folder (default: from the study)")
+    add("-f", "--log-folder", default="logs/studies", help="folder above all studies")
+    add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
+    add("--no-report", action="store_true", help="tables alone: no figures and no page")
+
+
+def main() -> int:
+    """Parse the arguments and do what they ask for; the exit code."""
+    args = build_parser().parse_args()
+    if args.logged or args.policy:
+        from commands.compare_on_log import compare_on_log
+
+        return compare_on_log(args)
+    from commands.study_request import study_spec
+
+    study = study_spec(args)
+    from experiments.study_plan import plan
+
+    root = Path(args.log_folder) / study.name
+    planned = plan(study, root)
+    from experiments.child_processes import start_server
+
+    if not all(run.is_finished for run in planned):
+        start_server()  # it imports the libraries while this process does
+    from commands.study_output import run_study
+
+    return run_study(
+        study, planned, root, command_line(), n_workers=args.jobs, with_page=not args.no_report
+    )

@@ -1,0 +1,31 @@
+"""``compare.py --logged``: policies judged on logged pulls."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from commands.terminal import table_console
+from experiments.off_policy.logged_policies import compare_policies, read_logged, read_policy
+from pipeline.errors import UserError
+from report.off_policy_table import print_comparison
+
+
+def compare_on_log(args: argparse.Namespace) -> int:
+    """Judge the policies of ``--policy`` on the log of ``--logged``; the exit code.
+
+    Raises:
+        UserError: if one of them cannot be read, or they do not go together.
+    """
+    if not (args.logged and args.policy):
+        raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
+    if args.study or args.env or args.algos:
+        raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
+    data = read_logged(args.logged)
+    policies = [read_policy(Path(path), args.trust) for path in args.policy]
+    names = [policy.name for policy in policies]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise UserError(f"--policy names {twice} twice")
+    print_comparison(table_console(highlight=False), compare_policies(data, policies))
+    return 0

@@ -1,0 +1,106 @@
+"""``train.py``: its flags, and what it does."""
+
+from __future__ import annotations
+
+import argparse
+
+from commands.parsing import INTERRUPT, OneLineParser, command_line
+
+EPILOG = """\
+examples:
+  python train.py --env Warehouse-v0 --algo ppo
+  python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
+  python train.py --env CartPole-v1 --algo dqn -params learning_rate:1e-3 buffer_size:50000
+  python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
+  python train.py --list
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The flags, with the names and meanings that rl_zoo3 gives them."""
+    parser = OneLineParser(
+        prog="train.py",
+        description="Train an agent and leave a run folder with its models, curves and settings.",
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--algo", default="ppo", help="agent (default: ppo; see --list)")
+    add("--env", default="CartPole-v1", help="environment id (default: CartPole-v1; see --list)")
+    add("--list", action="store_true", help="list agents and environments, and which fit which")
+    _add_training_flags(parser)
+    _add_output_flags(parser)
+    return parser
+
+
+def _add_training_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("how long, and on what settings").add_argument
+    add("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="environment steps")
+    add("--n-episodes", type=int, default=-1, metavar="N", help="episodes instead of steps")
+    add("--seed", type=int, default=-1, help="seed of everything (default: a random one)")
+    add(
+        "-params",
+        "--hyperparams",
+        nargs="+",
+        default=[],
+        metavar="KEY:VALUE",
+        help="hyperparameters to change, e.g. learning_rate:0.01",
+    )
+    add("-conf", "--conf-file", metavar="YAML", help="hyperparameters from another file")
+    add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
+    add(
+        "--eval-env-kwargs",
+        nargs="+",
+        default=[],
+        metavar="KEY:VALUE",
+        help="environment arguments for evaluation alone",
+    )
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
+    add("-i", "--trained-agent", default="", metavar="ZIP", help="go on training this agent")
+    add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
+    add("--device", default="auto", help="torch device (default: auto)")
+    add("--num-threads", type=int, default=1, help="torch threads (default: 1)")
+
+
+def _add_output_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("evaluation and output").add_argument
+    add("--eval-freq", type=int, metavar="N", help="steps between evaluations; -1 for none")
+    add("--eval-episodes", type=int, default=20, metavar="N", help="episodes of each (default: 20)")
+    add("--n-eval-envs", type=int, default=10, metavar="N", help="environments for it (10)")
+    add("--save-freq", type=int, default=-1, metavar="N", help="steps between checkpoints")
+    add("-f", "--log-folder", default="logs", help="folder above all runs (default: logs)")
+    add("-uuid", "--uuid", action="store_true", help="add a unique id to the run folder's name")
+    add("-tb", "--tensorboard-log", default="", metavar="DIR", help="write TensorBoard logs there")
+    add("--log-interval", type=int, default=-1, metavar="N", help="episodes between log records")
+    add(
+        "--verbose",
+        type=int,
+        default=1,
+        help="0 silent, 1 progress and summary (default), 2 the library's tables as well",
+    )
+    add("-P", "--progress", action="store_true", help="a live bar even without a terminal")
+
+
+def main() -> int:
+    """Parse the arguments and do what they ask for; the exit code."""
+    args = build_parser().parse_args()
+    if args.list:
+        from commands.listing import print_lists
+
+        print_lists()
+        return 0
+    from commands.train_request import train_spec
+
+    spec = train_spec(args)
+    from rich.console import Console
+
+    from commands.run_output import print_header, print_outcome
+    from pipeline.run_folder import INTERRUPTED
+    from pipeline.training import carry_out, prepare
+
+    console = Console(quiet=spec.verbose < 1)
+    training = prepare(spec, console, vars(args), command_line())
+    print_header(console, spec)
+    outcome = carry_out(training)
+    print_outcome(console, spec, outcome)
+    return INTERRUPT if outcome.state == INTERRUPTED else 0

@@ -1,0 +1,246 @@
+"""The results of the runs of a study, as tables with one row for each observation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from experiments.bandit_results import batch_rows, read_pulls, run_regret
+from experiments.pull_statistics import PullStatistics
+from experiments.study_plan import PlannedRun
+from experiments.study_spec import StudySpec
+from mdp.array_types import Floats
+from pipeline.run_folder import Run
+from verdicts import area_under_curve, steps_to_threshold
+
+LAST_EPISODES = 100
+TRAINING_POINTS = 100
+
+
+@dataclass(frozen=True)
+class StudyResults:
+    """A study and its runs.
+
+    Attributes:
+        study: what was asked for.
+        root: its folder.
+        summary: one row for each finished run, see `RUN_COLUMNS`.
+        curves: learning curves of all runs, see `CURVE_COLUMNS`.
+        planned: all runs of the study, also those that failed.
+        pulls: on bandits, figures by pull, by labels of agent and environment.
+    """
+
+    study: StudySpec
+    root: Path
+    summary: pd.DataFrame
+    curves: pd.DataFrame
+    planned: tuple[PlannedRun, ...]
+    pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
+
+
+# Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.
+RUN_COLUMNS = (
+    "agent",
+    "algo",
+    "environment",
+    "env_id",
+    "seed",
+    "final",  # return of the final policy
+    "final_std",  # standard deviation of an episode's return
+    "final_length",
+    "success_rate",
+    "exact",  # whether these are expectations rather than means of episodes
+    "optimum",
+    "best_blind",
+    "gap",  # optimum minus final
+    "score",  # final, with 0 at the best blind policy and 1 at the optimum
+    "best",  # highest return of an evaluation during training
+    "best_timesteps",
+    "area",  # mean return over the learning curve
+    "training",  # mean return of the training episodes
+    "last_episodes",  # of the last 100
+    "regret",  # on bandits, best expected rewards less those of the arms pulled, summed up
+    "threshold",
+    "steps_to_threshold",  # infinite where it was never reached
+    "episodes_to_threshold",
+    "n_timesteps",
+    "n_episodes",
+    "seconds",
+    "engine",
+    "path",
+)
+
+# Columns of `StudyResults.curves`. Each row is an evaluation, or the mean of some episodes of
+# training at the end of the last.
+CURVE_COLUMNS = (
+    "agent",
+    "environment",
+    "seed",
+    "kind",  # "evaluation" or "training"
+    "step",
+    "episode",
+    "seconds",
+    "value",  # return
+)
+
+
+# Columns that have the same name in ``run.json``.
+_FIGURES = ("success_rate", "exact", "optimum", "best_blind", "gap", "score")
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The training episodes of a run in the order in which they ended.
+
+    Attributes:
+        steps: environment steps done by then, over all environments, shape (n,).
+        returns: undiscounted returns, shape (n,).
+        seconds: time since the beginning, shape (n,).
+    """
+
+    steps: Floats
+    returns: Floats
+    seconds: Floats
+
+
+def read_episodes(run: Run) -> Episodes:
+    """The training episodes that Monitor wrote down."""
+    tables = []
+    paths = sorted(run.path.glob("*.monitor.csv"))
+    for path in paths:
+        table = pd.read_csv(path, skiprows=1, usecols=["r", "l", "t"], engine="c")
+        # The environments are stepped together: all have done what one of them has.
+        table["step"] = len(paths) * table["l"].cumsum()
+        tables.append(table)
+    rows = pd.concat(tables).sort_values("step", kind="stable")
+    return Episodes(*(rows[name].to_numpy(dtype=np.float64) for name in ("step", "r", "t")))
+
+
+def read_results(study: StudySpec, planned: Sequence[PlannedRun], root: Path) -> StudyResults:
+    """Read all runs that have finished."""
+    rows, curves = [], []
+    pulls = read_pulls([run for run in planned if run.is_finished])
+    for run in planned:
+        if run.is_finished and run.is_batch:
+            rows += batch_rows(run, pulls[run.agent, run.environment])
+        elif run.is_finished:
+            episodes = read_episodes(run.run)
+            evaluations = _evaluation_curve(run, episodes)
+            rows.append(_summary_row(study, run, episodes, evaluations))
+            curves += [evaluations, _training_curve(run, episodes)]
+    return StudyResults(
+        study,
+        root,
+        pd.DataFrame(rows, columns=list(RUN_COLUMNS)),
+        pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=CURVE_COLUMNS),
+        tuple(planned),
+        pulls,
+    )
+
+
+def _curve(planned: PlannedRun, kind: str, columns: dict[str, Floats]) -> pd.DataFrame:
+    table = pd.DataFrame(columns)
+    table["agent"], table["environment"] = planned.agent, planned.environment
+    table["seed"], table["kind"] = planned.seed, kind
+    return table[list(CURVE_COLUMNS)]
+
+
+def _evaluation_curve(planned: PlannedRun, episodes: Episodes) -> pd.DataFrame:
+    path = planned.run.evaluations_path
+    steps, returns = np.empty(0), np.empty(0)
+    if path.exists():
+        with np.load(path) as evaluations:
+            steps = evaluations["timesteps"].astype(np.float64)
+            returns = evaluations["results"].mean(axis=1)
+    seconds = np.interp(
+        steps, np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
+    )
+    columns = {
+        "step": steps,
+        "episode": np.searchsorted(episodes.steps, steps, side="right").astype(np.float64),
+        "seconds": seconds,
+        "value": returns,
+    }
+    return _curve(planned, "evaluation", columns)
+
+
+def _training_curve(planned: PlannedRun, episodes: Episodes) -> pd.DataFrame:
+    """Means over blocks of episodes, so that no run has more than `TRAINING_POINTS`."""
+    n = len(episodes.returns)
+    block = max(-(-n // TRAINING_POINTS), 1)
+    ends = np.minimum(np.arange(block, n + block, block), n)
+    starts = np.arange(0, n, block)
+    sums = np.add.reduceat(episodes.returns, starts) if n else np.empty(0)
+    columns = {
+        "step": episodes.steps[ends - 1],
+        "episode": ends.astype(np.float64),
+        "seconds": episodes.seconds[ends - 1],
+        "value": sums / (ends - starts),
+    }
+    return _curve(planned, "training", columns)
+
+
+def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float | None:
+    """The return that counts as solved; None where nobody says."""
+    import gymnasium as gym
+
+    if study.threshold is not None:
+        return study.threshold
+    if "optimum" in final:
+        optimum, blind = float(final["optimum"]), float(final["best_blind"])
+        return blind + 0.95 * (optimum - blind)
+    registered = gym.spec(env_id.rpartition(":")[2]).reward_threshold
+    return None if registered is None else float(registered)
+
+
+def _mean(values: Floats) -> float:
+    return float(values.mean()) if len(values) else float("nan")
+
+
+def _summary_row(
+    study: StudySpec, planned: PlannedRun, episodes: Episodes, evaluations: pd.DataFrame
+) -> dict[str, Any]:
+    info = planned.run.read_info()
+    final = info["final"] or {}
+    threshold = threshold_of(study, planned.spec.env_id, final)
+    steps = evaluations["step"].to_numpy()
+    values = evaluations["value"].to_numpy()
+    reached = float("nan")
+    if threshold is not None and len(steps):
+        reached = steps_to_threshold(steps, values, threshold)
+    return {
+        "agent": planned.agent,
+        "algo": planned.spec.algo,
+        "environment": planned.environment,
+        "env_id": planned.spec.env_id,
+        "seed": planned.seed,
+        "final": final.get("mean_return"),
+        "final_std": final.get("std_return"),
+        "final_length": final.get("mean_length"),
+        **{name: final.get(name) for name in _FIGURES},
+        "best": info["best_mean_return"],
+        "best_timesteps": info["best_timesteps"],
+        "area": area_under_curve(steps, values) if len(steps) else None,
+        "training": _mean(episodes.returns),
+        "last_episodes": _mean(episodes.returns[-LAST_EPISODES:]),
+        "regret": run_regret(planned),
+        "threshold": threshold,
+        "steps_to_threshold": reached,
+        "episodes_to_threshold": _episodes_by(episodes, reached),
+        "n_timesteps": info["n_timesteps"],
+        "n_episodes": len(episodes.returns),
+        "seconds": info["seconds"],
+        "engine": info.get("engine"),
+        "path": str(planned.path),
+    }
+
+
+def _episodes_by(episodes: Episodes, step: float) -> float:
+    if not np.isfinite(step):
+        return step
+    return float(np.searchsorted(episodes.steps, step, side="right"))

@@ -1,0 +1,188 @@
+"""Where machine code is kept between two processes, and when it may be used again.
+
+Numba keeps the machine code of a function beside its source, and throws it away when that one file
+changes. A function that others inline can change without that: they go on running as it was. Here
+the machine code lies in a folder named for a digest of every source that can take part in it, and
+of the versions of Python, Numba and NumPy. A changed source has another digest, and so never meets
+old code; nor does another processor, which Numba itself keeps apart.
+
+Not kept on disk is code that depends on sources outside of this project, such as a user's own
+update rule, and whatever is compiled in a process whose sources have changed since it began. Where
+no folder can be written, nothing is kept.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.metadata
+import logging
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+
+# Everything that is compiled, and every constant that is compiled into it, stands in these.
+PACKAGES = ("mdp", "agents")
+ROOT = Path(__file__).resolve().parent.parent
+
+# Folders of other digests that are left, so that one can go back and forth between two versions.
+KEPT_BESIDE = 3
+
+logger = logging.getLogger("mdp.machine_code")
+
+Stamps = tuple[tuple[str, int, int], ...]
+
+
+def source_stamps() -> Stamps:
+    """Path, time of change in nanoseconds and size of every source, in the order of their names."""
+    paths = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+    return tuple((str(path), (at := path.stat()).st_mtime_ns, at.st_size) for path in paths)
+
+
+@cache
+def stamps_at_start() -> Stamps:
+    """The stamps when they were first asked for in this process."""
+    return source_stamps()
+
+
+@cache
+def digest() -> str:
+    """Of the sources and of what compiles them; Numba itself tells processors apart."""
+    compilers = ("numba", "numpy", "llvmlite")
+    lines = [f"{name} {importlib.metadata.version(name)}" for name in compilers]
+    lines.append(f"python {platform.python_version()}")
+    for path, _, _ in stamps_at_start():
+        content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
+        lines.append(f"{Path(path).relative_to(ROOT)} {content}")
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:32]
+
+
+def parents() -> Iterator[Path]:
+    """Folders that machine code may be kept in, the best first."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    if given:
+        yield Path(given) / "yardstick"
+    yield Path(__file__).parent / "__pycache__" / "machine_code"
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    yield Path(home) / "yardstick" / "machine_code"
+
+
+@cache
+def folder() -> Path | None:
+    """Where this process keeps machine code; None where no folder can be written."""
+    for parent in parents():
+        chosen = parent / digest()
+        try:
+            chosen.mkdir(parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=chosen).close()
+            os.utime(chosen)
+        except OSError:
+            continue
+        remove_old(parent)
+        return chosen
+    logger.warning("no folder for machine code can be written: it is compiled anew in each process")
+    return None
+
+
+def remove_old(parent: Path) -> None:
+    """Leave the folder in use and the few that were used last before it."""
+    dated = []
+    for path in parent.iterdir():
+        try:
+            dated.append((path.stat().st_mtime_ns, path))
+        except OSError:
+            continue  # another process has removed it
+    for _, path in sorted(dated)[: -1 - KEPT_BESIDE]:
+        if path.name != digest():
+            shutil.rmtree(path, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def numba_cache_dir(path: Path) -> Iterator[None]:
+    """Let functions that are decorated meanwhile keep their machine code in ``path``."""
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    config.CACHE_DIR = str(path)
+    try:
+        yield
+    finally:
+        config.CACHE_DIR = before
+
+
+class CheckedCache:
+    """Numba's cache of one function, asked only where what it holds is sure to be right.
+
+    Args:
+        cache: Numba's own.
+        name: of the function, for the log.
+    """
+
+    def __init__(self, cache: Any, name: str) -> None:
+        self._cache = cache
+        self._name = name
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._cache, name)
+
+    def load_overload(self, signature: Any, target_context: Any) -> Any:
+        """The machine code for these argument types, or None where it has to be compiled."""
+        found = None
+        if is_keyed(signature):
+            try:
+                found = self._cache.load_overload(signature, target_context)
+            except Exception as error:  # noqa: BLE001  # a damaged file can fail in any way
+                logger.warning("the machine code of %s is damaged: %s", self._name, error)
+                self._forget()
+        if found is None:
+            logger.info("compiling %s", self._name)
+        return found
+
+    def _forget(self) -> None:
+        """Let the function begin with an empty index again."""
+        with contextlib.suppress(OSError):
+            self._cache.flush()
+
+    def save_overload(self, signature: Any, data: Any) -> None:
+        """Keep the machine code for these argument types, where the digest stands for it."""
+        if not is_keyed(signature):
+            return
+        try:
+            self._cache.save_overload(signature, data)
+        except OSError as error:  # a full disk, say: the code is there, for this process
+            logger.warning("the machine code of %s is not kept: %s", self._name, error)
+
+
+def is_keyed(signature: Any) -> bool:
+    """Whether the digest covers all that the machine code for these argument types depends on."""
+    own = all(module.partition(".")[0] in PACKAGES for module in modules_of(signature))
+    return own and source_stamps() == stamps_at_start()
+
+
+def modules_of(kind: Any) -> Iterator[str]:
+    """Where the classes and rules live that argument types, or one such type, are made of."""
+    if hasattr(kind, "args"):  # a signature
+        kind = kind.args
+    if isinstance(kind, tuple | list):
+        for part in kind:
+            yield from modules_of(part)
+        return
+    instance_class = getattr(kind, "instance_class", None)
+    if instance_class not in (None, tuple):
+        yield instance_class.__module__
+    for name in getattr(kind, "fields", ()):
+        if isinstance(name, str) and name.startswith(RULE_PREFIX):
+            yield name.removeprefix(RULE_PREFIX).partition(" ")[0]
+    for part in (getattr(kind, "dtype", None), *getattr(kind, "types", ())):
+        if part is not None and part is not kind:
+            yield from modules_of(part)
+
+
+# A record whose first field is named so is of the rule that the rest of the name stands for.
+RULE_PREFIX = "rule "

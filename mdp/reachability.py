@@ -1,0 +1,63 @@
+"""What can be reached at all, from arrays as `mdp.transition_model.TransitionModel` has them.
+
+The model itself asks for this, so nothing here knows the model.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mdp.array_types import AnyInts, Bools, Floats
+from mdp.machine_code import compiled
+
+
+def reached_from(
+    start: Bools, prob: Floats, next_state: AnyInts, terminated: Bools, allowed: Bools
+) -> Bools:
+    """The states that are visited from some of ``start`` on, by allowed actions.
+
+    Args:
+        start: where an episode may begin, bool of shape (S,).
+        prob: probabilities of the outcomes, shape (S, A, K).
+        next_state: where they lead, shape (S, A, K).
+        terminated: whether they end the episode, shape (S, A, K).
+        allowed: the actions that count, bool of shape (S, A).
+
+    Returns:
+        bool of shape (S,): ``start``, and whatever non-terminating transitions of positive
+        probability lead to.
+    """
+    found = start.copy()
+    _flood(prob, next_state, terminated, allowed, found)
+    return found
+
+
+@compiled
+def _flood(
+    prob: Floats,
+    next_state: AnyInts,
+    terminated: Bools,
+    allowed: Bools,
+    found: Bools,
+) -> None:
+    """Extend ``found`` by all that it leads to, in place."""
+    n_states, n_actions, n_outcomes = prob.shape
+    stack = np.empty(n_states, np.int64)
+    height = 0
+    for state in range(n_states):
+        if found[state]:
+            stack[height] = state
+            height += 1
+    while height > 0:
+        height -= 1
+        state = stack[height]
+        for action in range(n_actions):
+            if not allowed[state, action]:
+                continue
+            for k in range(n_outcomes):
+                reached = next_state[state, action, k]
+                leads = prob[state, action, k] > 0 and not terminated[state, action, k]
+                if leads and not found[reached]:
+                    found[reached] = True
+                    stack[height] = reached
+                    height += 1

@@ -1,0 +1,24 @@
+"""Writing an agent, and what belongs to it, whole or not at all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from pipeline.files import replacing
+from pipeline.run_folder import Run
+
+
+def save_model(model: BaseAlgorithm, path: Path) -> None:
+    """Write the agent to ``path``, whole or not at all."""
+    with replacing(path) as draft:
+        model.save(draft)
+
+
+def save_normalization(model: BaseAlgorithm, run: Run) -> None:
+    """Write the running statistics of VecNormalize, where the agent trains under one."""
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        with replacing(run.vecnormalize_path) as draft:
+            normalization.save(str(draft))

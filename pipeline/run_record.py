@@ -1,0 +1,37 @@
+"""What a run folder says of the run before it begins: what was asked for, with which versions."""
+
+from __future__ import annotations
+
+import platform
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import version
+from typing import Any
+
+import yaml
+
+from pipeline.files import write_text
+from pipeline.run_folder import Run
+from pipeline.train_spec import TrainSpec
+
+RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
+
+
+def write_settings(run: Run, spec: TrainSpec, command: str) -> None:
+    """Write the hyperparameters and the command, where rl_zoo3 has them."""
+    write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
+    write_text(run.params_path / "command.txt", command + "\n")
+
+
+def write_arguments(run: Run, spec: TrainSpec, args: Mapping[str, Any]) -> None:
+    """Write the arguments of the command, as rl_zoo3 does."""
+    # Its tools take env_kwargs for the environment's arguments and let them win over config.yml.
+    args = {**args, "env_kwargs": spec.saved_hyperparams.get("env_kwargs")}
+    write_text(run.params_path / "args.yml", yaml.safe_dump(args))
+
+
+@cache
+def recorded_versions() -> dict[str, str]:
+    """The versions that a run's results may depend on."""
+    packages = {package: version(package) for package in RECORDED_PACKAGES}
+    return {"python": platform.python_version(), **packages}

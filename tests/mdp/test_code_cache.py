@@ -1,0 +1,207 @@
+"""Machine code is what the sources say, whatever was compiled before."""
+
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from mdp import code_cache
+
+ROOT = Path(code_cache.__file__).resolve().parent.parent
+
+# Q-learning on the cliff: what the greedy policy is worth, and what was compiled for that.
+TRAIN = """
+import logging, sys
+names = []
+class Note(logging.Handler):
+    def emit(self, record):
+        names.append(record.getMessage())
+log = logging.getLogger("mdp.machine_code")
+log.addHandler(Note()); log.setLevel(logging.INFO); log.propagate = False
+from stable_baselines3.common.env_util import make_vec_env
+from agents.tabular.q_learning import QLearning
+model = QLearning(env=make_vec_env("CliffWalking-v1", seed=0), seed=0, learning_rate=0.5)
+model.learn(20_000)
+from envs.known_models import transition_model
+from mdp import policy_return
+import gymnasium as gym
+greedy = model.policy.q_table.argmax(axis=1)
+value = policy_return(transition_model(gym.make("CliffWalking-v1")), greedy, 200).expected_return
+print(round(float(value)), model.engine_in_use, int("compiling run_block" in names), len(names))
+print([name for name in names if not name.startswith("compiling")], file=sys.stderr)
+"""
+
+
+@pytest.fixture(scope="module")
+def checkout(tmp_path_factory):
+    """A copy of what trains, and nothing compiled in it."""
+    root = tmp_path_factory.mktemp("checkout")
+    for package in ("mdp", "agents", "envs"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / package, root / package, ignore=ignored)
+    return root
+
+
+def run(root, code=TRAIN, **environment):
+    variables = {**os.environ, "PYTHONPATH": str(root), **environment}
+    variables.pop("NUMBA_CACHE_DIR", None)
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        cwd=root,
+        env=variables,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+def outcome(root, **environment):
+    """Value of the policy, engine, and whether the loop was compiled."""
+    value, engine, compiled, _ = run(root, **environment).stdout.split()
+    return int(value), engine, compiled == "1"
+
+
+def test_a_changed_rule_is_what_runs(checkout):
+    """The rule stands in another file than the loop, and the constant in yet another."""
+    rule = checkout / "agents" / "common" / "exploration.py"
+    before = rule.read_text()
+    assert outcome(checkout) == (-13, "compiled", True)
+    assert outcome(checkout) == (-13, "compiled", False)
+    wrong = before.replace("        highest = max(highest, values[action])\n", "        pass\n")
+    assert wrong != before
+    rule.write_text(wrong)
+    value, engine, compiled = outcome(checkout)
+    rule.write_text(before)
+    assert (engine, compiled) == ("compiled", True)
+    assert value < -13
+    # Back again, what was compiled at first is still there and right.
+    assert outcome(checkout) == (-13, "compiled", False)
+
+
+def test_damaged_machine_code_is_compiled_anew(checkout):
+    outcome(checkout)
+    folder = checkout / "mdp" / "__pycache__" / "machine_code"
+    for place, path in enumerate(sorted(folder.rglob("*.nb[ic]"))):
+        size = path.stat().st_size
+        path.write_bytes(b"" if place % 2 else path.read_bytes()[: size // 2])
+    assert outcome(checkout) == (-13, "compiled", True)
+    assert outcome(checkout) == (-13, "compiled", False)
+
+
+def test_where_nothing_can_be_written_it_is_compiled_in_memory(checkout, tmp_path):
+    root = tmp_path / "closed"
+    shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
+    # A file where a folder is wanted stops root as well, whom permissions do not stop.
+    (root / "mdp" / "__pycache__").write_text("")
+    (tmp_path / "home").write_text("")
+    done = run(root, HOME=str(tmp_path / "home"), XDG_CACHE_HOME="")
+    assert done.stdout.split()[:2] == ["-13", "compiled"]
+    assert "Traceback" not in done.stderr
+    warnings = run(
+        root,
+        "import mdp.machine_code, mdp.sweeps, agents.tabular.q_learning",
+        HOME=str(tmp_path / "home"),
+        XDG_CACHE_HOME="",
+    ).stderr
+    assert warnings.strip() == (
+        "no folder for machine code can be written: it is compiled anew in each process"
+    )
+
+
+def test_a_home_serves_where_the_checkout_cannot_be_written(checkout, tmp_path):
+    root = tmp_path / "closed"
+    shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
+    (root / "mdp" / "__pycache__").write_text("")
+    cache = tmp_path / "cache"
+    code = "from mdp import code_cache; print(code_cache.folder())"
+    folder = Path(run(root, code, XDG_CACHE_HOME=str(cache)).stdout.strip())
+    assert folder.parent == cache / "yardstick" / "machine_code"
+    assert folder.is_dir()
+
+
+def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
+    """It has the old sources or the new: the digest cannot tell, so nothing is kept."""
+    code = """
+    from pathlib import Path
+    from mdp import code_cache
+    folder = code_cache.folder()
+    source = Path("mdp/graph.py")
+    source.write_text(source.read_text() + "\\n")
+    import numpy as np
+    from agents.common.exploration import highest_value
+    print(highest_value(np.array([1.0, 3.0, 2.0])))
+    print(len(list(folder.rglob("exploration.highest_value*"))))
+    """
+    before = (checkout / "mdp" / "graph.py").read_text()
+    (checkout / "mdp" / "graph.py").write_text(f"# Another digest.\n{before}")
+    try:
+        assert run(checkout, code).stdout.split() == ["3.0", "0"]
+    finally:
+        (checkout / "mdp" / "graph.py").write_text(before)
+
+
+OWN_RULE = """
+import sys
+from mdp.machine_code import inlined
+from agents.tabular.q_learning import QLearning
+from stable_baselines3.common.env_util import make_vec_env
+WORTH = {worth}
+
+@inlined
+def own_value(agent, env, progress, table):
+    return WORTH
+
+class Own(QLearning):
+    next_value = own_value
+"""
+USE = """
+from {module} import Own
+from stable_baselines3.common.env_util import make_vec_env
+def q(cls):
+    env = make_vec_env("FrozenLake-v1", seed=0)
+    model = cls(env=env, seed=0, learning_rate=1.0, gamma=1.0, exploration_decay="constant")
+    model.learn(500)
+    return float(model.policy.q_table[0, 0]), model.engine_in_use
+print(*q(Own))
+"""
+
+
+def test_a_rule_of_the_users_own_compiles_and_follows_its_source(checkout):
+    module = checkout / "own_rules.py"
+    for worth in (7.0, 9.0):
+        module.write_text(OWN_RULE.format(worth=worth))
+        printed = run(checkout, USE.format(module="own_rules")).stdout.split()
+        assert printed == [str(worth), "compiled"]
+    module.unlink()
+
+
+def test_a_class_that_is_defined_anew_is_compiled_anew(checkout):
+    """As in a notebook, where a cell is run once more."""
+    again = OWN_RULE.format(worth=7.0) + USE.format(module="__main__").replace(
+        "from __main__ import Own", ""
+    )
+    again += again.replace("7.0", "9.0")
+    assert run(checkout, again).stdout.split() == ["7.0", "compiled", "9.0", "compiled"]
+
+
+def test_old_machine_code_goes_away(tmp_path, monkeypatch):
+    parent = tmp_path / "machine_code"
+    now = time.time()
+    for age in range(6):
+        (parent / f"old{age}").mkdir(parents=True)
+        os.utime(parent / f"old{age}", (now - 100 - age, now - 100 - age))
+    own = parent / code_cache.digest()
+    own.mkdir()
+    os.utime(own, (now - 1000, now - 1000))
+    code_cache.remove_old(parent)
+    left = {path.name for path in parent.iterdir()}
+    assert left >= {own.name, "old0", "old1"}
+    assert len(left) <= 2 + code_cache.KEPT_BESIDE
+    assert "old5" not in left
