@@ -227,3 +227,15 @@ def published_files() -> Iterator[Path]:
     inside = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
     beside = [path for path in ROOT.iterdir() if path.is_file()]
     return (path for path in [*inside, *beside] if path.suffix in {*text, ""})
+
+
+def test_all_that_is_compiled_stands_where_the_digest_of_machine_code_looks() -> None:
+    """Compiled functions, and what is compiled into them, are sources of `mdp` and `agents`."""
+    from mdp.code_cache import PACKAGES as DIGESTED
+
+    compiling = {
+        str(path.relative_to(ROOT))
+        for path in sources()
+        if re.search(r"^\s*(import numba|from (numba|mdp\.machine_code))", path.read_text(), re.M)
+    }
+    assert {Path(name).parts[0] for name in compiling} == set(DIGESTED)
