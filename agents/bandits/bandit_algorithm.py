@@ -52,7 +52,7 @@ class BanditAlgorithm(LearningAlgorithm):
         ValueError: if an argument lies outside its range, or a space or a reward does not fit.
     """
 
-    _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_compiled")
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities")
 
     def __init__(
         self,
@@ -64,7 +64,6 @@ class BanditAlgorithm(LearningAlgorithm):
         self._pending: list[list[Any]] = []
         self._infos: list[dict[str, Any]] = []
         self._probabilities: NDArray[np.float64] = np.ones(0)
-        self._compiled: Any = None
         super().__init__(policy, env, learning_rate, **kwargs)
 
     def _check_arguments(self) -> None:
@@ -100,26 +99,6 @@ class BanditAlgorithm(LearningAlgorithm):
         assert self.env is not None
         check_kinds(self, self.env)
         return super()._setup_learn(total_timesteps, callback, *args, **kwargs)
-
-    def compiled_agent(self, rng: np.random.Generator) -> Any:
-        """The agent as compiled functions see it; None where it works in Python."""
-        return None
-
-    def _agent(self, rng: np.random.Generator) -> Any:
-        """The same, which in training is made once: that takes longer than a pull."""
-        in_training = self._compiled is not None and rng is self.rng
-        return self._compiled if in_training else self.compiled_agent(rng)
-
-    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        self._compiled = self.compiled_agent(self.rng)
-        try:
-            super()._run(total_timesteps, callback, log_interval)
-        finally:
-            self._compiled = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy's arrays would no longer be its policy's.
-        return {**self.__dict__, "_compiled": None}
 
     def _begin_episodes(self) -> None:
         self._pending = [[] for _ in range(self.n_envs)]

@@ -148,17 +148,22 @@ class LinearBanditAgent(BanditAlgorithm):
             handles_of([rng])[0],
         )
 
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
+        return self.compiled_agent(rng)
+
     def _contexts(self, obs: NDArray[Any]) -> Floats:
         return features(self.observation_space, obs)
 
     def _choose(self, contexts: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
         arms = np.empty(len(contexts), dtype=np.int64)
-        choose_all_by_model(self._agent(rng), contexts, self.progress()[0], arms)
+        choose_all_by_model(
+            self._workspace_for(rng, len(contexts)), contexts, self.progress()[0], arms
+        )
         return arms, np.ones(len(arms))
 
     def _learn(self, pull: Pull) -> None:
         record = np.array([(0, *pull[1:])], dtype=PULL)[0]
-        learn_one_by_model(self._agent(self.rng), record, np.array(pull.context))
+        learn_one_by_model(self._workspace_for(self.rng, 1), record, np.array(pull.context))
 
 
 class LinUCB(LinearBanditAgent):

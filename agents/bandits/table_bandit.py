@@ -109,17 +109,30 @@ class TableBandit(BanditAlgorithm):
             handles_of([rng])[0],
         )
 
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
+        return self.compiled_agent(rng)
+
     def _contexts(self, obs: NDArray[Any]) -> Ints:
         rows = obs.astype(np.int64).reshape(-1)
         return np.zeros_like(rows) if self.ignore_context else rows
 
     def _choose(self, contexts: Ints, rng: np.random.Generator) -> tuple[Ints, Floats]:
         arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
-        choose_arms(self._agent(rng), contexts, self.progress()[0], arms, probabilities)
+        choose_arms(
+            self._workspace_for(rng, len(contexts)),
+            contexts,
+            self.progress()[0],
+            arms,
+            probabilities,
+        )
         return arms, probabilities
 
     def _learn(self, pull: Pull) -> None:
-        learn_one(self._agent(self.rng), np.array([tuple(pull)], dtype=PULL)[0], self.progress()[0])
+        learn_one(
+            self._workspace_for(self.rng, 1),
+            np.array([tuple(pull)], dtype=PULL)[0],
+            self.progress()[0],
+        )
 
     def estimates(self, tables: ScoreTables) -> Floats:
         """What the agent takes the arms' mean rewards for, shapes (..., contexts, arms)."""

@@ -8,6 +8,7 @@ from typing import Any, ClassVar, Literal, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
@@ -52,7 +53,7 @@ class LearningAlgorithm(OnlineAlgorithm):
     }
     settings_type: ClassVar[np.dtype[np.void]]
 
-    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule")
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspace")
 
     def __init__(
         self,
@@ -65,6 +66,7 @@ class LearningAlgorithm(OnlineAlgorithm):
     ) -> None:
         self.tie_breaking = tie_breaking
         self.exploration_schedule: Schedule = FloatSchedule(0.0)
+        self._workspace: Any = None
         super().__init__(policy, env, cast(Any, learning_rate), policy_kwargs, **kwargs)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -113,6 +115,28 @@ class LearningAlgorithm(OnlineAlgorithm):
     def exploration_rate(self) -> float:
         """How much the agent explores now; 0 for agents that explore by a rule of their own."""
         return self.exploration_schedule(self._current_progress_remaining)
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
+        """What compiled functions work on: for ``n`` environments, drawing from ``rng``."""
+        return None
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        # Made once in a training: that takes longer than a step.
+        self._workspace = self._make_workspace(self.rng, self.n_envs)
+        try:
+            super()._run(total_timesteps, callback, log_interval)
+        finally:
+            self._workspace = None
+
+    def _workspace_for(self, rng: np.random.Generator, n: int) -> Any:
+        """The one of the training under way, or another where none is or it does not fit."""
+        if self._workspace is not None and rng is self.rng:
+            return self._workspace
+        return self._make_workspace(rng, n)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A copy's arrays would no longer be its policy's.
+        return {**self.__dict__, "_workspace": None}
 
     def settings(self) -> NDArray[np.void]:
         """The record of the agent's settings, alone in an array."""

@@ -84,8 +84,6 @@ class TabularAlgorithm(LearningAlgorithm):
     learn_from_step = td_learning
     commit = no_commitment
 
-    _rebuilt = (*LearningAlgorithm._rebuilt, "_workspace")
-
     def __init__(
         self,
         policy: str | type[BasePolicy] = "QTablePolicy",
@@ -122,7 +120,6 @@ class TabularAlgorithm(LearningAlgorithm):
         self.engine_in_use = ""
         self.mean_td_error = 0.0
         self._next_actions: Ints = np.empty(0, dtype=np.int64)
-        self._workspace: Workspace | None = None
         super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
@@ -191,15 +188,7 @@ class TabularAlgorithm(LearningAlgorithm):
         if engine is not None:
             engine.run(total_timesteps)
             return
-        self._workspace = self._make_workspace(self.rng, self.n_envs)
-        try:
-            super()._run(total_timesteps, callback, log_interval)
-        finally:
-            self._workspace = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        # A copy's arrays would no longer be its policy's.
-        return {**self.__dict__, "_workspace": None}
+        super()._run(total_timesteps, callback, log_interval)
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Write what the compiled loop goes on from into its records."""
@@ -213,7 +202,7 @@ class TabularAlgorithm(LearningAlgorithm):
 
     def _present_workspace(self) -> Workspace:
         """The one of the training under way, up to date."""
-        workspace = self._workspace or self._make_workspace(self.rng, self.n_envs)
+        workspace: Workspace = self._workspace_for(self.rng, self.n_envs)
         remaining = self._current_progress_remaining
         workspace.note_progress(
             self.exploration_schedule(remaining), self.lr_schedule(remaining), self._episode_num
