@@ -40,14 +40,14 @@ class Horizon:
 
 
 class BlockCallback(BaseCallback):
-    """A callback that says when it will act, and bears to be left out before that."""
+    """A callback that says when it will act, so that it need not be called before that."""
 
     def horizon(self) -> Horizon:
-        """When it may act next; by default it does not mind when it is called."""
+        """When it may act next; by default never by itself."""
         return Horizon()
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
-        """Take note of ``n_calls`` calls that were left out, in which ``n_episodes`` ended."""
+        """Count ``n_calls`` calls that were left out, in which ``n_episodes`` ended."""
         self.n_calls += n_calls
 
 
@@ -138,7 +138,7 @@ def horizon(callback: BaseCallback) -> Horizon:
 
 
 def pass_over(callback: BaseCallback, n_calls: int, n_episodes: int) -> None:
-    """Let each of the callbacks take note of calls that were left out."""
+    """Let each of the callbacks count calls that were left out."""
     for member in members(callback):
         if hasattr(member, "pass_over"):
             member.pass_over(n_calls, n_episodes)

@@ -106,7 +106,7 @@ def _row(kind: float, schedule: ExponentialSchedule | LinearSchedule) -> Schedul
 
 
 def schedule_row(schedule: float | Schedule) -> ScheduleRow | None:
-    """The schedule as four numbers; None for a foreign function."""
+    """The schedule as four numbers; None for a Python function."""
     if isinstance(schedule, FloatSchedule):
         return schedule_row(schedule.value_schedule)
     if isinstance(schedule, ConstantSchedule):

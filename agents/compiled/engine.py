@@ -156,7 +156,7 @@ class CompiledEngine:
         self.agent.take_over(self.envs, self.progress)
 
     def _read(self) -> None:
-        """Take over the state of agent and environments."""
+        """Copy the state of agent and environments into the records."""
         agent, progress = self.agent, self.progress[0]
         budgets = (m for m in members(self.callback) if isinstance(m, EpisodeBudget))
         for budget in budgets:

@@ -47,7 +47,7 @@ class EnvStates:
         self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]
 
     def read(self) -> None:
-        """Take over where the environments are."""
+        """Copy the state of the environments into the records."""
         for i, env in enumerate(self.vec_env.envs):
             base: Any = env.unwrapped
             record = self.records[i]

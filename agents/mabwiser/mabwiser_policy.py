@@ -105,7 +105,7 @@ class MABWiserPolicy(BasePolicy):
         return th.from_numpy(self.parts) if self.fitted else th.zeros(0, dtype=th.float64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        """Take over the state of another policy of the kind."""
+        """Copy the state of another policy of the kind."""
         if len(state) == 0:
             return
         width = len(features(self.observation_space, self._any_observation())[0])
