@@ -120,7 +120,7 @@ def test_a_hang_counts_as_caught(toy, drawing):
     copy = running.Checkout(toy, toy.parent / "copy")
     [mutant] = [m for m in drawing.mutants_of("toy/sizes.py", loop.encode()) if m.new == "pass"]
     found = imports.Imports(toy, ["toy", "tests"])
-    assert copy.judge(mutant, found, limit=5) == "a time-out"
+    assert copy.judge(mutant, found, (), limit=5) == "a time-out"
     assert (copy.path / "toy/sizes.py").read_text() == loop
 
 

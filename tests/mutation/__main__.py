@@ -19,7 +19,7 @@ from pathlib import Path
 
 from drawing import Mutant, draw
 from imports import Imports
-from running import Checkout, test_files
+from running import ABOVE, Checkout, test_files
 
 ROOT = Path(__file__).resolve().parents[2]
 # A hang is recognised by this: so many times the tests' usual time, plus what a cold start takes.
@@ -38,6 +38,7 @@ def main() -> int:
         for mutant in drawn:
             print(mutant.describe((root / mutant.path).read_bytes()))
         return 0
+    above = () if arguments.own else ABOVE.get(arguments.package, ())
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         copies = [Checkout(root, Path(folder) / f"copy-{i}") for i in range(arguments.jobs)]
         start = time.monotonic()
@@ -46,15 +47,17 @@ def main() -> int:
             print(f"without any error, {broken} fails already", file=sys.stderr)
             return 2
         limit = PATIENCE * (time.monotonic() - start) + COLD_START
-        caught = _judge_all(drawn, copies, root, limit)
+        caught = _judge_all(drawn, copies, above, limit)
     print(f"caught {caught} of {len(drawn)} ({100 * caught / len(drawn):.0f} %)")
     return 0
 
 
-def _judge_all(drawn: list[Mutant], copies: list[Checkout], root: Path, limit: float) -> int:
+def _judge_all(
+    drawn: list[Mutant], copies: list[Checkout], above: tuple[str, ...], limit: float
+) -> int:
     """Print each error with what became of it; how many were caught."""
-    folders = [path.name for path in root.iterdir() if path.is_dir() and path.name[0] != "."]
-    imports = Imports(copies[0].path, folders)
+    folders = [path.name for path in copies[0].path.iterdir() if path.is_dir()]
+    imports = Imports(copies[0].path, [name for name in folders if name[0] != "."])
     free: queue.Queue[Checkout] = queue.Queue()
     for copy in copies:
         free.put(copy)
@@ -62,20 +65,20 @@ def _judge_all(drawn: list[Mutant], copies: list[Checkout], root: Path, limit: f
     def judge(mutant: Mutant) -> str | None:
         copy = free.get()
         try:
-            return copy.judge(mutant, imports, limit)
+            return copy.judge(mutant, imports, above, limit)
         finally:
             free.put(copy)
 
+    sources = copies[0].path
+    described = {m: m.describe((sources / m.path).read_bytes()) for m in drawn}
     caught = 0
     with ThreadPoolExecutor(len(copies)) as pool:
         futures = {pool.submit(judge, mutant): mutant for mutant in drawn}
         for future in as_completed(futures):
             mutant, failure = futures[future], future.result()
             caught += failure is not None
-            verdict = f"caught by {failure}" if failure else "SURVIVED"
-            print(
-                f"{mutant.describe((root / mutant.path).read_bytes())}\n    {verdict}", flush=True
-            )
+            print(described[mutant])
+            print(f"    caught by {failure}" if failure else "    SURVIVED", flush=True)
     return caught
 
 
@@ -85,6 +88,7 @@ def _parse() -> argparse.Namespace:
     parser.add_argument("-n", type=int, default=25, help="how many errors (25)")
     parser.add_argument("--seed", type=int, default=0, help="which errors (0)")
     parser.add_argument("--jobs", type=int, default=2, help="how many at a time (2)")
+    parser.add_argument("--own", action="store_true", help="run the tests of the package alone")
     parser.add_argument("--list", action="store_true", help="draw them, and run nothing")
     parser.add_argument("--root", type=Path, default=ROOT, help="another checkout than this one")
     return parser.parse_args()

@@ -63,31 +63,38 @@ class Checkout:
         failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", output, re.MULTILINE)
         return failed[1] if failed else "a time-out" if code is None else f"pytest's code {code}"
 
-    def judge(self, mutant: Mutant, imports: Imports, limit: float) -> str | None:
-        """The test that catches an error, or None when it survives them all."""
+    def judge(
+        self, mutant: Mutant, imports: Imports, above: tuple[str, ...], limit: float
+    ) -> str | None:
+        """The test that catches an error, or None when it survives them all.
+
+        Args:
+            mutant: the error.
+            imports: of the checkout.
+            above: the packages whose tests get a chance after those of the mutated one.
+            limit: seconds after which the tests of the mutated package are taken to hang.
+        """
         file = self.path / mutant.path
         source = file.read_bytes()
         fresh = mutant.path in imports.beneath_machine_code()
+        distances = imports.distances(mutant.path)
+        own, others = (
+            # Those that stand nearest to the mutated module come first.
+            sorted(test_files(self.path, packages), key=lambda test: distances.get(test, 99))
+            for packages in ((mutant.path.partition("/")[0],), above)
+        )
         try:
             file.write_bytes(mutant.applied_to(source))
-            failure = self.first_failure(self._tests(mutant, imports), limit, fresh)
-            above = [] if failure else self._tests(mutant, imports, above=True)
-            if above:
-                failure = self.first_failure(above, LIMIT_ABOVE, fresh)
+            failure = self.first_failure(own, limit, fresh)
+            if failure or not others:
+                return failure
+            failure = self.first_failure(others, LIMIT_ABOVE, fresh)
         finally:
             file.write_bytes(source)
-        if above and failure:
-            # These tests were not seen green before: they may fail without the error as well.
-            known = failure.startswith("tests")
-            return None if known and self.first_failure([failure], limit) else failure
+        # These tests were not seen green before: they may fail without the error as well.
+        if failure and failure.startswith("tests") and self.first_failure([failure], limit):
+            return None
         return failure
-
-    def _tests(self, mutant: Mutant, imports: Imports, above: bool = False) -> list[str]:
-        """The files of tests, those that stand nearest to the mutated module first."""
-        package = mutant.path.partition("/")[0]
-        folders = ABOVE.get(package, ()) if above else (package,)
-        distances = imports.distances(mutant.path)
-        return sorted(test_files(self.path, folders), key=lambda file: distances.get(file, 99))
 
 
 def test_files(root: Path, packages: tuple[str, ...]) -> list[str]:
