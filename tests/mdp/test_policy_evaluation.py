@@ -206,7 +206,7 @@ def test_marks_of_the_wrong_shape_are_refused() -> None:
 
 
 def test_evaluation_is_fast() -> None:
-    """Of a policy that wanders for a thousand steps; in time of this process, whoever else is busy."""
+    """Of a policy that wanders for a thousand steps; in the time of this process alone."""
     model = model_of("Warehouse-v0")
     uniform = blind_policies(model)[0]
     times = []
