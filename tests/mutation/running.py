@@ -78,9 +78,13 @@ class Checkout:
         source = file.read_bytes()
         fresh = mutant.path in imports.beneath_machine_code()
         distances = imports.distances(mutant.path)
+
+        def remoteness(test: str) -> tuple[bool, int]:
+            return file.stem not in test, distances.get(test, 99)
+
         own, others = (
-            # Those that stand nearest to the mutated module come first.
-            sorted(test_files(self.path, packages), key=lambda test: distances.get(test, 99))
+            # The module's namesakes come first, then those that stand nearest to it.
+            sorted(test_files(self.path, packages), key=remoteness)
             for packages in ((mutant.path.partition("/")[0],), above)
         )
         try:

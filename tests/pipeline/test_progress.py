@@ -84,6 +84,9 @@ def test_in_a_terminal_a_bar(clock):
     assert text.rindex("\x1b[?25h") > text.rindex("\x1b[?25l")
     assert display.bar is None
     display.close()
+    # Nor does it write anything once it has let go, as after an interruption.
+    display.on_training_end()
+    assert display.console.file.getvalue() == text
 
 
 def test_a_bar_moves_ten_times_a_second_at_most(clock):
