@@ -2,6 +2,10 @@
 PYTHON ?= python3
 ARGS ?=
 PYTEST_ARGS ?= -n auto --maxprocesses 8 --dist worksteal
+PACKAGE ?= mdp
+N ?= 25
+SEED ?= 0
+JOBS ?= 2
 
 BIN := .venv/bin
 STAMP := .venv/.installed
@@ -13,7 +17,7 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help train test lint format bench clean
+.PHONY: help train test lint format bench mutants clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
@@ -37,6 +41,9 @@ format: $(STAMP) ## Format the code and mend what ruff can mend
 
 bench: $(STAMP) ## Run every benchmark
 	@set -e; for file in $(BENCHMARKS); do echo "== $$file"; $(BIN)/python "$$file"; done
+
+mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0 JOBS=2
+	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED) --jobs $(JOBS)
 
 clean: ## Remove caches and builds; .venv and logs/ stay
 	rm -rf build dist *.egg-info .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache

@@ -58,8 +58,10 @@ def finite_part(model: TransitionModel) -> FinitePart:
     allowed = np.repeat(model.reachable[:, None], model.n_actions, axis=1)
     ends = (model.terminated & (model.prob > 0)).any(axis=2)
     endless = allowed & ~ends
-    # Where every step may end the episode, any cost will do.
-    step_cost = -float(model.expected_reward[endless].max()) if endless.any() else 1.0
+    # Where every step may end the episode, any cost will do; one of the rewards' own size makes
+    # the bound of the error as close as it can be.
+    largest = max(1.0, float(np.abs(model.expected_reward[allowed]).max()))
+    step_cost = -float(model.expected_reward[endless].max()) if endless.any() else largest
     rest_actions = np.zeros_like(allowed)
     if step_cost <= ROUNDING:
         step_cost = 0.0

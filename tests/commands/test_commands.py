@@ -315,6 +315,22 @@ def test_nothing_to_play(type_command):
     assert ".gif or .mp4" in err
 
 
+@pytest.mark.parametrize(
+    ("choice", "complaint"),
+    [
+        (["--load-best"], "holds no best_model.zip: its training may not have ended"),
+        (["--load-checkpoint", "7"], "holds no rl_model_7_steps.zip: its training may not have"),
+        (["--load-last-checkpoint"], "holds no checkpoint: train with --save-freq"),
+        (["--exp-id", "9"], "9"),
+    ],
+)
+def test_what_a_run_does_not_hold(type_command, choice, complaint):
+    type_command("train.py", *QUICK, "--eval-freq", "-1")
+    code, out, err = type_command("enjoy.py", *QUICK[:4], "--render", "none", *choice)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert complaint in err
+
+
 def test_a_library_zip_from_elsewhere_wants_trust(type_command, tmp_path):
     from stable_baselines3 import PPO
 

@@ -1,6 +1,7 @@
 """compare.py as a user types it: what is run, what is skipped, and what survives."""
 
 import contextlib
+import importlib.util
 import json
 import os
 import re
@@ -341,6 +342,29 @@ def test_a_mistake_ends_in_one_line_and_leaves_nothing(type_command, folder, mis
     assert (code, out, err.count("\n")) == (2, "", 1)
     assert err.startswith("compare.py: error: ")
     assert complaint in err
+    assert [p for p in sorted(folder.rglob("*")) if "__pycache__" not in str(p)] == before
+
+
+@pytest.mark.parametrize("n_seeds", [1, 3])
+def test_settings_are_checked_before_the_first_run(type_command, folder, n_seeds):
+    before = sorted(folder.rglob("*"))
+    code, out, err = type_command(*PAIR, "--seeds", n_seeds, "--hyperparams", "gamma:1.5")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "gamma" in err
+    assert [p for p in sorted(folder.rglob("*")) if "__pycache__" not in str(p)] == before
+
+
+def test_where_tensorboard_is_missing_it_is_named_beforehand(type_command, folder, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *more: None if name == "tensorboard" else find(name, *more),
+    )
+    before = sorted(folder.rglob("*"))
+    code, out, err = type_command(*PAIR, "-tb")
+    assert (code, out) == (2, "")
+    assert err == "compare.py: error: -tb needs: pip install 'rl-yardstick[tensorboard]'\n"
     assert [p for p in sorted(folder.rglob("*")) if "__pycache__" not in str(p)] == before
 
 

@@ -173,6 +173,64 @@ def test_mistakes_in_a_log_are_named_with_their_line(write: Any, text: str, mess
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(
+    ("column", "accepted", "refused"),
+    [
+        ("arm", ["0", "1", "9999", "1e3", "2.0"], ["-1", "-0.5", "10000", "9999.5", "nan", "inf"]),
+        ("reward", ["0", "-1e308", "1e308", "5e-324"], ["nan", "inf", "-inf", "1e309"]),
+        (
+            "propensity",
+            ["5e-324", "0.5", "0.9999999999999999", "1"],
+            ["0", "-5e-324", "-1", "1.0000000000000002", "2", "nan", "inf"],
+        ),
+        ("age", ["0", "-1e308", "1e308"], ["nan", "inf", "-inf"]),
+    ],
+)
+def test_the_limits_of_each_column_from_both_sides(
+    write: Any, column: str, accepted: list[str], refused: list[str]
+) -> None:
+    row = {"arm": "0", "reward": "1", "propensity": "0.5", "age": "30"}
+
+    def log_with(value: str) -> Path:
+        rows = [row.values(), {**row, column: value}.values()]
+        return write("\n".join(",".join(cells) for cells in [row, *rows]))
+
+    for value in accepted:
+        data = read_log(log_with(value))
+        read = {
+            "arm": data.arms,
+            "reward": data.rewards,
+            "propensity": data.propensities,
+            "age": data.contexts[:, 0],
+        }
+        found = read[column]
+        assert found is not None
+        assert found[1] == float(value)
+    for value in refused:
+        with pytest.raises(ValueError, match=f"line 3: {column} is '{value}', it must be"):
+            read_log(log_with(value))
+
+
+def test_one_pull_is_a_log(write: Any) -> None:
+    data = read_log(write("arm,reward\n3,1\n"))
+    assert (len(data), data.n_arms) == (1, 4)
+
+
+@pytest.mark.parametrize(
+    ("context", "n_contexts", "fits"),
+    [("0", 3, True), ("2", 3, True), ("3", 3, False), ("-1", 3, False), ("0", 1, True)],
+)
+def test_the_first_and_the_last_context_that_an_agent_knows(
+    write: Any, context: str, n_contexts: int, fits: bool
+) -> None:
+    data = read_log(write(f"segment,arm,reward\n0,0,1\n{context},0,1\n"))
+    if fits:
+        assert data.observations(spaces.Discrete(n_contexts)).tolist() == [0, int(context)]
+    else:
+        with pytest.raises(ValueError, match=f"whole numbers from 0 to {n_contexts - 1}"):
+            data.observations(spaces.Discrete(n_contexts))
+
+
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"cannot read .*missing\.csv: No such file or directory"):
         read_log(tmp_path / "missing.csv")

@@ -90,6 +90,7 @@ def test_a_row_for_each_run(tmp_path):
     assert list(results.summary.columns) == list(RUN_COLUMNS)
     row = results.summary.iloc[0]
     assert (row["agent"], row["environment"], row["seed"]) == ("qlearning", "Warehouse-v0", 0)
+    assert (row["algo"], row["env_id"]) == ("qlearning", "Warehouse-v0")
     assert (row["final"], row["gap"], row["score"]) == (90.0, 10.0, 0.9)
     assert (row["optimum"], row["best_blind"], row["best"]) == (OPTIMUM, BLIND, 96.0)
     # 0.95 of the way from 0 to 100, reached at the second evaluation; 6 episodes were over then.
@@ -102,12 +103,57 @@ def test_a_row_for_each_run(tmp_path):
     assert row["path"] == str(planned.path)
 
 
+def test_the_columns_of_the_files_that_others_read():
+    """Once written down here: whoever reads the files reads them by these names."""
+    assert RUN_COLUMNS == (
+        "agent",
+        "algo",
+        "environment",
+        "env_id",
+        "seed",
+        "final",
+        "final_std",
+        "final_length",
+        "success_rate",
+        "exact",
+        "optimum",
+        "best_blind",
+        "gap",
+        "score",
+        "best",
+        "best_timesteps",
+        "area",
+        "training",
+        "last_episodes",
+        "regret",
+        "threshold",
+        "steps_to_threshold",
+        "episodes_to_threshold",
+        "n_timesteps",
+        "n_episodes",
+        "seconds",
+        "engine",
+        "path",
+    )
+    assert CURVE_COLUMNS == (
+        "agent",
+        "environment",
+        "seed",
+        "kind",
+        "step",
+        "episode",
+        "seconds",
+        "value",
+    )
+
+
 def test_learning_curves_by_step_episode_and_time(tmp_path):
     study = study_of(n_seeds=1, agents=("qlearning",))
     (planned,) = plan(study, tmp_path)
     write_run(planned, [(20, 10.0), (60, 96.0)], [(10, float(n)) for n in range(6)])
     curves = read_results(study, [planned], tmp_path).curves
     assert list(curves.columns) == list(CURVE_COLUMNS)
+    assert curves.index.tolist() == list(range(len(curves)))
     evaluations = curves[curves["kind"] == "evaluation"]
     assert evaluations[["step", "episode", "seconds", "value"]].to_numpy().tolist() == [
         [20, 2, 2, 10],

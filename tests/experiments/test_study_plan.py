@@ -126,6 +126,26 @@ def test_settings_that_the_agent_refuses_are_found_beforehand(tmp_path, settings
     check_settings(study_of("qlearning"), plan(study_of("qlearning"), tmp_path))
 
 
+@pytest.mark.parametrize("n_seeds", [1, 2, 5])
+@pytest.mark.parametrize("place", [0, 1])
+def test_every_agent_is_checked_however_few_its_seeds_are(tmp_path, n_seeds, place):
+    agents = [AgentSpec("good", "sarsa"), AgentSpec("bad", "qlearning", {"gamma": 1.5})]
+    study = study_of(*agents[:: 1 - 2 * place], n_seeds=n_seeds)
+    with pytest.raises(UserError, match="gamma"):
+        check_settings(study, plan(study, tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_batch_of_bandit_runs_is_checked_as_well(tmp_path):
+    bandit = EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 10})
+    agent = AgentSpec("ucb", "ucb", {"bonus": 3, "boons": 1})
+    study = study_of(agent, environments=(bandit,), n_seeds=3)
+    planned = plan(study, tmp_path)
+    assert [run.is_batch for run in planned] == [True]
+    with pytest.raises(UserError, match="bonus"):
+        check_settings(study, planned)
+
+
 def record(planned, **fields):
     """What a run that has come to its end leaves."""
     planned.path.mkdir(parents=True, exist_ok=True)

@@ -17,7 +17,7 @@ from verdicts import (
     performance_profile,
     summarise,
 )
-from verdicts.bootstrap import enough_resamples, interval_tail
+from verdicts.bootstrap import check_confidence, enough_resamples, interval_tail
 
 STATISTICS = ("mean", "median", "iqm")
 PLAIN = {"mean": np.mean, "median": np.median, "iqm": lambda x: stats.trim_mean(x, 0.25)}
@@ -174,6 +174,17 @@ def test_wrong_arguments_are_named():
         summarise([], seed=0)
     with pytest.raises(ValueError, match="confidence is 95"):
         summarise([1.0, 2.0], seed=0, confidence=95)
+
+
+@pytest.mark.parametrize("confidence", [-0.1, 0, 1, 1.5, 95, float("nan")])
+def test_confidences_that_are_no_shares(confidence):
+    with pytest.raises(ValueError, match="it must lie between 0 and 1, as 0"):
+        check_confidence(confidence)
+
+
+@pytest.mark.parametrize("confidence", [5e-324, 0.5, 0.95, np.nextafter(1, 0)])
+def test_confidences_that_are(confidence):
+    check_confidence(confidence)
 
 
 # --- coverage ------------------------------------------------------------------------------------

@@ -1,0 +1,173 @@
+"""What is said of a run, and what the lists of agents and environments hold, to the letter."""
+
+import io
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from agents import ALGORITHMS
+from commands import listing
+from commands.run_output import describe, describe_pulls, print_header, print_outcome
+from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+
+
+def console_of(width=200):
+    return Console(file=io.StringIO(), width=width)
+
+
+def spec_of(log_folder="logs", **entry):
+    return TrainSpec(
+        "qlearning", "Lake-v1", split(entry), entry, seed=7, log_folder=Path(log_folder)
+    )
+
+
+SAMPLED = Evaluation(np.array([1.0, 3.0]), np.array([5.0, 7.0]), successes=None)
+EXACT = Evaluation(
+    np.array([70.0]),
+    np.array([9.0]),
+    successes=np.array([0.875]),
+    exact_std=1.0,
+    yardstick=Yardstick(optimum=80.0, blind=-20.0),
+)
+
+
+def outcome_of(**changes):
+    fields = {
+        "run": SimpleNamespace(path=Path("logs/qlearning/Lake-v1_3")),
+        "state": "finished",
+        "n_steps": 12_345,
+        "seconds": 2.0,
+        "final": None,
+        "best_return": None,
+        "best_timesteps": 0,
+        "engine": None,
+        "pulls": None,
+    }
+    return SimpleNamespace(**{**fields, **changes})
+
+
+def pulls_of(**changes):
+    fields = {
+        "n_pulls": 1500,
+        "regret": None,
+        "optimal": 0.0,
+        "reward": None,
+        "n_matched": 0,
+    }
+    return SimpleNamespace(**{**fields, **changes})
+
+
+def printed(outcome, spec):
+    console = console_of()
+    print_outcome(console, spec, outcome)
+    return [line.rstrip() for line in console.file.getvalue().splitlines()]
+
+
+def test_evaluations_in_words():
+    assert describe(SAMPLED) == "return 2.00 ± 1.00 over 2 episodes"
+    assert describe(EXACT) == (
+        "return 70.00 (exact), success 87.5%, optimum 80.00, best blind policy -20.00, score 0.90"
+    )
+
+
+@pytest.mark.parametrize(
+    ("pulls", "words"),
+    [
+        (pulls_of(), "not known: none of 1,500 pulls is in the log"),
+        (
+            pulls_of(reward=0.25, n_matched=1200),
+            "not known; reward 0.2500 a pull over the 1,200 of 1,500 that are in the log",
+        ),
+        (
+            pulls_of(regret=1234.5, optimal=0.97),
+            "1,234.50 over 1,500 pulls; a best arm in 97% of the last 100",
+        ),
+        (
+            pulls_of(regret=0.0, optimal=1.0, n_pulls=40),
+            "0.00 over 40 pulls; a best arm in 100% of the last 40",
+        ),
+    ],
+)
+def test_pulls_in_words(pulls, words):
+    assert describe_pulls(pulls) == words
+
+
+def test_a_run_with_nothing_to_tell():
+    assert printed(outcome_of(), spec_of()) == [
+        "trained  12,345 steps in 2.0 s (6,172 steps/s)",
+        "files    logs/qlearning/Lake-v1_3",
+        "watch    python enjoy.py --algo qlearning --env Lake-v1",
+    ]
+
+
+def test_a_run_with_everything():
+    outcome = outcome_of(
+        state="interrupted",
+        engine="compiled",
+        pulls=pulls_of(),
+        final=SAMPLED,
+        best_return=3.25,
+        best_timesteps=10_000,
+        seconds=0.0,
+        n_steps=0,
+    )
+    assert printed(outcome, spec_of("else where")) == [
+        "interrupted  0 steps in 0.0 s (0 steps/s)",
+        "engine       compiled",
+        "regret       not known: none of 1,500 pulls is in the log",
+        "final        return 2.00 ± 1.00 over 2 episodes",
+        "best         return 3.25, first at step 10,000",
+        "files        logs/qlearning/Lake-v1_3",
+        "watch        python enjoy.py --algo qlearning --env Lake-v1 -f else where",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("entry", "budget"),
+    [({"n_timesteps": 2000}, "2,000 steps"), ({"n_episodes": 1500}, "1,500 episodes")],
+)
+def test_what_is_about_to_be_trained(entry, budget):
+    console = console_of()
+    print_header(console, spec_of(gamma=0.9, **entry))
+    key, value = next(iter(entry.items()))
+    assert console.file.getvalue() == (
+        f"qlearning on Lake-v1, seed 7, {budget}\ngamma=0.9  {key}={value}\n"
+    )
+
+
+# --- lists ----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def lists(monkeypatch):
+    """The lines of both lists, on a wide terminal."""
+    file = io.StringIO()
+    monkeypatch.setattr(listing, "Console", lambda **more: Console(file=file, width=300, **more))
+    listing.print_lists()
+    return [line.rstrip() for line in file.getvalue().splitlines()]
+
+
+def test_every_agent_has_a_line(lists):
+    first, *agents = lists[: len(ALGORITHMS) + 1]
+    width = len("agent (--algo)") + 2
+    width = max(width, *(len(name) + 2 for name in ALGORITHMS))
+    assert first == f"{'agent (--algo)':{width}}what it is"
+    assert agents == [f"{name:{width}}{entry.summary}" for name, entry in ALGORITHMS.items()]
+    # An empty line stands between the lists.
+    assert lists[len(ALGORITHMS) + 1] == ""
+    assert lists[len(ALGORITHMS) + 2].startswith("environment (--env)")
+
+
+def test_an_environment_names_the_agents_that_are_tuned_for_it_and_those_that_fit(lists):
+    (line,) = (line for line in lists if line.startswith("Warehouse-v0 "))
+    tuned, fitting = line.removeprefix("Warehouse-v0").strip().split("   ", 1)
+    assert {"qlearning", "sarsa", "ppo"} <= set(tuned.split())
+    assert not set(tuned.split()) & set(fitting.split())
+    assert set(tuned.split()) | set(fitting.split()) <= set(ALGORITHMS)
+    assert lists[-2] == ""
+    assert lists[-1].startswith("Any other environment registered with Gymnasium works where")

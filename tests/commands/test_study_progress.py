@@ -1,0 +1,131 @@
+"""What a person watching a study reads: in a terminal, and where the output goes elsewhere."""
+
+import io
+import re
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+from rich.console import Console
+
+import commands.study_progress as module
+from commands.study_progress import StudyProgress
+from experiments.execution import RunFailure
+from experiments.study_plan import plan
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands until it is told to go on."""
+    fake = SimpleNamespace(now=1000.0)
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    return fake
+
+
+def planned_runs(n_seeds=4):
+    agents = (AgentSpec("[b]one[/b]", "qlearning"), AgentSpec("two", "sarsa"))
+    lake = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
+    return plan(StudySpec("s", "S", agents, (lake,), n_seeds=n_seeds), Path("nowhere"))
+
+
+def console_of(**options):
+    file = io.StringIO()
+    return file, Console(file=file, width=100, **options)
+
+
+def failure_of(run):
+    return RunFailure(run, "too [hot]", Path("log.txt"))
+
+
+def test_where_there_is_no_terminal_a_line_now_and_then(clock):
+    runs = planned_runs()
+    file, console = console_of(force_terminal=False)
+    with StudyProgress(console, runs, runs[:2]) as progress:
+        assert file.getvalue() == ""
+        clock.now += 5
+        progress.note(runs[2], None)
+        # Ten seconds are not over before they are past.
+        clock.now += 5
+        progress.note(runs[3], None)
+        assert file.getvalue() == ""
+        clock.now += 0.5
+        progress.note(runs[4], None)
+        assert file.getvalue() == "3 of 6 runs in 10 s, about 10 s left\n"
+        # From that line on they are counted anew.
+        clock.now += 9.9
+        progress.note(runs[5], None)
+        assert file.getvalue().count("\n") == 1
+        clock.now += 70
+        progress.note(runs[6], None)
+        # The last run is told of at once.
+        progress.note(runs[7], None)
+    assert file.getvalue().splitlines() == [
+        "3 of 6 runs in 10 s, about 10 s left",
+        "5 of 6 runs in 1 min 30 s, about 18 s left",
+        "6 of 6 runs in 1 min 30 s",
+    ]
+
+
+def test_failures_are_told_at_once_and_to_the_letter(clock):
+    runs = planned_runs()
+    file, console = console_of(force_terminal=False)
+    with StudyProgress(console, runs, []) as progress:
+        progress.note(runs[2], failure_of(runs[2]))
+    assert file.getvalue() == "failed: [b]one[/b] on lake, seed 1: too [hot]\n"
+
+
+def test_a_study_that_is_interrupted_says_how_to_go_on(clock):
+    runs = planned_runs()
+    file, console = console_of(force_terminal=False)
+
+    def interrupted():
+        with StudyProgress(console, runs, []) as progress:
+            clock.now += 7200 + 180 + 9
+            progress.note(runs[0], None)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert file.getvalue().splitlines() == [
+        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left",
+        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left; the same command goes on",
+    ]
+
+
+def test_a_study_that_breaks_otherwise_promises_nothing(clock):
+    runs = planned_runs()
+    file, console = console_of(force_terminal=False)
+
+    def broken():
+        with StudyProgress(console, runs, []):
+            raise ValueError
+
+    with pytest.raises(ValueError):  # noqa: PT011  # it has no message
+        broken()
+    assert file.getvalue() == ""
+
+
+def test_in_a_terminal_one_table_moves(clock):
+    runs = planned_runs()
+    file, console = console_of(force_terminal=True, force_interactive=True, color_system=None)
+    with StudyProgress(console, runs, runs[:2]) as progress:
+        first = plain(file.getvalue())
+        assert re.search(r"agent +environment +runs +failed", first)
+        # The table is there before the first run has ended, and names are taken to the letter.
+        assert re.search(r"\[b\]one\[/b\] +lake +1/4", first)
+        assert "0 of 6 runs in 0 s" in first
+        clock.now += 60
+        progress.note(runs[2], None)
+        progress.note(runs[3], failure_of(runs[3]))
+    shown = plain(file.getvalue())
+    assert "failed: two on lake, seed 1: too [hot]" in shown
+    last = shown[shown.rindex("agent ") :]
+    assert re.search(r"\[b\]one\[/b\] +lake +2/4 .*[^1]\n", last)
+    assert re.search(r"two +lake +1/4 .* 1 *\n", last)
+    assert "2 of 6 runs in 1 min 0 s, about 2 min 0 s left" in last
+
+
+def plain(text):
+    """Without the codes that move the cursor."""
+    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", text)

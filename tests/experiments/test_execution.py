@@ -1,0 +1,120 @@
+"""Doing the runs of a study: what each leaves behind, in what order, and on how many cores."""
+
+import json
+import os
+from concurrent.futures import Future
+
+import pytest
+import yaml
+
+from experiments.child_processes import StoppedError, WorkFailedError
+from experiments.execution import available_cores, execute, execute_on, failure_log
+from experiments.run_in_child import do_run, draft_path
+from experiments.study_plan import plan
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+
+LAKE = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_timesteps": 20})
+
+
+def runs_of(root, n_seeds=2, tensorboard=False):
+    agents = (AgentSpec("mine", "qlearning"),)
+    study = StudySpec("s", "S", agents, (LAKE,), n_seeds=n_seeds, tensorboard=tensorboard)
+    return plan(study, root)
+
+
+def test_the_cores_that_this_process_may_use(monkeypatch):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {pid, 3, 5}, raising=False)
+    assert available_cores() == 3
+    monkeypatch.delattr(os, "sched_getaffinity")
+    monkeypatch.setattr(os, "cpu_count", lambda: 7)
+    assert available_cores() == 7
+    # Python does not know on every machine.
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    assert available_cores() == 1
+
+
+def test_a_run_says_what_it_is(tmp_path):
+    _, planned = runs_of(tmp_path)
+    draft = draft_path(tmp_path, planned)
+    do_run(planned, draft, "compare.py s.yml")
+    assert planned.is_finished
+    assert not draft.exists()
+    args = yaml.safe_load((planned.run.params_path / "args.yml").read_text())
+    given = {key: value for key, value in args.items() if value is not None}
+    assert given == {"algo": "qlearning", "env": "FrozenLake-v1", "seed": 1}
+    assert "compare.py s.yml" in (planned.run.params_path / "command.txt").read_text()
+
+
+def test_a_run_replaces_one_of_other_settings_and_leaves_one_that_is_finished(tmp_path):
+    first, second = runs_of(tmp_path)
+    first.path.mkdir(parents=True)
+    (first.path / "old.txt").touch()
+    do_run(first, draft_path(tmp_path, first), "again")
+    assert first.is_finished
+    assert not (first.path / "old.txt").exists()
+    # Another process was faster: what it has done stays.
+    do_run(second, draft_path(tmp_path, second), "one")
+    (second.path / "mark").touch()
+    do_run(second, draft_path(tmp_path, second), "two")
+    assert (second.path / "mark").exists()
+
+
+def test_tensorboard_logs_of_an_earlier_try_are_removed(tmp_path):
+    planned, _ = runs_of(tmp_path, tensorboard=True)
+    old = planned.spec.tensorboard_log / "old"
+    old.mkdir(parents=True)
+    do_run(planned, draft_path(tmp_path, planned), "compare.py s.yml")
+    assert not old.exists()
+    assert list(planned.spec.tensorboard_log.rglob("events.out.tfevents.*"))
+
+
+class InPlace:
+    """Does the work at once, in this process."""
+
+    def submit(self, function, *args):
+        future = Future()
+        future.set_result(function(*args))
+        return future
+
+
+def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
+    runs = runs_of(tmp_path, n_seeds=3)
+    good, bad, stopped = runs
+    log = failure_log(tmp_path, good)
+    log.parent.mkdir()
+    log.write_text("of an earlier try")
+
+    def supervise(work, run, draft, command, *, clean_up):
+        assert (work, draft, command) == (do_run, draft_path(tmp_path, run), "c")
+        if run is bad:
+            raise WorkFailedError("thin ice", "Traceback: thin ice\n")
+        if run is stopped:
+            raise StoppedError
+
+    monkeypatch.setattr("experiments.execution.supervise", supervise)
+    told = {}
+    failures = execute_on(
+        InPlace(), runs, tmp_path, "c", lambda run, failure: told.setdefault(run.seed, failure)
+    )
+    (failure,) = failures
+    assert (failure.planned, failure.reason) == (bad, "thin ice")
+    assert told == {0: None, 1: failure, 2: None}
+    assert failure.log == tmp_path / "failures" / "mine@dry_lake_2.txt"
+    # What an earlier try left of a run that has now been done is gone.
+    assert list(log.parent.iterdir()) == [failure.log]
+    assert failure.log.read_text() == "Traceback: thin ice\n"
+
+
+def test_nothing_to_do_starts_nothing(tmp_path, monkeypatch):
+    def never(n_workers):
+        pytest.fail("an executor was started")
+
+    monkeypatch.setattr("experiments.execution.local_executor", never)
+    assert execute([], tmp_path, "c", 2, never) == []
+
+
+def test_a_record_is_whole(tmp_path):
+    planned, _ = runs_of(tmp_path)
+    do_run(planned, draft_path(tmp_path, planned), "c")
+    info = json.loads(planned.run.info_path.read_text())
+    assert (info["state"], info["spec"]["seed"]) == ("finished", 0)

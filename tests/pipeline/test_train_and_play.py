@@ -1,0 +1,139 @@
+"""What a training leaves beside its results, and what a trained agent is played on."""
+
+import io
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from rich.console import Console
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecNormalize
+
+from pipeline.environments import make_training_env
+from pipeline.errors import UserError
+from pipeline.playing import playing_env
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+from pipeline.training import train
+
+
+def spec_of(folder, env_id="FrozenLake-v1", n_timesteps=600, entry=None, **fields):
+    entry = {"n_timesteps": n_timesteps, **(entry or {})}
+    fields = {"pictures": False, "eval_freq": -1, **fields}
+    return TrainSpec("qlearning", env_id, split(entry), entry, seed=0, log_folder=folder, **fields)
+
+
+def train_to(folder, console=None, **fields):
+    spec = spec_of(folder, **fields)
+    return train(spec, console or Console(quiet=True), {}, "train.py")
+
+
+class Trouble(BaseCallback):
+    """Raises at the three hundredth step."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error = error
+
+    def _on_step(self):
+        if self.num_timesteps == 300:
+            raise self.error
+        return True
+
+
+@pytest.mark.parametrize("every", [1, 10])
+def test_checkpoints_after_so_many_episodes(tmp_path, every):
+    run = train_to(tmp_path, save_every_n_episodes=every).run
+    lines = (run.path / "0.monitor.csv").read_text().splitlines()[2:]
+    ends = np.cumsum([int(line.split(",")[1]) for line in lines])
+    assert [int(path.stem.split("_")[2]) for path in run.checkpoints()] == ends[
+        every - 1 :: every
+    ].tolist()
+
+
+def test_no_checkpoints_unless_asked_for(tmp_path):
+    assert train_to(tmp_path).run.checkpoints() == []
+
+
+@pytest.mark.parametrize(("verbose", "shown"), [(0, False), (1, False), (2, True)])
+def test_the_librarys_tables_are_for_those_who_ask(tmp_path, capsys, verbose, shown):
+    train_to(tmp_path, verbose=verbose, log_interval=1)
+    assert ("| time/" in capsys.readouterr().out) is shown
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("thin ice")])
+def test_a_bar_lets_go_of_the_terminal_whatever_happens(tmp_path, monkeypatch, error):
+    monkeypatch.setattr("pipeline.settings.components.callbacks", lambda *args: [Trouble(error)])
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, color_system=None)
+    try:
+        state = train_to(tmp_path, console).state
+    except RuntimeError:
+        state = "failed"
+    assert state == ("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
+    # The cursor that the bar has hidden is shown again.
+    assert file.getvalue().count("\x1b[?25h") == file.getvalue().count("\x1b[?25l") == 1
+
+
+# --- playing --------------------------------------------------------------------------------------
+
+
+def chosen_of(spec, statistics=None):
+    run = None if statistics is None else SimpleNamespace(vecnormalize_path=statistics)
+    return SimpleNamespace(spec=spec, run=run, path=None)
+
+
+def saved_statistics(spec, path):
+    """The statistics of some steps of training."""
+    env = make_training_env(spec, None)
+    env.reset()
+    for _ in range(50):
+        env.step([env.action_space.sample()])
+    env.save(path)
+    return env.obs_rms.mean.copy()
+
+
+def test_observations_are_normalised_as_in_training_and_rewards_left_alone(tmp_path):
+    spec = spec_of(tmp_path, "CartPole-v1", entry={"normalize": True})
+    mean = saved_statistics(spec, tmp_path / "vecnormalize.pkl")
+    env = playing_env(chosen_of(spec, tmp_path / "vecnormalize.pkl"), None)
+    assert isinstance(env, VecNormalize)
+    env.seed(0)
+    env.reset()
+    for _ in range(20):
+        _, reward, _, _ = env.step([env.action_space.sample()])
+        assert reward.tolist() == [1.0]
+    # Watching teaches nothing.
+    assert env.obs_rms.mean.tolist() == mean.tolist()
+    env.close()
+
+
+def test_statistics_that_are_missing_or_broken(tmp_path):
+    spec = spec_of(tmp_path, "CartPole-v1", entry={"normalize": True})
+    path = tmp_path / "vecnormalize.pkl"
+    playing_env(chosen_of(spec, path), None).close()
+    path.write_bytes(b"broken")
+    with pytest.raises(UserError, match=r"vecnormalize\.pkl cannot be read"):
+        playing_env(chosen_of(spec, path), None)
+
+
+def test_frames_are_kept_over_the_ends_of_episodes(tmp_path):
+    env = playing_env(chosen_of(spec_of(tmp_path)), "ansi")
+    env.seed(0)
+    env.reset()
+    steps, ends = 0, 0
+    while ends < 3:
+        _, _, done, _ = env.step([2])
+        steps, ends = steps + 1, ends + int(done[0])
+    # One for each step, and one for the beginning of each episode.
+    assert len(env.env_method("render")[0]) == steps + ends + 1
+    # They are handed over once.
+    assert env.env_method("render")[0] == []
+    env.close()
+
+
+def test_what_cannot_be_drawn_so_is_refused(tmp_path):
+    # Gymnasium has its say first.
+    said = pytest.warns(UserWarning, match="not in the possible render_modes")
+    with said, pytest.raises(UserError, match="CartPole-v1 cannot be rendered as ansi"):
+        playing_env(chosen_of(spec_of(tmp_path, "CartPole-v1")), "ansi")
