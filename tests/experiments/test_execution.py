@@ -7,7 +7,7 @@ from concurrent.futures import Future
 import pytest
 import yaml
 
-from experiments.child_processes import StoppedError, WorkFailedError
+from experiments.child_processes import StoppedError, TaskFailedError
 from experiments.execution import available_cores, execute, execute_on, failure_log
 from experiments.run_in_child import do_run, draft_path
 from experiments.study_plan import plan
@@ -87,7 +87,7 @@ def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
     def supervise(work, run, draft, command, *, clean_up):
         assert (work, draft, command) == (do_run, draft_path(tmp_path, run), "c")
         if run is bad:
-            raise WorkFailedError("thin ice", "Traceback: thin ice\n")
+            raise TaskFailedError("thin ice", "Traceback: thin ice\n")
         if run is stopped:
             raise StoppedError
 
