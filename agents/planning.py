@@ -22,6 +22,7 @@ from agents.common.online import OnlineAlgorithm
 from agents.common.signatures import CommonArguments
 from envs.known_models import observations_of_states, time_limit, transition_model
 from mdp import TransitionModel, finite_horizon_optimum, value_iteration
+from mdp.array_types import Ints
 
 
 class ActionTablePolicy(BasePolicy):
@@ -52,7 +53,7 @@ class ActionTablePolicy(BasePolicy):
         self.actions = th.from_numpy(actions.astype(np.int64))
         self.horizon = th.tensor(horizon)
 
-    def actions_after(self, obs: NDArray[np.int64], steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    def actions_after(self, obs: Ints, steps: Ints) -> Ints:
         """What to do in ``obs`` after ``steps`` steps of the episode, all of shape (n,)."""
         steps_left = np.clip(int(self.horizon) - steps, 1, len(self.actions))
         return np.asarray(self.actions.numpy()[steps_left - 1, obs])
@@ -141,7 +142,7 @@ class PlanningAgent(OnlineAlgorithm):
     ) -> tuple[NDArray[np.integer[Any]], int]:
         """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon."""
 
-    def _choose_actions(self) -> NDArray[np.int64]:
+    def _choose_actions(self) -> Ints:
         actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)
         self._steps = self._steps + 1
         return actions

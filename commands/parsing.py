@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import os
 import shlex
 import sys
@@ -46,6 +47,16 @@ def run_command(main: Callable[[], int]) -> NoReturn:
         sys.exit(INTERRUPT)
     print(f"{program}: error: {message}", file=sys.stderr)
     sys.exit(MISTAKE)
+
+
+def check_tensorboard(wanted: object) -> None:
+    """Make sure that a TensorBoard log can be written where one is wanted.
+
+    Raises:
+        UserError: if TensorBoard is not installed.
+    """
+    if wanted and importlib.util.find_spec("tensorboard") is None:
+        raise UserError("-tb needs: pip install 'rl-yardstick[tensorboard]'")
 
 
 def command_line() -> str:

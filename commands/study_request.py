@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import importlib.util
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
+from commands.parsing import check_tensorboard
 from experiments.study_files import read_study
 from experiments.study_spec import (
     METRICS,
@@ -58,8 +58,7 @@ def _check_output(args: argparse.Namespace) -> None:
         raise UserError(f"--margin must be at least 0, not {args.margin}")
     if args.metric is not None and args.metric not in METRICS:
         raise unknown("--metric: unknown metric", args.metric, METRICS)
-    if args.tensorboard and importlib.util.find_spec("tensorboard") is None:
-        raise UserError("-tb needs: pip install 'rl-yardstick[tensorboard]'")
+    check_tensorboard(args.tensorboard)
 
 
 def _study_of_file(args: argparse.Namespace) -> StudySpec:

@@ -8,6 +8,7 @@ from pathlib import Path
 from secrets import randbelow
 from typing import Any
 
+from commands.parsing import check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError
@@ -26,6 +27,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     check_algorithm(args.algo)
     import_gym_packages(tuple(args.gym_packages))
     check_env_id(args.env)
+    check_tensorboard(args.tensorboard_log)
     raw = _raw_hyperparams(args)
     trained_agent = Path(args.trained_agent) if args.trained_agent else None
     if trained_agent is not None:

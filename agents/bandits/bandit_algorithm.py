@@ -17,6 +17,7 @@ from agents.common.online import Transitions
 from agents.common.setting_checks import check_space
 from agents.common.signatures import LearningArguments
 from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
+from mdp.array_types import Bools, Floats, Ints
 
 
 class Pull(NamedTuple):
@@ -63,7 +64,7 @@ class BanditAlgorithm(LearningAlgorithm):
     ) -> None:
         self._pending: list[list[Any]] = []
         self._infos: list[dict[str, Any]] = []
-        self._probabilities: NDArray[np.float64] = np.ones(0)
+        self._probabilities: Floats = np.ones(0)
         super().__init__(policy, env, learning_rate, **kwargs)
 
     def _check_arguments(self) -> None:
@@ -84,9 +85,7 @@ class BanditAlgorithm(LearningAlgorithm):
         """What arms are chosen in, one for each of the observations, shape (n, ...)."""
 
     @abstractmethod
-    def _choose(
-        self, contexts: Any, rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _choose(self, contexts: Any, rng: np.random.Generator) -> tuple[Ints, Floats]:
         """An arm for each context and how likely it was, shapes (n,)."""
 
     @abstractmethod
@@ -103,14 +102,12 @@ class BanditAlgorithm(LearningAlgorithm):
     def _begin_episodes(self) -> None:
         self._pending = [[] for _ in range(self.n_envs)]
 
-    def _choose_actions(self) -> NDArray[np.int64]:
+    def _choose_actions(self) -> Ints:
         contexts = self._contexts(cast(Any, self._last_obs))
         actions, self._probabilities = self._choose(contexts, self.rng)
         return actions
 
-    def _update_info_buffer(
-        self, infos: list[dict[str, Any]], dones: NDArray[np.bool_] | None = None
-    ) -> None:
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Bools | None = None) -> None:
         super()._update_info_buffer(infos, dones)
         # What an environment says of a pull decides what is learnt from it.
         self._infos = infos

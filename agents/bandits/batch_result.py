@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mdp.array_types import Bools, Floats, Ints
+
 
 @dataclass(frozen=True)
 class BatchResult:
@@ -28,17 +30,17 @@ class BatchResult:
             the Beta distribution, or mean and standard deviation; None for others.
     """
 
-    seeds: NDArray[np.int64]
+    seeds: Ints
     arms: NDArray[np.int16]
     rewards: NDArray[np.float32]
-    regrets: NDArray[np.float64]
+    regrets: Floats
     contexts: NDArray[np.int32] | None = None
-    estimates: NDArray[np.float64] | None = None
-    coefficients: NDArray[np.float64] | None = None
+    estimates: Floats | None = None
+    coefficients: Floats | None = None
     moments: tuple[int, ...] = ()
-    posteriors: NDArray[np.float64] | None = None
+    posteriors: Floats | None = None
 
     @property
-    def optimal(self) -> NDArray[np.bool_]:
+    def optimal(self) -> Bools:
         """Whether the arm was a best one, shape (n_runs, pulls)."""
         return np.asarray(self.regrets == 0.0)

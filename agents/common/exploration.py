@@ -12,8 +12,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from mdp.array_types import Floats
 from mdp.machine_code import inlined
 
 EPSILON_GREEDY = 0
@@ -25,9 +25,6 @@ STRATEGIES = {
     "boltzmann": BOLTZMANN,
     "gaussian_noise": GAUSSIAN_NOISE,
 }
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 def draws_per_choice(strategy: int, n_actions: int) -> int:

@@ -24,6 +24,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from agents.common.model_files import JsonAlgorithm
 from agents.common.signatures import full_signature
+from mdp.array_types import Bools, Floats
 
 
 @dataclass(slots=True)
@@ -41,9 +42,9 @@ class Transitions:
 
     obs: Any
     actions: Any
-    rewards: NDArray[np.float64]
-    terminated: NDArray[np.bool_]
-    dones: NDArray[np.bool_]
+    rewards: Floats
+    terminated: Bools
+    dones: Bools
     next_obs: Any
 
 
@@ -234,9 +235,7 @@ class OnlineAlgorithm(JsonAlgorithm):
             self.env.seed(seed)
 
 
-def true_outcome(
-    new_obs: Any, dones: NDArray[np.bool_], infos: list[dict[str, Any]]
-) -> tuple[Any, NDArray[np.bool_]]:
+def true_outcome(new_obs: Any, dones: Bools, infos: list[dict[str, Any]]) -> tuple[Any, Bools]:
     """What the environments showed before they were reset, and whether they had terminated.
 
     A VecEnv resets a finished environment within the same step.

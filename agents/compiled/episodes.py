@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
+from mdp.array_types import Bools, Floats, Ints
+
 DECIMALS = 6
 
 
@@ -26,11 +28,11 @@ class Episodes:
         successes: whether it was a success, shape (n_episodes,).
     """
 
-    envs: NDArray[np.int64]
-    steps: NDArray[np.int64]
-    returns: NDArray[np.float64]
-    lengths: NDArray[np.int64]
-    successes: NDArray[np.bool_]
+    envs: Ints
+    steps: Ints
+    returns: Floats
+    lengths: Ints
+    successes: Bools
 
     @classmethod
     def of(cls, log: NDArray[np.void]) -> Episodes:
@@ -75,9 +77,7 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
     return times
 
 
-def _write_rows(
-    file: Any, returns: NDArray[np.float64], lengths: NDArray[np.int64], seconds: float
-) -> None:
+def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> None:
     """Append rows as csv.DictWriter would."""
     end = f"{seconds}\r\n"
     rows = zip(returns.tolist(), lengths.tolist(), strict=True)

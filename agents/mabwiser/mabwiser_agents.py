@@ -17,6 +17,7 @@ from agents.bandits.linear_policy import features
 from agents.common.setting_checks import check_at_least, check_share, check_space, settings_of
 from agents.common.signatures import CommonArguments, LearningArguments, TieBreaking
 from agents.mabwiser.mabwiser_policy import MABWiserPolicy
+from mdp.array_types import Floats, Ints
 
 SUMS = ("arm_to_sum", "arm_to_count", "arm_to_expectation")
 
@@ -67,16 +68,14 @@ class MABWiserAgent(BanditAlgorithm):
         )
         return made
 
-    def _contexts(self, obs: NDArray[Any]) -> NDArray[np.float64]:
+    def _contexts(self, obs: NDArray[Any]) -> Floats:
         return features(self.observation_space, obs)
 
     def _first_pull(self) -> int | None:
         """An arm to pull before the library is asked, which it cannot be without a reward."""
         return None if self.policy.fitted else 0
 
-    def _choose(
-        self, contexts: NDArray[np.float64], rng: np.random.Generator
-    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    def _choose(self, contexts: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
         first = self._first_pull()
         arms = [self.policy.choose(c, rng) if first is None else first for c in contexts]
         return np.array(arms, dtype=np.int64), np.ones(len(arms))

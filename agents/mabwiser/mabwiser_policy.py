@@ -17,8 +17,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.bandits.linear_policy import features
-
-Floats = NDArray[np.float64]
+from mdp.array_types import Floats
 
 
 class MABWiserPolicy(BasePolicy):

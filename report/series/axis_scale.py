@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from mdp.array_types import Floats
 
 # Returns that are so many times larger than what matters flatten a linear axis.
 DWARFED = 10

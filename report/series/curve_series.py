@@ -5,18 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from experiments.analysis import EnvironmentAnalysis
 from experiments.seed_values import mean_curve
 from experiments.study_results import StudyResults
+from mdp.array_types import Floats
 from report.series.axis_scale import linear_up_to
 
 KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

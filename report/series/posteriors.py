@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
 from experiments.pull_statistics import PullStatistics
 from experiments.study_results import StudyResults
+from mdp.array_types import Floats, Ints
 
 N_POINTS = 241
-
-Floats = NDArray[np.float64]
 
 
 def is_normal(results: StudyResults, agent: str) -> bool:
@@ -62,7 +60,7 @@ class Belief:
     """
 
     agent: str
-    moments: NDArray[np.int64]
+    moments: Ints
     points: Floats
     densities: Floats
     true_means: list[list[float | None]]

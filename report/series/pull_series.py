@@ -8,11 +8,11 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.pull_statistics import QUANTILES, PullStatistics
 from experiments.study_results import StudyResults
+from mdp.array_types import Floats, Ints
 from pipeline.environments import make_single_env
 from report.series.curve_series import Curve
 from report.series.posteriors import Belief, belief
@@ -20,7 +20,6 @@ from report.series.regret_bounds import auer_bound, best_expected_reward, lai_ro
 
 SPREAD = f"{QUANTILES[-1] - QUANTILES[0]:.0%}"  # of the runs lie between the outer quantiles
 
-Floats = NDArray[np.float64]
 Pulls = Mapping[str, PullStatistics]
 
 
@@ -28,7 +27,7 @@ Pulls = Mapping[str, PullStatistics]
 class RegretBounds:
     """What theory says of the regret, each of shape (n_points,)."""
 
-    pulls: NDArray[np.int64]
+    pulls: Ints
     auer: Floats
     lai_robbins: Floats
 

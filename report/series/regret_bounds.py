@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import integrate, special, stats
 
-Floats = NDArray[np.float64]
+from mdp.array_types import Floats
 
 
 def auer_bound(means: ArrayLike, pulls: ArrayLike) -> Floats:

@@ -6,19 +6,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.seed_values import values_over_seeds
 from experiments.study_results import StudyResults
 from experiments.study_spec import AgentSpec
+from mdp.array_types import Floats, Ints
 from report.series.axis_scale import linear_up_to
 from report.series.curve_series import Curve
 from verdicts import Estimate
 
 LEAST_VALUES = 3  # of a parameter, for a figure of it
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class AgentRuns:
 
     agent: str
     mean: Estimate
-    seeds: NDArray[np.int64]
+    seeds: Ints
     values: Floats
 
 

@@ -1,5 +1,6 @@
 """train.py and enjoy.py as a user types them."""
 
+import importlib.util
 import json
 import os
 import re
@@ -440,3 +441,16 @@ def test_answers_without_loading_anything_heavy(words, code, tmp_path):
     )
     assert result.returncode == code
     assert result.stderr.splitlines()[-1] == "[]"
+
+
+def test_where_tensorboard_is_missing_it_is_named_beforehand(type_command, tmp_path, monkeypatch):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util,
+        "find_spec",
+        lambda name, *more: None if name == "tensorboard" else find(name, *more),
+    )
+    code, out, err = type_command("train.py", *QUICK, "-tb", "curves")
+    assert (code, out) == (2, "")
+    assert err == "train.py: error: -tb needs: pip install 'rl-yardstick[tensorboard]'\n"
+    assert contents(tmp_path) == []
