@@ -23,11 +23,13 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 _ALGORITHMS: dict[str, type] = {}
 _DEFINITIONS: Counter[str] = Counter()
+_NAMES: set[str] = set()
 
 
 def by_type(stub: Function) -> Function:
     """Make a compiled function that calls its first argument's own function of that name."""
     name = stub.__name__
+    _NAMES.add(name)
 
     def choose(thing: Any, *others: Any) -> Any:
         return getattr(getattr(_class_of(thing), name, None), "py_func", None)
@@ -47,6 +49,20 @@ def _class_of(argument: Any) -> type | None:
         return next((_ALGORITHMS[name] for name in record.fields if name in _ALGORITHMS), None)
     chosen: type = kind.instance_class
     return chosen
+
+
+def check_functions(algorithm: type) -> None:
+    """Make sure that what the compiled loop calls of an algorithm is compiled.
+
+    Raises:
+        TypeError: naming the function that is not, and what to do.
+    """
+    for name in _NAMES & vars(algorithm).keys():
+        if not hasattr(vars(algorithm)[name], "py_func"):
+            raise TypeError(
+                f"{algorithm.__name__}.{name} is called by compiled code: put @inlined of "
+                "mdp.machine_code on the function"
+            )
 
 
 def settings_dtype(algorithm: type, fields: Mapping[str, Any]) -> np.dtype[np.void]:

@@ -43,14 +43,24 @@ class CompiledEngine:
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
         self.states = EnvStates(agent.env, world)
         self.envs = self.states.records
-        self.handles = handles_of([env.unwrapped.np_random for env in agent.env.envs])
+        # Handles do not keep the generators alive that they stand for.
+        self.generators = [env.unwrapped.np_random for env in agent.env.envs]
+        self.handles = handles_of(self.generators)
         self.progress = np.zeros(1, dtype=PROGRESS)
         self.log = EpisodeLog(
             np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
             np.empty((self.block_steps, agent.n_envs)),
         )
-        self.learner = agent.compiled_agent(agent.rng)
+        self.rng = agent.rng
+        self.learner = agent.compiled_agent(self.rng)
         self._read()
+
+    def _learner(self) -> Any:
+        """The agent as compiled functions see it, also after a callback has seeded it anew."""
+        if self.agent.rng is not self.rng:
+            self.rng = self.agent.rng
+            self.learner = self.agent.compiled_agent(self.rng)
+        return self.learner
 
     def run(self, total_timesteps: int) -> None:
         """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
@@ -75,7 +85,7 @@ class CompiledEngine:
         )
         n_steps = run_block(
             self.world,
-            self.learner,
+            self._learner(),
             self.envs,
             self.handles,
             self.progress[0],
@@ -86,7 +96,7 @@ class CompiledEngine:
         )
         episodes = Episodes.of(self.log.episodes[: self.progress[0]["logged_episodes"]])
         keep_going = self._tell(episodes, n_steps)
-        learn_from_last_step(self.learner, self.envs, self.progress[0])
+        learn_from_last_step(self._learner(), self.envs, self.progress[0])
         last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._take_over_counts(1, len(episodes.envs) - last_step)
         self.callback.on_rollout_end()

@@ -18,7 +18,7 @@ from agents.common.online import OnlineAlgorithm
 from agents.common.setting_checks import check_learning_rate, check_option
 from agents.common.signatures import CommonArguments, TieBreaking
 from agents.common.step_sizes import SAMPLE_AVERAGE
-from agents.compiled.dispatch import settings_dtype
+from agents.compiled.dispatch import check_functions, settings_dtype
 from agents.compiled.training_records import PROGRESS
 
 StepSize = float | Schedule | Literal["sample_average"]
@@ -66,11 +66,12 @@ class LearningAlgorithm(OnlineAlgorithm):
     ) -> None:
         self.tie_breaking = tie_breaking
         self.exploration_schedule: Schedule = FloatSchedule(0.0)
-        self._workspace: Any = None
+        self._workspace: tuple[np.random.Generator, Any] | None = None
         super().__init__(policy, env, cast(Any, learning_rate), policy_kwargs, **kwargs)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        check_functions(cls)
         above = [vars(base).get("parameters", {}) for base in reversed(cls.__mro__)]
         fields = {name: kind for parameters in above for name, kind in parameters.items()}
         cls.settings_type = settings_dtype(cls, fields)
@@ -122,17 +123,16 @@ class LearningAlgorithm(OnlineAlgorithm):
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
         # Made once in a training: that takes longer than a step.
-        self._workspace = self._make_workspace(self.rng, self.n_envs)
+        self._workspace = self.rng, self._make_workspace(self.rng, self.n_envs)
         try:
             super()._run(total_timesteps, callback, log_interval)
         finally:
             self._workspace = None
 
     def _workspace_for(self, rng: np.random.Generator, n: int) -> Any:
-        """The one of the training under way, or another where none is or it does not fit."""
-        if self._workspace is not None and rng is self.rng:
-            return self._workspace
-        return self._make_workspace(rng, n)
+        """The one of the training under way, if it draws from ``rng``; else another."""
+        drawing_from, workspace = self._workspace or (None, None)
+        return workspace if drawing_from is rng else self._make_workspace(rng, n)
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy's arrays would no longer be its policy's.

@@ -1,6 +1,7 @@
 """The compiled engine ends in the same bits as the interpreted one."""
 
 import csv
+import gc
 import itertools
 from functools import partial
 
@@ -13,7 +14,12 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 from agents import ALGORITHMS, load_algorithm
-from agents.common.callback_horizons import EpisodeBudget
+from agents.common.callback_horizons import (
+    BlockCallback,
+    EpisodeBudget,
+    Horizon,
+    calls_until_multiple,
+)
 from agents.common.schedules import ExponentialSchedule
 from envs.wrappers import DiscretizeObservation, FlattenToDiscrete, ScaleReward, TerminationReward
 
@@ -296,3 +302,36 @@ def test_what_follows_without_an_agent_is_the_same():
         steps = [model.env.step(np.array([0, 3])) for _ in range(1200)]
         played.append([[part.tolist() for part in step[:3]] for step in steps])
     assert played[0] == played[1]
+
+
+class Reseeding(BlockCallback):
+    """Seeds the agent anew in the middle of a training, and leaves the old generator to nobody."""
+
+    def horizon(self):
+        return Horizon(calls=calls_until_multiple(self.n_calls, 500))
+
+    def _on_step(self):
+        if self.n_calls == 500:
+            self.model.rng = np.random.default_rng(7)
+            gc.collect()
+        return True
+
+
+@pytest.mark.parametrize("name", ["qlearning", "double_qlearning"])
+def test_an_agent_that_is_seeded_anew_draws_from_its_new_generator(name):
+    models = [
+        make(name, "FrozenLake-v1", engine=engine).learn(1000, callback=Reseeding())
+        for engine in ENGINES
+    ]
+    assert [model.engine_in_use[:8] for model in models] == ["interpre", "compiled"]
+    assert not differences(*map(state_of, models))
+    plain = make(name, "FrozenLake-v1", engine="compiled").learn(1000)
+    assert not np.array_equal(plain.policy.q_table, models[1].policy.q_table)
+
+
+def test_a_rule_that_is_not_compiled_is_named():
+    with pytest.raises(TypeError, match=r"Plain.next_value is called by compiled code: put @inl"):
+
+        class Plain(load_algorithm("qlearning")):
+            def next_value(agent, env, progress, table):  # noqa: N805
+                return 0.0
