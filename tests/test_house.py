@@ -58,23 +58,10 @@ def test_importing_a_package_is_cheap(package: str, tmp_path: Path) -> None:
     assert python(code, cwd=tmp_path) == str(ROOT / package / "__init__.py")
 
 
-def test_any_module_can_be_the_first_one_imported(tmp_path: Path) -> None:
-    """Import cycles show only from some entry points, so each module takes its turn to be first."""
+def test_every_module_can_be_imported(tmp_path: Path) -> None:
+    """In any order, since no two of them need each other."""
     names = [module_name(path) for path in sources()]
-    code = f"""
-import importlib, sys, traceback
-import gymnasium, numba, matplotlib, pandas, scipy, stable_baselines3
-registered = set(gymnasium.registry)
-for name in {names}:
-    for loaded in [m for m in sys.modules if m in {names}]:
-        del sys.modules[loaded]
-    for ours in set(gymnasium.registry) - registered:
-        del gymnasium.registry[ours]
-    try:
-        importlib.import_module(name)
-    except ImportError:
-        print(name, traceback.format_exc())
-"""
+    code = f"import importlib\nfor name in {names}:\n    importlib.import_module(name)"
     assert python(code, cwd=tmp_path) == ""
 
 
