@@ -17,6 +17,7 @@ from agents.bandits.one_by_one import run_one_by_one
 from agents.compiled.compile_envs import NotCompilable
 from experiments.pull_statistics import PullStatistics, pull_statistics
 from mdp.array_types import Floats
+from mdp.machine_code import compile_timer
 from pipeline.environments import make_single_env
 from pipeline.preparation import algorithm_kwargs
 from pipeline.pull_recording import PULLS_FILE
@@ -30,7 +31,8 @@ STATISTICS_FILE = "pull_statistics.npz"
 def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     """Do the runs with seeds 0 to ``n_runs`` - 1 and leave their statistics in the run folder."""
     started = time.monotonic()
-    result, engine = _run(spec, n_runs)
+    with compile_timer() as seconds_compiling:
+        result, engine = _run(spec, n_runs)
     env = make_single_env(spec)
     try:
         statistics = _statistics(env, result)
@@ -45,7 +47,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
         n_runs=n_runs,
         n_timesteps=len(result.arms[0]),
         versions=recorded_versions(),
-        seconds=round(time.monotonic() - started, 3),
+        seconds=round(time.monotonic() - started - seconds_compiling(), 3),
         engine=engine,
     )
 

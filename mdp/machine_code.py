@@ -9,11 +9,13 @@ as IEEE 754 has it.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 
 from mdp.code_cache import PACKAGES, ROOT, CheckedCache, folder, numba_cache_dir
 
@@ -47,6 +49,18 @@ def inlined(function: Function) -> Function:
 def internal(function: Function) -> Function:
     """As `inlined`, for functions whose arguments or results Python cannot see."""
     return _decorated(function, {**BARE_OPTIONS, "forceinline": True, "no_cpython_wrapper": True})
+
+
+@contextmanager
+def compile_timer() -> Iterator[Callable[[], float]]:
+    """Let a caller leave the time of compiling, which is spent once, out of what it measures.
+
+    Yields:
+        A function that tells how many seconds have gone into compiling in the ``with`` statement.
+    """
+    timer: Any = event.TimingListener()  # type: ignore[no-untyped-call]
+    with event.install_listener("numba:compile", timer):
+        yield lambda: float(timer.duration) if timer.done else 0.0
 
 
 def _decorated(function: Function, options: dict[str, Any]) -> Function:

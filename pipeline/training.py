@@ -12,6 +12,7 @@ from uuid import uuid4
 import torch as th
 from rich.console import Console
 
+from mdp.machine_code import compile_timer
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
@@ -39,7 +40,7 @@ class Outcome:
         run: its folder.
         state: ``"finished"`` or ``"interrupted"``.
         n_steps: environment steps that were run.
-        seconds: time that they took, evaluations included.
+        seconds: time that they took, evaluations included, and compiling, which is done once, not.
         final: evaluation of the agent at the end, by episodes used for nothing else; None where
             evaluation was turned off.
         best_return: mean return of the best evaluation during training, if there was one.
@@ -123,13 +124,15 @@ def carry_out(training: Training) -> Outcome:
     started = time.monotonic()
     state = FINISHED
     try:
-        try:
-            _learn(training)
-        except KeyboardInterrupt:
-            state = INTERRUPTED
-        finally:
-            training.display.close()
-        return _finish(training, state, time.monotonic() - started)
+        with compile_timer() as seconds_compiling:
+            try:
+                _learn(training)
+            except KeyboardInterrupt:
+                state = INTERRUPTED
+            finally:
+                training.display.close()
+            seconds = time.monotonic() - started - seconds_compiling()
+        return _finish(training, state, seconds)
     except BaseException as error:
         _give_up(training, error)
         raise
