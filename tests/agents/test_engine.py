@@ -5,6 +5,7 @@ import gc
 import itertools
 from functools import partial
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers import PassiveEnvChecker
@@ -13,6 +14,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
+import envs  # noqa: F401  # registers the environments
 from agents import ALGORITHMS, load_algorithm
 from agents.common.callback_horizons import (
     BlockCallback,
@@ -21,6 +23,7 @@ from agents.common.callback_horizons import (
     calls_until_multiple,
 )
 from agents.common.schedules import ExponentialSchedule
+from envs.grid import GridWorld
 from envs.wrappers import DiscretizeObservation, FlattenToDiscrete, ScaleReward, TerminationReward
 
 ENGINES = ("interpreted", "compiled")
@@ -43,6 +46,12 @@ ENVS = {
     "Taxi": ("Taxi-v4", {}, None),
     "CartPole": ("CartPole-v1", {}, discretize),
 }
+for spec in list(gym.registry.values()):
+    # A grid world that is not among them yet is trained on as it is.
+    if str(spec.entry_point).startswith("envs.") and f"envs:{spec.id}" not in str(ENVS):
+        env = gym.make(spec.id) if spec.id != "ReplayBandit-v0" else None
+        if env is not None and isinstance(env.unwrapped, GridWorld):
+            ENVS[spec.id] = (f"envs:{spec.id}", {}, None)
 EXPLORATION = {
     "linear": {},
     "constant": {"exploration_decay": "constant", "exploration_initial_eps": 0.1},
