@@ -66,9 +66,10 @@ def compile_timer() -> Iterator[Callable[[], float]]:
 def _decorated(function: Function, options: dict[str, Any]) -> Function:
     kept_in = folder() if _is_own(function) else None
     if kept_in is None:
-        return cast(Function, numba.njit(**options)(function))
-    with numba_cache_dir(kept_in):
-        dispatcher = numba.njit(cache=True, **options)(function)
+        dispatcher = numba.njit(**options)(function)
+    else:
+        with numba_cache_dir(kept_in):
+            dispatcher = numba.njit(cache=True, **options)(function)
     dispatcher._cache = CheckedCache(dispatcher._cache, function.__qualname__)
     return cast(Function, dispatcher)
 
