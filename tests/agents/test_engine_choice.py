@@ -75,6 +75,12 @@ UNSUITED = {
     "RecordEpisodeStatistics must see every step": lambda: lake(
         wrapper_class=gym.wrappers.RecordEpisodeStatistics
     ),
+    "RecordEpisodeStatistics, RenderCollection must see every step": lambda: lake(
+        env_kwargs={"render_mode": "ansi"},
+        wrapper_class=lambda env: gym.wrappers.RenderCollection(
+            gym.wrappers.RecordEpisodeStatistics(env)
+        ),
+    ),
     "the environment is shown on the screen": lambda: lake(env_kwargs={"render_mode": "human"}),
     "under DiscretizeObservation and Monitor alone": lambda: pole(gym.wrappers.Autoreset),
     "with its default reward alone": lambda: pole(sutton_barto_reward=True),
