@@ -161,11 +161,18 @@ def learn_from_feedback(agent: ScoreAgent, envs: Any, progress: Any) -> None:
 @kernel
 def choose_arms(
     agent: ScoreAgent, rows: Ints, progress: Any, arms: Ints, probabilities: Floats
-) -> None:
-    """Fill in an arm for each of the contexts ``rows``, and how likely it was; shapes (n,)."""
+) -> int:
+    """Fill in an arm for each of the contexts ``rows``, and how likely it was; shapes (n,).
+
+    Returns:
+        -1, or the place of a context that has no row in the tables, before which it stops.
+    """
     for i in range(len(rows)):
+        if not 0 <= rows[i] < agent.tables.scores.shape[0]:
+            return i
         arms[i] = choose_arm(agent, rows[i], progress)
         probabilities[i] = choice_probability(agent, rows[i], arms[i])
+    return -1
 
 
 @kernel

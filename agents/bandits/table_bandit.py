@@ -118,13 +118,16 @@ class TableBandit(BanditAlgorithm):
 
     def _choose(self, contexts: Ints, rng: np.random.Generator) -> tuple[Ints, Floats]:
         arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
-        choose_arms(
+        outside = choose_arms(
             self._workspace_for(rng, len(contexts)),
             contexts,
             self.progress()[0],
             arms,
             probabilities,
         )
+        if outside >= 0:
+            n_contexts = len(self.policy.scores)
+            raise ValueError(f"context {contexts[outside]} is not in Discrete({n_contexts})")
         return arms, probabilities
 
     def _learn(self, pull: Pull) -> None:

@@ -169,11 +169,20 @@ def act_in_all(
     room: Floats,
     draws: Floats,
     rng: Any,
-) -> None:
-    """`act` in each environment, for the interpreted loop."""
+) -> int:
+    """`act` in each environment, for the interpreted loop.
+
+    Returns:
+        -1, or the number of an environment whose observation has no row in the tables; none acts
+        then.
+    """
+    for i in range(len(envs)):
+        if not 0 <= envs[i].obs < values.shape[1]:
+            return i
     agent = TabularAgent(settings[0], Tables(values, visit_counts), Room(room, draws), rng[0])
     for i in range(len(envs)):
         act(agent, envs[i], progress[0])
+    return -1
 
 
 @kernel
@@ -186,7 +195,11 @@ def learn_from_all(
     room: Floats,
     draws: Floats,
     rng: Any,
-) -> None:
-    """`learn_from_step` of all environments, for the interpreted loop."""
+) -> int:
+    """`learn_from_step` of all environments, for the interpreted loop; returns as `act_in_all`."""
+    for i in range(len(envs)):
+        if not 0 <= envs[i].next_obs < values.shape[1]:
+            return i
     agent = TabularAgent(settings[0], Tables(values, visit_counts), Room(room, draws), rng[0])
     learn_from_step(agent, envs, progress[0])
+    return -1

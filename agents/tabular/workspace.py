@@ -45,6 +45,17 @@ class Workspace:
         progress["learning_rate"] = learning_rate
         progress["episodes"] = episodes
 
+    def _check(self, field: str, outside: int) -> None:
+        """Refuse an observation that the tables have no row for, which compiled code would not see.
+
+        Raises:
+            ValueError: naming the observation and what it may be.
+        """
+        if outside >= 0:
+            n_states = self.arrays[3].shape[1]
+            obs = self.fields[field][outside]
+            raise ValueError(f"observation {obs} is not in Discrete({n_states}), the agent's space")
+
     def act(self, obs: Any, next_actions: Ints) -> Ints:
         """An action for each observation, the one that was committed to where there is one.
 
@@ -55,7 +66,7 @@ class Workspace:
         fields = self.fields
         fields["obs"][:] = obs
         fields["next_action"][:] = next_actions
-        act_in_all(*self.arrays)
+        self._check("obs", act_in_all(*self.arrays))
         next_actions[:] = fields["next_action"]
         actions: Ints = fields["action"].copy()
         return actions
@@ -77,6 +88,6 @@ class Workspace:
         fields["terminated"][:] = transitions.terminated
         fields["done"][:] = transitions.dones
         fields["next_obs"][:] = transitions.next_obs
-        learn_from_all(*self.arrays)
+        self._check("next_obs", learn_from_all(*self.arrays))
         next_actions[:] = fields["next_action"]
         return float(self.progress["mean_td_error"][0])

@@ -227,3 +227,32 @@ def test_wrong_arguments(arguments, complaint):
 def test_every_name_in_the_table_can_be_loaded():
     assert load_algorithm("qlearning") is QLearning
     assert load_algorithm("double_qlearning") is DoubleQLearning
+
+
+class Liar(gym.Env):
+    """Shows what is not in its space, at the start or after a step."""
+
+    observation_space = spaces.Discrete(4)
+    action_space = spaces.Discrete(2)
+
+    def __init__(self, at_start, after_step):
+        self.at_start, self.after_step = at_start, after_step
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.at_start, {}
+
+    def step(self, action):
+        return self.after_step, 1.0, False, False, {}
+
+
+@pytest.mark.parametrize("outside", [4, 10**9, -1])
+@pytest.mark.parametrize("name", ["qlearning", "double_qlearning", "epsilon_greedy"])
+def test_an_observation_outside_of_the_space_is_refused(name, outside):
+    """Compiled code would read and write beside the table."""
+    for at_start, after_step in ((outside, 0), (0, outside)):
+        model = load_algorithm(name)(env=Liar(at_start, after_step), seed=0)
+        with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
+            model.learn(5)
+    with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
+        load_algorithm(name)(env=Liar(0, 0), seed=0).predict(outside, deterministic=False)
