@@ -58,6 +58,8 @@ def digest() -> str:
     compilers = ("numba", "numpy", "llvmlite")
     lines = [f"{name} {importlib.metadata.version(name)}" for name in compilers]
     lines.append(f"python {platform.python_version()}")
+    settings: Any = numba.config
+    lines.append(f"optimised {settings.OPT}, bounds checked {settings.BOUNDSCHECK}")
     for path, _, _ in stamps_at_start():
         content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
         lines.append(f"{Path(path).relative_to(ROOT)} {content}")
@@ -129,6 +131,8 @@ class CheckedCache:
         self._name = name
 
     def __getattr__(self, name: str) -> Any:
+        if name == "_cache":
+            raise AttributeError(name)  # of a copy that is being made
         return getattr(self._cache, name)
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:

@@ -64,6 +64,8 @@ def compile_timer() -> Iterator[Callable[[], float]]:
 
 
 def _decorated(function: Function, options: dict[str, Any]) -> Function:
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        return function
     kept_in = folder() if _is_own(function) else None
     if kept_in is None:
         dispatcher = numba.njit(**options)(function)

@@ -21,7 +21,6 @@ from agents.bandits.reward_checks import check_kinds
 from agents.bandits.score_agent import ScoreTables
 from agents.bandits.table_bandit import TableBandit
 from agents.bandits.thompson import Thompson
-from agents.common.schedules import schedule_row
 from agents.compiled.bandit_model import (
     BANDIT_ENV,
     BanditModel,
@@ -33,6 +32,7 @@ from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.engine_choice import check_class
 from agents.compiled.env_state import COMPENSATED_SUM
 from agents.compiled.generators import handles_of
+from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import learn_from_last_step, run_block
 from agents.compiled.training_records import EPISODE
 from agents.registry import load_algorithm
@@ -151,14 +151,8 @@ class Runs:
         """
         progress = self.agent.progress()
         progress["total_timesteps"], progress["remaining"] = self.n_pulls, 1.0
-        for name, schedule in (
-            ("exploration", self.agent.exploration_schedule),
-            ("learning_rate", self.agent.lr_schedule),
-        ):
-            row = schedule_row(schedule)
-            if row is None:
-                raise NotCompilable("a schedule is a Python function")
-            progress[f"{name}_schedule"] = row
+        for name, schedule in self.agent.schedules().items():
+            progress[f"{name}_schedule"] = compiled_schedule(schedule)
         return np.asarray(progress)
 
     def run(self, index: int) -> None:

@@ -23,7 +23,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from agents.common.model_files import JsonAlgorithm
-from agents.common.signatures import full_signature
+from agents.common.signatures import CheckedConstructor, full_signature
 from mdp.array_types import Bools, Floats
 
 
@@ -48,7 +48,7 @@ class Transitions:
     next_obs: Any
 
 
-class OnlineAlgorithm(JsonAlgorithm):
+class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
     """Acts and learns one step at a time, with generators of its own.
 
     Subclasses define `_setup_model`, which calls ``set_random_seed``, and `_choose_actions`, and
@@ -158,6 +158,11 @@ class OnlineAlgorithm(JsonAlgorithm):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        if self.env is not None and self.env.num_envs != self.n_envs:
+            raise ValueError(
+                f"the agent works on {self.n_envs} environments, not {self.env.num_envs}: "
+                "change them by set_env"
+            )
         if reset_num_timesteps or self._last_obs is None:
             self._begin_episodes()
         total_timesteps, callback = super()._setup_learn(

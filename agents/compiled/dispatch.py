@@ -12,10 +12,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
+import numba
 import numpy as np
 from numba.core import types
 from numba.extending import overload
 
+from agents.common.signatures import CheckedConstructor
 from mdp.code_cache import RULE_PREFIX
 from mdp.machine_code import BARE_OPTIONS
 
@@ -28,6 +30,8 @@ _NAMES: set[str] = set()
 
 def by_type(stub: Function) -> Function:
     """Make a compiled function that calls its first argument's own function of that name."""
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+        raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
     name = stub.__name__
     _NAMES.add(name)
 
@@ -49,6 +53,17 @@ def _class_of(argument: Any) -> type | None:
         return next((_ALGORITHMS[name] for name in record.fields if name in _ALGORITHMS), None)
     chosen: type = kind.instance_class
     return chosen
+
+
+class CompiledClass(CheckedConstructor):
+    """The class of algorithms; what their loops are compiled from cannot be exchanged."""
+
+    def __setattr__(cls, name: str, value: object) -> None:  # noqa: N805  # of a metaclass
+        if name in _NAMES:
+            raise AttributeError(
+                f"{cls.__name__}.{name} is compiled into its loop: define a subclass with another"
+            )
+        super().__setattr__(name, value)
 
 
 def check_functions(algorithm: type) -> None:

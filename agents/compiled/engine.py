@@ -9,12 +9,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.common.callback_horizons import EpisodeBudget, horizon, members, pass_over
-from agents.common.schedules import schedule_row
 from agents.compiled.compile_envs import World
 from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
 from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.generators import handles_of
 from agents.compiled.interrupts import interrupts_held
+from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
 from agents.compiled.training_records import EPISODE, PROGRESS
 
@@ -51,15 +51,22 @@ class CompiledEngine:
             np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
             np.empty((self.block_steps, agent.n_envs)),
         )
-        self.rng = agent.rng
-        self.learner = agent.compiled_agent(self.rng)
+        self.made_from: tuple[Any, ...] = ()
+        self.learner: Any = None
         self._read()
 
     def _learner(self) -> Any:
-        """The agent as compiled functions see it, also after a callback has seeded it anew."""
-        if self.agent.rng is not self.rng:
-            self.rng = self.agent.rng
-            self.learner = self.agent.compiled_agent(self.rng)
+        """The agent as compiled functions see it, also after a callback has changed it."""
+        agent, progress = self.agent, self.progress[0]
+        made_from = agent.made_from(agent.rng)
+        if made_from != self.made_from:
+            self.made_from, self.learner = made_from, agent.compiled_agent(agent.rng)
+        for name, schedule in agent.schedules().items():
+            progress[f"{name}_schedule"] = compiled_schedule(schedule)
+            progress[name] = schedule(agent._current_progress_remaining)
+        generators = [env.unwrapped.np_random for env in agent.env.envs]
+        if any(a is not b for a, b in zip(generators, self.generators, strict=True)):
+            self.generators, self.handles = generators, handles_of(generators)
         return self.learner
 
     def run(self, total_timesteps: int) -> None:
@@ -76,6 +83,7 @@ class CompiledEngine:
     def _run_block(self, total_timesteps: int) -> bool:
         agent = self.agent
         self.callback.on_rollout_start()
+        self.progress[0]["episodes"] = agent._episode_num
         ahead = horizon(self.callback)
         steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
         episodes_to_log = (
@@ -174,14 +182,8 @@ class CompiledEngine:
             progress["budget_episodes"] = budget.episodes_seen
         progress["num_timesteps"] = agent.num_timesteps
         progress["total_timesteps"] = agent._total_timesteps
-        progress["remaining"] = remaining = agent._current_progress_remaining
+        progress["remaining"] = agent._current_progress_remaining
         progress["episodes"] = agent._episode_num
-        for name, schedule in (
-            ("exploration", agent.exploration_schedule),
-            ("learning_rate", agent.lr_schedule),
-        ):
-            progress[f"{name}_schedule"] = schedule_row(schedule)
-            progress[name] = schedule(remaining)
         self.envs["obs"] = agent._last_obs
         agent.hand_over(self.envs, self.progress)
         self.states.read()

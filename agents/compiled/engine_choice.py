@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from types import FunctionType
 from typing import Any, Literal
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.common.callback_horizons import unknown_callbacks
-from agents.common.schedules import schedule_row
 from agents.compiled.compile_envs import NotCompilable, World, compile_envs
 from agents.compiled.engine import CompiledEngine
-from agents.compiled.learning_algorithm import LearningAlgorithm
+from agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]
 
 # What a class may say anew in Python: all of it ends up in the settings, schedules and tables that
 # compiled functions are handed.
 SETTINGS = (
+    "__dict__",
     "__init__",
+    "__weakref__",
     "_check_arguments",
     "_make_exploration_schedule",
     "_make_policy",
@@ -54,12 +54,14 @@ def choose_engine(
 
 def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> World:
     check_class(type(agent))
+    for name in vars(agent):
+        if callable(vars(agent)[name]) and callable(getattr(type(agent), name, None)):
+            raise NotCompilable(f"this agent has a {name} of its own in Python")
     unknown = unknown_callbacks(callback)
     if unknown:
         raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
-    for schedule in (agent.exploration_schedule, agent.lr_schedule):
-        if schedule_row(schedule) is None:
-            raise NotCompilable("a schedule is a Python function")
+    for schedule in agent.schedules().values():
+        compiled_schedule(schedule)
     assert agent.env is not None
     return compile_envs(agent.env)
 
@@ -74,8 +76,14 @@ def check_class(algorithm: type) -> None:
     for place, cls in enumerate(order[: order.index(LearningAlgorithm)]):
         if cls.__module__.startswith("agents."):
             continue
+        above = [vars(base) for base in order[place + 1 :] if base is not object]
         for name, value in vars(cls).items():
-            in_python = isinstance(value, FunctionType | property | classmethod | staticmethod)
-            replaces = any(name in vars(above) for above in order[place + 1 :])
+            in_python = hasattr(value, "__get__") and not hasattr(value, "py_func")
+            replaces = any(name in names for names in above) or name in _settings(algorithm)
             if in_python and replaces and name not in SETTINGS:
                 raise NotCompilable(f"{algorithm.__name__} has a {name} of its own in Python")
+
+
+def _settings(algorithm: Any) -> tuple[str, ...]:
+    """Names of what compiled functions are told of an agent."""
+    return tuple(algorithm.settings_type.names)

@@ -4,27 +4,32 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from operator import attrgetter
 from typing import Any, ClassVar, Literal, Unpack, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
 from agents.common.exploration import EPSILON_GREEDY
 from agents.common.online import OnlineAlgorithm
+from agents.common.schedules import ScheduleRow, schedule_row
 from agents.common.setting_checks import check_learning_rate, check_option
 from agents.common.signatures import CommonArguments, TieBreaking
 from agents.common.step_sizes import SAMPLE_AVERAGE
-from agents.compiled.dispatch import check_functions, settings_dtype
+from agents.compiled.compile_envs import NotCompilable
+from agents.compiled.dispatch import CompiledClass, check_functions, settings_dtype
 from agents.compiled.training_records import PROGRESS
+
+# Training, and exploring by another generator for a few numbers of observations.
+MOST_WORKSPACES = 4
 
 StepSize = float | Schedule | Literal["sample_average"]
 
 
-class LearningAlgorithm(OnlineAlgorithm):
+class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     """Learns with a step size, explores by a schedule, and breaks ties between best actions.
 
     How it acts and learns stands in compiled functions, which are attributes of the class. They are
@@ -52,8 +57,9 @@ class LearningAlgorithm(OnlineAlgorithm):
         "strategy": np.int64,
     }
     settings_type: ClassVar[np.dtype[np.void]]
+    _read_settings: ClassVar[Any]
 
-    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspace")
+    _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspaces")
 
     def __init__(
         self,
@@ -66,7 +72,7 @@ class LearningAlgorithm(OnlineAlgorithm):
     ) -> None:
         self.tie_breaking = tie_breaking
         self.exploration_schedule: Schedule = FloatSchedule(0.0)
-        self._workspace: tuple[np.random.Generator, Any] | None = None
+        self._workspaces: dict[tuple[int, int], tuple[tuple[Any, ...], Any]] = {}
         super().__init__(policy, env, cast(Any, learning_rate), policy_kwargs, **kwargs)
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -75,6 +81,7 @@ class LearningAlgorithm(OnlineAlgorithm):
         above = [vars(base).get("parameters", {}) for base in reversed(cls.__mro__)]
         fields = {name: kind for parameters in above for name, kind in parameters.items()}
         cls.settings_type = settings_dtype(cls, fields)
+        cls._read_settings = attrgetter(*fields)
 
     def _setup_model(self) -> None:
         self._check_arguments()
@@ -121,35 +128,59 @@ class LearningAlgorithm(OnlineAlgorithm):
         """What compiled functions work on: for ``n`` environments, drawing from ``rng``."""
         return None
 
-    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
-        # Made once in a training: that takes longer than a step.
-        self._workspace = self.rng, self._make_workspace(self.rng, self.n_envs)
-        try:
-            super()._run(total_timesteps, callback, log_interval)
-        finally:
-            self._workspace = None
+    def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
+        """What a workspace is made from: once this differs, it is out of date.
+
+        Callbacks may change settings, replace a table or seed the agent anew.
+        """
+        tables = [
+            buffer.data_ptr() for buffer in self.policy._buffers.values() if buffer is not None
+        ]
+        return rng, self._read_settings(self), *tables
 
     def _workspace_for(self, rng: np.random.Generator, n: int) -> Any:
-        """The one of the training under way, if it draws from ``rng``; else another."""
-        drawing_from, workspace = self._workspace or (None, None)
-        return workspace if drawing_from is rng else self._make_workspace(rng, n)
+        """A workspace that is up to date, and keeps the generator alive that it draws from."""
+        made_from = self.made_from(rng)
+        known = self._workspaces.get((id(rng), n))
+        if known is None or known[0] != made_from:
+            if len(self._workspaces) >= MOST_WORKSPACES:
+                self._workspaces.clear()
+            known = made_from, self._make_workspace(rng, n)
+            self._workspaces[id(rng), n] = known
+        return known[1]
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy's arrays would no longer be its policy's.
-        return {**self.__dict__, "_workspace": None}
+        return {**self.__dict__, "_workspaces": {}}
 
     def settings(self) -> NDArray[np.void]:
         """The record of the agent's settings, alone in an array."""
         settings = np.zeros(1, dtype=self.settings_type)
-        for name in self.settings_type.names[1:]:  # type: ignore[index]  # the first is the class
-            settings[name] = getattr(self, name)
+        # The first field is the class.
+        settings[0] = (0, *self._read_settings(self))
         return settings
+
+    def schedules(self) -> dict[str, Schedule]:
+        """The schedules, by the names that they have in the record of how far the training is."""
+        return {"exploration": self.exploration_schedule, "learning_rate": self.lr_schedule}
 
     def progress(self) -> NDArray[np.void]:
         """The record of how far the training is, alone in an array."""
         progress = np.zeros(1, dtype=PROGRESS)
         remaining = self._current_progress_remaining
-        progress["exploration"] = self.exploration_schedule(remaining)
-        progress["learning_rate"] = self.lr_schedule(remaining)
+        for name, schedule in self.schedules().items():
+            progress[name] = schedule(remaining)
         progress["episodes"] = self._episode_num
         return progress
+
+
+def compiled_schedule(schedule: Schedule) -> ScheduleRow:
+    """The schedule as compiled code reads it.
+
+    Raises:
+        NotCompilable: if it is a Python function.
+    """
+    row = schedule_row(schedule)
+    if row is None:
+        raise NotCompilable("a schedule is a Python function")
+    return row

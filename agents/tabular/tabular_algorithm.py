@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack
+from typing import Any, ClassVar, Unpack, cast
 
 import numpy as np
 import torch as th
@@ -171,6 +171,7 @@ class TabularAlgorithm(LearningAlgorithm):
     def compiled_agent(self, rng: np.random.Generator) -> TabularAgent:
         """The agent as compiled functions see it, its tables in the memory of its policy."""
         values = self.policy.q_tables.numpy()
+        self._check_tables()
         n_actions = values.shape[2]
         n_draws = draws_per_choice(self.strategy, n_actions)
         return TabularAgent(
@@ -179,6 +180,20 @@ class TabularAlgorithm(LearningAlgorithm):
             Room(np.empty(n_actions), np.empty(n_draws)),
             handles_of([rng])[0],
         )
+
+    def _check_tables(self) -> None:
+        """Refuse tables that compiled code would read beside.
+
+        Raises:
+            ValueError: naming the shape that they must have.
+        """
+        spaces = cast(Any, (self.observation_space, self.action_space))
+        shape = (self.n_tables, *(int(space.n) for space in spaces))
+        found = tuple(self.policy.q_tables.shape), tuple(self.policy.visit_counts.shape)
+        if found != (shape, shape) or self.n_tables not in (1, 2):
+            raise ValueError(f"tables must be 1 or 2, of shape {shape}, not {found[0]}")
+        if self.strategy not in STRATEGIES.values():
+            raise ValueError(f"unknown exploration strategy {self.strategy}")
 
     def _begin_episodes(self) -> None:
         self._next_actions = np.full(self.n_envs, UNDECIDED)
@@ -234,7 +249,7 @@ class TabularAlgorithm(LearningAlgorithm):
         if deterministic:
             return super().predict(observation, state, episode_start, deterministic)
         obs = np.asarray(observation, dtype=np.int64)
-        workspace = self._make_workspace(self.predict_rng, obs.size)
+        workspace = self._workspace_for(self.predict_rng, obs.size)
         rate = self.exploration_schedule(self._current_progress_remaining)
         workspace.note_progress(rate, 0.0, self._episode_num)
         actions = workspace.act(obs.reshape(-1), np.full(obs.size, UNDECIDED))

@@ -23,6 +23,7 @@ class Workspace:
     """
 
     def __init__(self, agent: TabularAgent, rng: np.random.Generator, n: int) -> None:
+        self.rng = rng  # the handle does not keep it alive
         self.envs = np.zeros(n, dtype=ENV)
         self.envs["next_action"] = UNDECIDED
         self.progress = np.zeros(1, dtype=PROGRESS)
