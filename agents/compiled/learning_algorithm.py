@@ -133,6 +133,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
 
         Callbacks may change settings, replace a table or seed the agent anew.
         """
+        # Looked up in one go each: this is asked after every step.
         tables = [
             buffer.data_ptr() for buffer in self.policy._buffers.values() if buffer is not None
         ]

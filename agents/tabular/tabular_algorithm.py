@@ -84,6 +84,8 @@ class TabularAlgorithm(LearningAlgorithm):
     learn_from_step = td_learning
     commit = no_commitment
 
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_in_use")
+
     def __init__(
         self,
         policy: str | type[BasePolicy] = "QTablePolicy",
@@ -120,6 +122,7 @@ class TabularAlgorithm(LearningAlgorithm):
         self.engine_in_use = ""
         self.mean_td_error = 0.0
         self._next_actions: Ints = np.empty(0, dtype=np.int64)
+        self._in_use: Workspace | None = None
         super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
@@ -203,7 +206,11 @@ class TabularAlgorithm(LearningAlgorithm):
         if engine is not None:
             engine.run(total_timesteps)
             return
+        self._in_use = None
         super()._run(total_timesteps, callback, log_interval)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_in_use": None}
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Write what the compiled loop goes on from into its records."""
@@ -222,16 +229,26 @@ class TabularAlgorithm(LearningAlgorithm):
         workspace.note_progress(
             self.exploration_schedule(remaining), self.lr_schedule(remaining), self._episode_num
         )
+        if self._next_actions is not workspace.next_actions:
+            workspace.next_actions[:] = self._next_actions
+            self._next_actions = workspace.next_actions
         return workspace
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> Workspace:
         return Workspace(self.compiled_agent(rng), rng, n)
 
     def _choose_actions(self) -> Ints:
-        return self._present_workspace().act(self._last_obs, self._next_actions)
+        workspace = self._in_use
+        if workspace is None or workspace.rng is not self.rng:
+            workspace = self._present_workspace()
+        else:
+            # Brought up to date when the agent learnt last: episodes have been counted since then.
+            workspace.episodes[0] = self._episode_num
+        return workspace.act(self._last_obs)
 
     def _learn_from(self, transitions: Transitions) -> None:
-        self.mean_td_error = self._present_workspace().learn(transitions, self._next_actions)
+        self._in_use = workspace = self._present_workspace()
+        self.mean_td_error = workspace.learn(transitions)
         self._n_updates += self.n_envs
 
     def predict(
@@ -252,7 +269,8 @@ class TabularAlgorithm(LearningAlgorithm):
         workspace = self._workspace_for(self.predict_rng, obs.size)
         rate = self.exploration_schedule(self._current_progress_remaining)
         workspace.note_progress(rate, 0.0, self._episode_num)
-        actions = workspace.act(obs.reshape(-1), np.full(obs.size, UNDECIDED))
+        workspace.next_actions[:] = UNDECIDED
+        actions = workspace.act(obs.reshape(-1))
         return actions.reshape(obs.shape), state
 
     def action_probabilities(self) -> Floats:

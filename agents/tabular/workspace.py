@@ -38,13 +38,21 @@ class Workspace:
         )
         # Looked up once: finding a field takes longer than filling it.
         self.fields = {name: self.envs[name] for name in ENV.names or ()}
+        names = ("exploration", "learning_rate", "episodes")
+        self.exploration, self.learning_rate, self.episodes = (self.progress[n] for n in names)
+        self._chosen: Ints | None = None
+
+    @property
+    def next_actions(self) -> Ints:
+        """What the agent has committed to in each environment, or `UNDECIDED`; shape (n,)."""
+        actions: Ints = self.fields["next_action"]
+        return actions
 
     def note_progress(self, exploration: float, learning_rate: float, episodes: int) -> None:
         """Set how much to explore, the step size, and how many episodes have ended."""
-        progress = self.progress
-        progress["exploration"] = exploration
-        progress["learning_rate"] = learning_rate
-        progress["episodes"] = episodes
+        self.exploration[0] = exploration
+        self.learning_rate[0] = learning_rate
+        self.episodes[0] = episodes
 
     def _check(self, field: str, outside: int) -> None:
         """Refuse an observation that the tables have no row for, which compiled code would not see.
@@ -57,38 +65,29 @@ class Workspace:
             obs = self.fields[field][outside]
             raise ValueError(f"observation {obs} is not in Discrete({n_states}), the agent's space")
 
-    def act(self, obs: Any, next_actions: Ints) -> Ints:
+    def act(self, obs: Any) -> Ints:
         """An action for each observation, the one that was committed to where there is one.
 
         Args:
             obs: observations, shape (n,).
-            next_actions: commitments, or `UNDECIDED`, which they all are afterwards; shape (n,).
         """
         fields = self.fields
         fields["obs"][:] = obs
-        fields["next_action"][:] = next_actions
         self._check("obs", act_in_all(*self.arrays))
-        next_actions[:] = fields["next_action"]
         actions: Ints = fields["action"].copy()
+        self._chosen = actions
         return actions
 
-    def learn(self, transitions: Transitions, next_actions: Ints) -> float:
-        """Learn from a step of each environment.
-
-        Args:
-            transitions: the steps.
-            next_actions: filled in with what the agent commits to, shape (n,).
-
-        Returns:
-            The mean absolute TD error.
-        """
+    def learn(self, transitions: Transitions) -> float:
+        """Learn from a step of each environment, and return the mean absolute TD error."""
         fields = self.fields
-        fields["obs"][:] = transitions.obs
-        fields["action"][:] = transitions.actions
+        if transitions.actions is not self._chosen:
+            # Not what `act` has just chosen, whose observations and actions are there already.
+            fields["obs"][:] = transitions.obs
+            fields["action"][:] = transitions.actions
         fields["reward"][:] = transitions.rewards
         fields["terminated"][:] = transitions.terminated
         fields["done"][:] = transitions.dones
         fields["next_obs"][:] = transitions.next_obs
         self._check("next_obs", learn_from_all(*self.arrays))
-        next_actions[:] = fields["next_action"]
         return float(self.progress["mean_td_error"][0])
