@@ -1,0 +1,49 @@
+"""Figures as a reader wants them, and the table of episodes."""
+
+import io
+
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from report.terminal_tables import print_episodes_table
+from report.wording import number
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (None, "-"),
+        (float("nan"), "-"),
+        (float("inf"), "never"),
+        (float("-inf"), "-∞"),
+        (0.0, "0"),
+        (-0.00001, "0"),
+        (0.74421, "0.7442"),
+        (-27427.3, "-27,427"),
+        (1234.5, "1,234"),
+        (12.345, "12.35"),
+    ],
+)
+def test_a_figure_has_four_digits(value, text):
+    assert number(value) == text
+
+
+def test_episodes_stand_in_columns_that_end_on_one_line():
+    rows = [("a", 20, 5.0, 1.0, 9.0), ("a", 40, 50.0, 10.0, 90.0), ("b", 20, -700.0, -800.0, 0.5)]
+    names = ["agent", "episode", "average", "minimum", "maximum"]
+    table = pd.DataFrame(rows, columns=names).assign(environment="Warehouse-v0")
+    console = Console(file=io.StringIO(), width=80, force_terminal=False)
+    print_episodes_table(console, table, 20)
+    text = console.file.getvalue()
+    assert " ".join(text.split("┏")[0].split()) == (
+        "Warehouse-v0: return per 20 episodes (average, min, max; all seeds)"
+    )
+    lines = text.splitlines()
+    (header,) = [line.split("┃")[1:-1] for line in lines if "┃" in line]
+    first, second = [line.split("│")[1:-1] for line in lines if "│" in line]
+    assert [cell.strip() for cell in header] == ["episode", "a", "b"]
+    assert [cell.strip() for cell in first] == ["20", "5  1  9", "-700  -800  0.5"]
+    assert [cell.strip() for cell in second] == ["40", "50  10  90", "-"]
+    for line in (header, first, second):
+        assert all(cell.endswith(f"{cell.strip()} ") for cell in line)
