@@ -35,6 +35,9 @@ ROOT = Path(__file__).resolve().parent.parent
 # Folders of other digests that are left, so that one can go back and forth between two versions.
 KEPT_BESIDE = 3
 
+# The first field of a record of settings: after this come the algorithm's module and its class.
+RULE_PREFIX = "rule "
+
 logger = logging.getLogger("mdp.machine_code")
 
 Stamps = tuple[tuple[str, int, int], ...]
@@ -186,7 +189,3 @@ def modules_of(kind: Any) -> Iterator[str]:
     for part in (getattr(kind, "dtype", None), *getattr(kind, "types", ())):
         if part is not None and part is not kind:
             yield from modules_of(part)
-
-
-# A record whose first field is named so is of the rule that the rest of the name stands for.
-RULE_PREFIX = "rule "

@@ -77,7 +77,7 @@ class BanditAlgorithm(LearningAlgorithm):
 
     @property
     def rewards_known(self) -> str:
-        """The rewards that the agent can learn from, one of `agents.bandits.rewards`."""
+        """The rewards that the agent can learn from, one of `agents.bandits.reward_checks`."""
         return ANY
 
     @abstractmethod

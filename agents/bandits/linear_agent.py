@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from agents.bandits.score_agent import Feedback
 from agents.common.exploration import greedy_action
-from agents.compiled.dispatch import by_type
+from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import generator_of
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined, kernel
@@ -64,13 +64,13 @@ class LinearAgent(NamedTuple):
 @by_type
 def bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
     """What is added to the predicted reward before the best arm is taken."""
-    raise NotImplementedError
+    raise CompiledOnlyError
 
 
 @by_type
 def pick(agent: LinearAgent, progress: Any) -> int:
     """An arm by the scores in ``agent.arms`` and the first draw in ``agent.draws``."""
-    raise NotImplementedError
+    raise CompiledOnlyError
 
 
 @inlined

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.compiled.dispatch import by_type
+from agents.compiled.dispatch import CompiledOnlyError, by_type
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined, kernel
 
@@ -76,13 +76,13 @@ class ScoreAgent(NamedTuple):
 @by_type
 def choose_arm(agent: ScoreAgent, row: int, progress: Any) -> int:
     """An arm in the context ``row``."""
-    raise NotImplementedError
+    raise CompiledOnlyError
 
 
 @by_type
 def choice_probability(agent: ScoreAgent, row: int, arm: int) -> float:
     """How likely the choice of ``arm`` was."""
-    raise NotImplementedError
+    raise CompiledOnlyError
 
 
 @by_type

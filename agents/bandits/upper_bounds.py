@@ -8,7 +8,7 @@ from typing import Any
 from agents.bandits.score_agent import ScoreAgent, total_count
 from agents.bandits.table_bandit import TableBandit
 from agents.common.exploration import greedy_action
-from agents.compiled.dispatch import by_type
+from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import generator_of
 from mdp.machine_code import inlined
 
@@ -16,7 +16,7 @@ from mdp.machine_code import inlined
 @by_type
 def upper_bound(agent: ScoreAgent, mean: float, count: int, pulls: int) -> float:
     """The bound of an arm after ``count`` of ``pulls`` pulls."""
-    raise NotImplementedError
+    raise CompiledOnlyError
 
 
 @inlined

@@ -28,6 +28,10 @@ _DEFINITIONS: Counter[str] = Counter()
 _NAMES: set[str] = set()
 
 
+class CompiledOnlyError(TypeError):
+    """A function of `by_type` was called from Python, where nothing stands behind it."""
+
+
 def by_type(stub: Function) -> Function:
     """Make a compiled function that calls its first argument's own function of that name."""
     if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Unpack, cast
+from typing import Any, ClassVar, Literal, Unpack, cast
 
 import numpy as np
 import torch as th
@@ -29,7 +29,6 @@ from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from agents.compiled.training_records import UNDECIDED
 from agents.tabular.q_table_policy import QTablePolicy
-from agents.tabular.tabular_arguments import ExplorationStrategy
 from agents.tabular.temporal_difference import (
     Room,
     Tables,
@@ -40,6 +39,8 @@ from agents.tabular.temporal_difference import (
 )
 from agents.tabular.workspace import Workspace
 from mdp.array_types import Floats, Ints
+
+ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
 class TabularAlgorithm(LearningAlgorithm):

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from agents.common.exploration import GAUSSIAN_NOISE, choose_action
 from agents.common.step_sizes import step_size
-from agents.compiled.dispatch import by_type
+from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import generator_of
 from agents.compiled.loop import act, learn_from_step
 from agents.compiled.training_records import UNDECIDED
@@ -69,7 +69,7 @@ def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> floa
     ``agent.room.values`` holds the values of that table in ``env.next_obs``; ``env.uniform`` is a
     number in [0, 1), uniform where there are several tables.
     """
-    raise NotImplementedError
+    raise CompiledOnlyError
 
 
 @by_type
