@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from commands.parsing import OneLineParser, command_line
+from commands.parsing import OneLineParser, as_called, command_line, program_name
 
 EPILOG = """\
 examples:
@@ -20,17 +20,17 @@ The same command again does the runs that are missing, and no other.
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The flags; those of single runs mean what they mean to train.py."""
+    """The flags; those of single runs mean what they mean to the command train."""
     parser = OneLineParser(
-        prog="compare.py",
+        prog=program_name(),
         description="Compare agents on environments over seeds: tables, figures, and a page.",
-        epilog=EPILOG,
+        epilog=as_called(EPILOG),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("study", nargs="?", metavar="STUDY.yml", help="a study file, instead of --env and --algos")
+    add("study", nargs="?", metavar="STUDY.yml", help="a study file, or the name of one of ours")
     add("--env", nargs="+", default=[], metavar="ID", help="environments")
-    add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (see train.py --list)")
+    add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (train --list has them)")
     add("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: the study's, or 10)")
     add("-n", "--n-timesteps", type=int, metavar="N", help="environment steps of each run")
     add("--n-episodes", type=int, metavar="N", help="episodes instead of steps")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from commands.parsing import OneLineParser
+from commands.parsing import OneLineParser, as_called, called_as, program_name
 
 EPILOG = """\
 examples:
@@ -19,9 +19,9 @@ examples:
 def build_parser() -> argparse.ArgumentParser:
     """The flags; where rl_zoo3 has one, with its name and meaning."""
     parser = OneLineParser(
-        prog="enjoy.py",
+        prog=program_name(),
         description="Play a trained agent and print the returns of its episodes.",
-        epilog=EPILOG,
+        epilog=as_called(EPILOG),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
@@ -66,12 +66,18 @@ def main() -> int:
     args = build_parser().parse_args()
     from commands.enjoy_request import model_request
     from pipeline.filming import check_film_path
+    from pipeline.errors import UserError
     from pipeline.model_choice import choose_model
+    from pipeline.run_folder import NoRunError
 
     film = None if args.record is None else Path(args.record)
     if film is not None:
         check_film_path(film)
-    chosen = choose_model(model_request(args))
+    try:
+        chosen = choose_model(model_request(args))
+    except NoRunError as error:
+        flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
+        raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error
     from commands.playing_output import PlayingRequest, play
 
     request = PlayingRequest(

@@ -1,19 +1,55 @@
-"""What the commands share: one-line errors, exit codes, and lists of ``key:value``."""
+"""What the commands share: how they are called, one-line errors, and exit codes."""
 
 from __future__ import annotations
 
 import argparse
+import codecs
 import importlib.util
+import io
 import os
 import shlex
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import NoReturn
 
 from pipeline.errors import UserError, did_you_mean, one_line
 
 MISTAKE = 2
 INTERRUPT = 130
+
+# The command that installing the project brings, and its own commands: the scripts of a checkout.
+NAME = "yardstick"
+COMMANDS = {
+    "train": "train an agent on an environment",
+    "enjoy": "watch a trained agent",
+    "compare": "compare agents over seeds, and write a page",
+}
+
+# What stands for signs that a terminal's encoding lacks; a question mark for all others.
+PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
+
+
+def called_as(command: str) -> str:
+    """How the user calls one of the commands: by the installed name, or as a script."""
+    program = sys.argv[0]
+    if program.startswith(f"{NAME} "):
+        return f"{NAME} {command}"
+    script = f"{command}.py"
+    beside = Path(program).with_name(script) if Path(program).stem in COMMANDS else script
+    return f"python {shlex.quote(str(beside))}"
+
+
+def as_called(examples: str) -> str:
+    """Examples that are written as for a checkout, as the user calls the commands."""
+    for command in COMMANDS:
+        examples = examples.replace(f"python {command}.py", called_as(command))
+    return examples
+
+
+def program_name() -> str:
+    """The name of the running command, which its own messages begin with."""
+    return os.path.basename(sys.argv[0])  # noqa: PTH119  # a name, not a path
 
 
 class OneLineParser(argparse.ArgumentParser):
@@ -34,7 +70,8 @@ def run_command(main: Callable[[], int]) -> NoReturn:
     A mistake of the user's, or a file system that refuses, ends in one line on stderr and exit
     code 2.
     """
-    program = os.path.basename(sys.argv[0])  # noqa: PTH119  # a name, not a path
+    program = program_name()
+    print_on_any_terminal()
     try:
         sys.exit(main())
     except UserError as error:
@@ -61,4 +98,22 @@ def check_tensorboard(wanted: object) -> None:
 
 def command_line() -> str:
     """The command as it was typed, ready to be typed again."""
-    return shlex.join(["python", *sys.argv])
+    program, *arguments = sys.argv
+    words = program.split() if program.startswith(f"{NAME} ") else ["python", program]
+    return shlex.join([*words, *arguments])
+
+
+def print_on_any_terminal() -> None:
+    """Let what is printed be simplified where the terminal's encoding has no such signs.
+
+    On Windows, standard output that goes to a file or a pipe has the encoding of the country.
+    """
+    codecs.register_error(NAME, _plain)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors=NAME)
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    assert isinstance(error, UnicodeEncodeError)
+    signs = error.object[error.start : error.end]
+    return "".join(PLAIN.get(sign, "?") for sign in signs), error.end

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.table import Table
 
+from commands.parsing import called_as
 from pipeline.run_folder import FINISHED
 from pipeline.train_spec import TrainSpec
 
@@ -83,5 +84,5 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
         )
     table.add_row("files", str(outcome.run.path))
     folder = "" if str(spec.log_folder) == "logs" else f" -f {spec.log_folder}"
-    table.add_row("watch", f"python enjoy.py --algo {spec.algo} --env {spec.env_id}{folder}")
+    table.add_row("watch", f"{called_as('enjoy')} --algo {spec.algo} --env {spec.env_id}{folder}")
     console.print(table, highlight=False)

@@ -9,7 +9,7 @@ from typing import Any
 
 from agents import ALGORITHMS
 from commands.parsing import check_tensorboard
-from experiments.study_files import read_study
+from experiments.study_files import find_study, read_study
 from experiments.study_spec import (
     METRICS,
     AgentSpec,
@@ -21,6 +21,8 @@ from experiments.study_spec import (
 from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError, unknown
 from pipeline.settings.literals import parse_assignments
+
+LONGEST_STUDY_NAME = 200  # bytes
 
 _MINIMUM = {
     "seeds": 1,
@@ -64,7 +66,7 @@ def _check_output(args: argparse.Namespace) -> None:
 def _study_of_file(args: argparse.Namespace) -> StudySpec:
     if args.env or args.algos:
         raise UserError("give a study file, or --env and --algos, not both")
-    return read_study(Path(args.study))
+    return read_study(find_study(args.study))
 
 
 def _study_of_flags(args: argparse.Namespace) -> StudySpec:
@@ -80,7 +82,7 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
             raise UserError(f"{flag} names one of them twice")
     agents, environments = ", ".join(args.algos), ", ".join(args.env)
     return StudySpec(
-        name=file_name(f"{'-'.join(args.env)}_{'-'.join(args.algos)}"),
+        name=file_name(f"{'-'.join(args.env)}_{'-'.join(args.algos)}", LONGEST_STUDY_NAME),
         title=f"{agents} on {environments}",
         agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
         environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from commands.parsing import INTERRUPT, OneLineParser, command_line
+from commands.parsing import INTERRUPT, OneLineParser, as_called, command_line, program_name
 
 EPILOG = """\
 examples:
@@ -19,9 +19,9 @@ examples:
 def build_parser() -> argparse.ArgumentParser:
     """The flags, with the names and meanings that rl_zoo3 gives them."""
     parser = OneLineParser(
-        prog="train.py",
+        prog=program_name(),
         description="Train an agent and leave a run folder with its models, curves and settings.",
-        epilog=EPILOG,
+        epilog=as_called(EPILOG),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument

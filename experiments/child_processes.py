@@ -1,8 +1,10 @@
 """Tasks in processes of their own, so that one that dies takes nothing else with it.
 
 `supervise` runs a function in a fresh child process and waits for it; any executor whose workers
-can call it launches a study. Here that is a pool of threads, each with one child at a time. The
-children are forked from a server that has imported the heavy libraries once.
+can call it launches a study. Here that is a pool of threads, each with one child at a time. On
+Linux the children are forked from a server that has imported the heavy libraries once. Windows
+cannot fork, and on macOS a process that has used its libraries should not: there each child begins
+anew, and imports for some seconds.
 """
 
 from __future__ import annotations
@@ -11,13 +13,14 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
@@ -25,7 +28,9 @@ PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
 # One thread in each process: small networks are slower with more, and runs go side by side.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
-_context = multiprocessing.get_context("forkserver")
+START_METHOD = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
+
+_context: Any = multiprocessing.get_context(START_METHOD)
 _children: set[BaseProcess] = set()
 _lock = threading.Lock()
 _stopping = threading.Event()
@@ -68,11 +73,10 @@ def supervise(
         TaskFailedError: if it raised an exception, which is not tried again, or died each time.
         StoppedError: if `stop_all` ended it.
     """
+    task = bytes(ForkingPickler.dumps((function, args, clean_up)))
     for _ in range(tries):
         receiver, sender = _context.Pipe(duplex=False)
-        child = _context.Process(
-            target=_answer_from_child, args=(sender, clean_up, function, args), daemon=True
-        )
+        child = _context.Process(target=_answer_from_child, args=(sender, task), daemon=True)
         with _started(child):
             sender.close()
             try:
@@ -128,12 +132,18 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
 
 
 def start_server() -> None:
-    """Start the process that children are forked from, which ignores Ctrl-C while it imports.
-
-    It works in the background: start it early to have it sooner.
-    """
+    """Start what children begin from, in the background: start it early to have it sooner."""
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
+    if _context.get_start_method() == "forkserver":
+        _start_fork_server()
+
+
+def _start_fork_server() -> None:
+    """Start the process that children are forked from, which ignores Ctrl-C while it imports."""
+    assert sys.platform != "win32"
+    from multiprocessing import forkserver, resource_tracker
+
     _context.set_forkserver_preload(PRELOADED)
     # It lets SIGINT through again after its own start, so that has to come first.
     resource_tracker.ensure_running()
@@ -152,16 +162,13 @@ def stop_all() -> None:
             child.kill()
 
 
-def _answer_from_child(
-    sender: Connection,
-    clean_up: Callable[[], object],
-    function: Callable[..., Any],
-    args: tuple[Any, ...],
-) -> None:
-    # Ctrl-C reaches the whole group of processes; the supervisor decides what it means.
+def _answer_from_child(sender: Connection, task: bytes) -> None:
+    # Ctrl-C reaches the whole group of processes; the supervisor decides what it means. Only then
+    # is the task unpacked: in a process that begins anew, its imports take seconds.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, args=(clean_up,), daemon=True).start()
     try:
+        function, args, clean_up = ForkingPickler.loads(task)
+        threading.Thread(target=_end_with_parent, args=(clean_up,), daemon=True).start()
         answer = ("returned", function(*args))
     except Exception as error:  # noqa: BLE001  # whatever it is, the supervisor is told
         message = " ".join(str(error).split()) or type(error).__name__

@@ -6,6 +6,7 @@ import contextlib
 import os
 import platform
 import shutil
+import sys
 from pathlib import Path
 
 from rich.console import Console
@@ -13,22 +14,27 @@ from rich.console import Console
 from experiments.bandit_batches import do_batch
 from experiments.study_plan import PlannedRun
 from pipeline.environments import import_gym_packages
+from pipeline.files import portable_name, put_in_place
 from pipeline.run_folder import Run
 from pipeline.training import train
+
+LONGEST_DRAFT_NAME = 150  # bytes, besides the numbers and names of process and machine
 
 
 def draft_path(root: Path, planned: PlannedRun) -> Path:
     """Where a run of this process is written until it is whole."""
-    name = f"{planned.path.parent.name}@{planned.path.name}"
+    name = portable_name(f"{planned.path.parent.name}@{planned.path.name}", LONGEST_DRAFT_NAME)
     return root / ".drafts" / f"{os.getpid()}@{platform.node()}@{name}"
 
 
 def remove_draft(draft: Path) -> None:
     """Remove what an unfinished run has left, even while it is being written."""
     dead = draft.with_name(f"{draft.name}.dead")
-    with contextlib.suppress(FileNotFoundError):
-        draft.rename(dead)
-    shutil.rmtree(dead, ignore_errors=True)
+    with contextlib.suppress(OSError):
+        draft.replace(dead)
+    # Windows does not rename a folder of which a file is open.
+    for folder in (dead, draft):
+        shutil.rmtree(folder, ignore_errors=True)
     for folder in (draft.parent, draft.parent.parent):
         with contextlib.suppress(OSError):
             folder.rmdir()
@@ -52,6 +58,8 @@ def make_folder(path: Path) -> None:
 
 
 def _is_alive(pid: int) -> bool:
+    if sys.platform == "win32":
+        return _is_alive_on_windows(pid)
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -59,6 +67,23 @@ def _is_alive(pid: int) -> bool:
     except PermissionError:
         return True
     return True
+
+
+def _is_alive_on_windows(pid: int) -> bool:
+    """There, `os.kill` would send Ctrl-C or end the process, whatever the signal."""
+    assert sys.platform == "win32"
+    import _winapi
+
+    try:
+        process = _winapi.OpenProcess(_winapi.SYNCHRONIZE, False, pid)
+    except PermissionError:
+        return True
+    except OSError:
+        return False
+    try:
+        return _winapi.WaitForSingleObject(process, 0) == _winapi.WAIT_TIMEOUT
+    finally:
+        _winapi.CloseHandle(process)
 
 
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
@@ -77,7 +102,7 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
         shutil.rmtree(planned.path)  # of other settings, or cut off
     planned.path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        draft.rename(planned.path)
+        put_in_place(draft, planned.path)
     except OSError:
         if not planned.is_finished:
             raise

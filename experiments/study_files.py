@@ -22,6 +22,9 @@ from pipeline.errors import UserError, shown, unknown
 from pipeline.settings.coercion import coerce
 from pipeline.settings.strict_yaml import key_lines, read_yaml
 
+# The studies that come with the project.
+_SHIPPED = Path(__file__).resolve().parents[1] / "studies"
+
 BUDGETS = ("n_timesteps", "n_episodes")
 
 # Keys of a study, and what their values must be.
@@ -98,6 +101,28 @@ class _Document:
         if all(data.get(key) is not None for key in BUDGETS):
             place = self.at(*keys, BUDGETS[1])
             raise UserError(f"{place}: give {' or '.join(BUDGETS)}, not both")
+
+
+def find_study(given: str) -> Path:
+    """The file that is meant: the one of that path, or else the shipped study of that name.
+
+    Args:
+        given: a path, or for a shipped study also its bare name: ``mine-maze``,
+            ``mine-maze.yml`` or ``studies/mine-maze.yml``.
+
+    Raises:
+        UserError: if there is neither.
+    """
+    path = Path(given)
+    if path.is_file():
+        return path
+    shipped = {known.stem: known for known in sorted(_SHIPPED.glob("*.yml"))}
+    name = path.name.removesuffix(".yml")
+    if path.parent not in (Path(), Path("studies")):
+        raise UserError(f"{given}: there is no such study file")
+    if name not in shipped:
+        raise unknown(f"{given}: there is no such file, and no study", name, shipped)
+    return shipped[name]
 
 
 def read_study(path: Path) -> StudySpec:

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
+from unicodedata import normalize
 
 from agents import ALGORITHMS
 from envs.known_models import time_limit
@@ -164,8 +165,9 @@ def _check_folders(what: str, labels: Sequence[str]) -> None:
     """Refuse labels that are the same, or would have the same folder."""
     places: dict[str, int] = {}
     for index, label in enumerate(labels):
-        # Some file systems do not tell upper from lower case.
-        first = places.setdefault(file_name(label).lower(), index)
+        # Some file systems do not tell upper from lower case, nor "ä" from "a" with two dots.
+        folder = normalize("NFC", file_name(label).casefold())
+        first = places.setdefault(folder, index)
         if first != index:
             raise UserError(
                 f"{what}: {labels[first]!r} and {label!r} would share the folder "

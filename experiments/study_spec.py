@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from pipeline.files import LONGEST_NAME, portable_name
 from pipeline.settings.hyperparam_entries import override
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
@@ -40,9 +41,9 @@ def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     return override(settings, {**changes, **merged})
 
 
-def file_name(label: str) -> str:
-    """The label as the name of a folder."""
-    return re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_"
+def file_name(label: str, longest: int = LONGEST_NAME) -> str:
+    """The label as the name of a folder, of ``longest`` bytes at most."""
+    return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,60 @@
-"""Writing files so that a reader, or a crash, never meets a half-written one."""
+"""Writing files so that a reader, or a crash, never meets a half-written one; names for them."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import re
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+# Windows takes no more than 260 characters for a whole path, Linux no more than 255 bytes a name.
+LONGEST_NAME = 100  # bytes
+
+_REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
+_DEVICE = re.compile(r"(con|prn|aux|nul|(con(in|out)\$)|(com|lpt)[0-9¹²³]) *(\.|$)", re.IGNORECASE)
+
+# Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
+_PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
+
+
+def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
+    """The name of a file or folder, as every common file system takes it.
+
+    Args:
+        name: what it should be called.
+        longest: how many bytes it may have.
+
+    Returns:
+        The name as it is, where no system would refuse it; otherwise one that resembles it, with a
+        digest that keeps it apart from others.
+    """
+    plain = _REFUSED_SIGNS.sub("_", name) or "_"
+    is_device = _DEVICE.match(plain) is not None
+    if plain == name and not is_device and len(name.encode(errors="surrogatepass")) <= longest:
+        return name
+    if is_device:
+        plain = plain.replace(".", "_")  # "nul.txt" is a device too
+    digest = hashlib.sha256(name.encode(errors="surrogatepass")).hexdigest()[:8]
+    kept = plain.encode(errors="replace")[: longest - len(digest) - 1]
+    return f"{kept.decode(errors='ignore')}-{digest}"
+
+
+def put_in_place(draft: Path, path: Path) -> None:
+    """Rename a file or folder to ``path``; a file that is there is replaced in one step."""
+    for pause in _PAUSES if sys.platform == "win32" else ():
+        try:
+            draft.replace(path)
+        except PermissionError:
+            time.sleep(pause)
+        else:
+            return
+    draft.replace(path)
 
 
 @contextmanager
@@ -16,17 +63,17 @@ def replacing(path: Path) -> Iterator[Path]:
     draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         yield draft
-        with draft.open("rb") as file:
+        with draft.open("rb+") as file:  # Windows flushes only what may be written
             os.fsync(file.fileno())
-        draft.replace(path)
+        put_in_place(draft, path)
     finally:
         draft.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace the file at ``path`` by ``text``."""
+    """Replace the file at ``path`` by ``text``, byte for byte the same on every system."""
     with replacing(path) as draft:
-        draft.write_text(text, encoding="utf-8")
+        draft.write_text(text, encoding="utf-8", newline="\n")
 
 
 def write_json(path: Path, data: Any) -> None:

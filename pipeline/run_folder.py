@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.files import write_json
+from pipeline.files import portable_name, write_json
 
 RUNNING = "running"
 FINISHED = "finished"
@@ -22,9 +22,17 @@ INTERRUPTED = "interrupted"
 FAILED = "failed"
 
 
+class NoRunError(UserError):
+    """An agent has not been trained on an environment yet."""
+
+    def __init__(self, algo: str, env_id: str, log_folder: Path) -> None:
+        super().__init__(f"no run of {algo} on {environment_name(env_id)} in {log_folder}")
+        self.algo, self.env_id, self.log_folder = algo, env_id, log_folder
+
+
 def environment_name(env_id: str) -> str:
     """The environment's id as a file name: no module before it, and no slash in it."""
-    return env_id.rpartition(":")[2].replace("/", "-")
+    return portable_name(env_id.rpartition(":")[2].replace("/", "-"))
 
 
 def _run_number(name: str, env_name: str) -> int:
@@ -76,15 +84,13 @@ class Run:
         """The run of that number, or the newest where the number is 0.
 
         Raises:
-            UserError: if there is none; it names those that there are.
+            NoRunError: if there is none at all.
+            UserError: if there is none of that number; it names those that there are.
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
         if not runs:
-            raise UserError(
-                f"no run of {algo} on {name} in {log_folder}: "
-                f"train one with: python train.py --algo {algo} --env {env_id} -f {log_folder}"
-            )
+            raise NoRunError(algo, env_id, log_folder)
         if number == 0:
             return cls(runs[-1][1], name)
         for known, path in runs:

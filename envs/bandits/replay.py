@@ -127,6 +127,6 @@ def _number_of_arms(data: LoggedData) -> int:
         raise ValueError(
             f"{data.source} did not choose among its {n_arms} arms uniformly: the propensity of "
             f"pull {wrong[0] + 1} is {data.propensities[wrong[0]]:g}, not {1 / n_arms:.4g}; use "
-            f"inverse propensities instead: python compare.py --logged {data.source} --policy RUN"
+            f"inverse propensities instead: compare --logged {data.source} --policy RUN"
         )
     return n_arms

@@ -377,7 +377,7 @@ def test_replay_estimates_what_policies_are_worth(tmp_path: Path) -> None:
         ),
         (
             "arm,reward,propensity\n0,1,0.9\n1,0,0.1\n",
-            "use inverse propensities instead: python compare.py --logged .*log.csv --policy RUN",
+            "use inverse propensities instead: compare --logged .*log.csv --policy RUN",
         ),
         (
             "arm,reward,propensity\n0,1,0.5\n1,0,0.5\n2,0,0.5\n",
