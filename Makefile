@@ -7,6 +7,9 @@ N ?= 25
 SEED ?= 0
 JOBS ?= 2
 
+# What is installed, and has to work on systems other than this one.
+PACKAGES := mdp verdicts envs agents pipeline experiments report commands
+
 BIN := .venv/bin
 STAMP := .venv/.installed
 # MushroomRL needs an old NumPy and brings a PyTorch of its own: that comparison is run by itself.
@@ -17,7 +20,7 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help train test lint format bench mutants clean
+.PHONY: help train test lint format bench mutants wheel clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
@@ -33,6 +36,7 @@ lint: $(STAMP) ## Check style, formatting, types and import contracts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/python -m mypy
+	$(BIN)/python -m mypy --platform win32 --cache-dir .mypy_cache/win32 $(PACKAGES)
 	$(BIN)/lint-imports
 
 format: $(STAMP) ## Format the code and mend what ruff can mend
@@ -44,6 +48,11 @@ bench: $(STAMP) ## Run every benchmark
 
 mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0 JOBS=2
 	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED) --jobs $(JOBS)
+
+wheel: $(STAMP) ## Build dist/, install the wheel in an environment of its own, and try it
+	rm -rf dist
+	$(BIN)/python -m build --outdir dist .
+	PYTHON=$(BIN)/python .ci/try-wheel dist/*.whl
 
 clean: ## Remove caches and builds; .venv and logs/ stay
 	rm -rf build dist *.egg-info .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache

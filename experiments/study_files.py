@@ -111,17 +111,15 @@ def find_study(given: str) -> Path:
             ``mine-maze.yml`` or ``studies/mine-maze.yml``.
 
     Raises:
-        UserError: if there is neither.
+        UserError: if it is a plain name, and there is neither.
     """
     path = Path(given)
-    if path.is_file():
+    if path.is_file() or path.parent not in (Path(), Path("studies")):
         return path
     shipped = {known.stem: known for known in sorted(_SHIPPED.glob("*.yml"))}
     name = path.name.removesuffix(".yml")
-    if path.parent not in (Path(), Path("studies")):
-        raise UserError(f"{given}: there is no such study file")
     if name not in shipped:
-        raise unknown(f"{given}: there is no such file, and no study", name, shipped)
+        raise unknown(f"{given}: cannot be read: no such file, and no study", name, shipped)
     return shipped[name]
 
 

@@ -66,7 +66,7 @@ def digest() -> str:
     for path, _, _ in stamps_at_start():
         content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
         lines.append(f"{Path(path).relative_to(ROOT)} {content}")
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:32]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
 def parents() -> Iterator[Path]:

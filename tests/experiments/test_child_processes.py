@@ -1,13 +1,17 @@
 """Work in child processes: what comes back, what is tried again, and what is left behind."""
 
+import multiprocessing
 import os
+import runpy
 import signal
+import subprocess
 import sys
 import time
 from functools import partial
 
 import pytest
 
+from experiments import child_processes
 from experiments.child_processes import (
     StoppedError,
     TaskFailedError,
@@ -49,6 +53,14 @@ def clean_up(folder):
     with (Path(folder) / "cleaned").open("a") as file:
         file.write(".")
 """
+
+
+@pytest.fixture(params=["forkserver", "spawn"], autouse=True)
+def method(request, monkeypatch):
+    """Children of Linux, and those of Windows and macOS."""
+    context = multiprocessing.get_context(request.param)
+    monkeypatch.setattr(child_processes, "_context", context)
+    return request.param
 
 
 @pytest.fixture
@@ -166,3 +178,48 @@ def test_ctrl_c_does_not_reach_the_children(chores, tmp_path):
         assert not waiting.done()
         stop_all()
         assert isinstance(waiting.exception(), StoppedError)
+
+
+# A supervisor of its own, which is to be killed.
+DRIVER = """
+import multiprocessing, sys
+from functools import partial
+import study_chores
+from experiments import child_processes
+
+if __name__ == "__main__":
+    method, folder = sys.argv[1:]
+    child_processes._context = multiprocessing.get_context(method)
+    child_processes.supervise(
+        study_chores.wait, folder, clean_up=partial(study_chores.clean_up, folder)
+    )
+"""
+
+
+def test_a_child_ends_with_its_supervisor_and_cleans_up(chores, tmp_path, method):
+    driver = tmp_path / "driver.py"
+    driver.write_text(DRIVER)
+    paths = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    command = [sys.executable, str(driver), method, str(tmp_path)]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": paths}) as process:
+        wait_for(lambda: list(tmp_path.glob("waiting_*")))
+        process.kill()
+    (path,) = tmp_path.glob("waiting_*")
+    wait_for(lambda: not is_alive(int(path.name.partition("_")[2])))
+    assert (tmp_path / "cleaned").read_text() == "."
+
+
+@pytest.mark.parametrize(
+    ("platform", "expected"), [("linux", "forkserver"), ("win32", "spawn"), ("darwin", "spawn")]
+)
+def test_only_linux_forks(monkeypatch, platform, expected):
+    """Windows has no fork server, and the module must do without."""
+    monkeypatch.setattr(sys, "platform", platform)
+    if platform == "win32":
+        monkeypatch.setitem(sys.modules, "multiprocessing.forkserver", None)
+        monkeypatch.delattr(signal, "pthread_sigmask")
+    loaded = runpy.run_path(child_processes.__file__)
+    assert loaded["START_METHOD"] == expected
+    assert loaded["_context"].get_start_method() == expected
+    if platform != "linux":
+        loaded["start_server"]()

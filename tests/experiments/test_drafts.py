@@ -79,6 +79,54 @@ def test_a_process_of_another_user_is_alive(tmp_path, dead_pid, monkeypatch):
     assert draft.is_dir()
 
 
+class _Windows:
+    """What Windows says of three processes: one at work, one that has ended, another user's."""
+
+    SYNCHRONIZE, WAIT_OBJECT_0, WAIT_TIMEOUT = 0x100000, 0, 0x102
+
+    def __init__(self):
+        self.n_open = 0
+
+    def OpenProcess(self, access, inherit, pid):  # noqa: N802  # that is what it is called
+        assert (access, inherit) == (self.SYNCHRONIZE, False)
+        if pid == 3:
+            raise PermissionError
+        if pid > 3:
+            raise OSError(22, "the parameter is incorrect")
+        self.n_open += 1
+        return pid
+
+    def WaitForSingleObject(self, handle, milliseconds):  # noqa: N802
+        assert milliseconds == 0
+        return {1: self.WAIT_TIMEOUT, 2: self.WAIT_OBJECT_0}[handle]
+
+    def CloseHandle(self, handle):  # noqa: N802
+        self.n_open -= 1
+
+
+def test_on_windows_nothing_is_sent_to_the_process(tmp_path, monkeypatch):
+    windows = _Windows()
+    monkeypatch.setitem(sys.modules, "_winapi", windows)
+    monkeypatch.setattr(sys, "platform", "win32")
+    monkeypatch.delattr(os, "kill")
+    drafts = [draft_of(tmp_path, pid) for pid in (1, 2, 3, 4)]
+    remove_dead_drafts(tmp_path)
+    assert [draft.exists() for draft in drafts] == [True, False, True, False]
+    assert windows.n_open == 0
+
+
+def test_a_draft_that_cannot_be_renamed_is_removed_all_the_same(tmp_path, monkeypatch):
+    """Windows renames no folder of which somebody has a file open."""
+    draft = draft_of(tmp_path, 1)
+
+    def refuse(path, target):
+        raise PermissionError(13, "is being used by another process", str(path))
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    remove_draft(draft)
+    assert not draft.exists()
+
+
 def test_where_there_are_no_drafts_nothing_happens(tmp_path):
     remove_dead_drafts(tmp_path)
     remove_dead_drafts(tmp_path / "never")
@@ -103,6 +151,16 @@ def test_a_draft_says_whose_it_is(tmp_path):
     assert [path.name for path in paths] == [
         f"{os.getpid()}@{HERE}@mine@dry_lake_{number}" for number in (1, 2)
     ]
+
+
+def test_a_draft_of_long_labels_has_a_name_that_can_be_made(tmp_path):
+    names = ["ä" * 90, "ö" * 90]
+    lake = EnvironmentSpec(names[0], "FrozenLake-v1", {"n_timesteps": 10})
+    study = StudySpec("s", "S", (AgentSpec(names[1], "qlearning"),), (lake,), n_seeds=2)
+    paths = [draft_path(tmp_path, run) for run in plan(study, tmp_path)]
+    assert len({path.name for path in paths}) == 2
+    for path in paths:
+        make_folder(path.with_name(f"{path.name}.dead"))
 
 
 def test_a_folder_is_made_while_another_run_removes_it(tmp_path, monkeypatch):

@@ -1,6 +1,7 @@
 """Study files: what they may say, and how each mistake is told."""
 
 import re
+from pathlib import Path
 
 import pytest
 import yaml
@@ -8,9 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents import ALGORITHMS
-from experiments.study_files import read_study, swept
+from experiments import study_files
+from experiments.study_files import find_study, read_study, swept
 from experiments.study_spec import METRICS, AgentSpec, QuickSpec, file_name, layered
 from pipeline.errors import UserError
+from pipeline.files import portable_name
 
 
 @pytest.fixture
@@ -273,9 +276,31 @@ def test_every_metric_and_every_agent_is_known(read):
     assert len(read(f"agents: [{names}]\nenvironments: [Taxi-v4]\n").agents) == len(ALGORITHMS)
 
 
-@given(st.text())
+@given(st.text() | st.text(min_size=99, max_size=300) | st.sampled_from(["CON", "nul.x", "a."]))
 def test_a_label_makes_a_plain_file_name(label):
     name = file_name(label)
-    assert name == file_name(name)
+    assert name == file_name(name) == portable_name(name)
     assert re.fullmatch(r"[\w.=+,-]+", name)
     assert name not in (".", "..")
+
+
+@pytest.mark.parametrize(
+    "label", ["qlearning", "Eis_glatt", "ε=0.1, k", "qlearning learning_rate=0.01, gamma=0.9"]
+)
+def test_ordinary_labels_keep_the_folders_that_they_had(label):
+    assert file_name(label) == re.sub(r"[^\w.=+,-]+", "_", label)
+
+
+def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shipped = Path(study_files.__file__).resolve().parents[1] / "studies" / "mine-maze.yml"
+    for given_name in ("mine-maze", "mine-maze.yml", "studies/mine-maze.yml", "./mine-maze.yml"):
+        assert find_study(given_name) == shipped
+    assert read_study(shipped).name == "mine-maze"
+    # A file of the user's own comes first, and elsewhere ours are not looked for.
+    Path("mine-maze.yml").touch()
+    assert find_study("mine-maze.yml") == Path("mine-maze.yml")
+    assert find_study("mine-maze") == shipped
+    assert find_study("other/mine-maze.yml") == Path("other/mine-maze.yml")
+    with pytest.raises(UserError, match=r"mine-mase: cannot be read: .* did you mean 'mine-maze'"):
+        find_study("mine-mase")

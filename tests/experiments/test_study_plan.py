@@ -48,7 +48,16 @@ def test_labels_become_names_of_folders(tmp_path):
     assert only(study_of(agent), tmp_path).path.parent.name == "a_b_gamma=0.9_mine"
 
 
-@pytest.mark.parametrize("labels", [("a b", "a/b"), ("Mine", "mine"), ("same", "same")])
+@pytest.mark.parametrize(
+    "labels",
+    [
+        ("a b", "a/b"),
+        ("Mine", "mine"),
+        ("same", "same"),
+        ("Straße", "STRASSE"),
+        ("\uf900", "\u8c48"),  # one sign under two numbers, which macOS makes one
+    ],
+)
 def test_labels_that_would_share_a_folder(labels):
     agents = [AgentSpec(label, "qlearning") for label in labels]
     with pytest.raises(UserError, match=r"agents: .* would share the folder"):

@@ -1,12 +1,18 @@
 """A file is there whole, or as it was before."""
 
+import errno
 import json
+import os
+import sys
 import threading
+from pathlib import Path
 
 import pytest
+from hypothesis import assume, example, given
+from hypothesis import strategies as st
 
 from pipeline import files
-from pipeline.files import replacing, write_json, write_text
+from pipeline.files import portable_name, put_in_place, replacing, write_json, write_text
 
 
 def names(folder):
@@ -103,3 +109,112 @@ def test_a_reader_never_meets_a_half_written_file(tmp_path):
     reader.join()
     assert met <= set(texts)
     assert met
+
+
+def test_what_is_flushed_may_be_written(tmp_path, monkeypatch):
+    """Windows flushes no file that was opened for reading."""
+    fsync = os.fsync
+
+    def as_on_windows(descriptor):
+        os.write(descriptor, b"")
+        fsync(descriptor)
+
+    monkeypatch.setattr(files.os, "fsync", as_on_windows)
+    write_text(tmp_path / "notes.txt", "whole")
+    assert (tmp_path / "notes.txt").read_text() == "whole"
+
+
+def test_lines_end_alike_on_every_system(tmp_path, monkeypatch):
+    given_newline = []
+    write = Path.write_text
+
+    def note(path, text, encoding=None, errors=None, newline=None):
+        given_newline.append(newline)
+        return write(path, text, encoding, errors, newline)
+
+    monkeypatch.setattr(Path, "write_text", note)
+    write_json(tmp_path / "run.json", {"a": 1})
+    assert given_newline == ["\n"]
+
+
+@pytest.fixture
+def refusals(monkeypatch):
+    """How often Windows still refuses to rename; and what was tried."""
+    left, tried, replace = [0], [], Path.replace
+
+    def refusing(path, target):
+        tried.append(target)
+        if left[0]:
+            left[0] -= 1
+            raise PermissionError(errno.EACCES, "is being used by another process")
+        return replace(path, target)
+
+    monkeypatch.setattr(Path, "replace", refusing)
+    monkeypatch.setattr(files.time, "sleep", lambda seconds: None)
+    return left, tried
+
+
+@pytest.mark.parametrize(("n", "platform"), [(0, "linux"), (0, "win32"), (3, "win32")])
+def test_what_a_scanner_holds_is_renamed_a_moment_later(tmp_path, monkeypatch, refusals, n, platform):
+    monkeypatch.setattr(sys, "platform", platform)
+    left, tried = refusals
+    left[0] = n
+    (tmp_path / "draft").write_text("new")
+    put_in_place(tmp_path / "draft", tmp_path / "file")
+    assert (tmp_path / "file").read_text() == "new"
+    assert len(tried) == n + 1
+
+
+@pytest.mark.parametrize(("platform", "n"), [("linux", 1), ("win32", 6)])
+def test_what_stays_refused_is_an_error(tmp_path, monkeypatch, refusals, platform, n):
+    monkeypatch.setattr(sys, "platform", platform)
+    left, tried = refusals
+    left[0] = 99
+    with pytest.raises(PermissionError):
+        put_in_place(tmp_path / "draft", tmp_path / "file")
+    assert len(tried) == n
+
+
+# --- names ---------------------------------------------------------------------------------------
+
+DEVICES = {"CON", "PRN", "AUX", "NUL", "CONIN$", "CONOUT$"}
+DEVICES |= {f"{port}{digit}" for port in ("COM", "LPT") for digit in "0123456789¹²³"}
+NAMES = st.text(st.characters(exclude_categories=["Cs"])) | st.sampled_from(
+    [*DEVICES, "con", "Nul.txt", "aux .zip", "com1.a.b", "a.", "a ", ".", "..", "a:b", "a/b", "a?b"]
+)
+
+
+def is_acceptable(name):
+    """The rules of Windows, which are the strictest, and Linux's for the length."""
+    base = name.partition(".")[0].rstrip(" ").upper()
+    return (
+        0 < len(name.encode()) <= 255
+        and not set(name) & {*'<>:"/\\|?*', *map(chr, range(32))}
+        and not name.endswith((" ", "."))
+        and base not in DEVICES
+    )
+
+
+@given(NAMES | st.text(min_size=100, max_size=400))
+@example("COM¹.x")
+def test_a_name_is_one_that_every_system_takes(name):
+    portable = portable_name(name)
+    assert is_acceptable(portable)
+    assert portable_name(portable) == portable
+    assert len(portable.encode()) <= 100
+    if is_acceptable(name) and len(name.encode()) <= 100:
+        assert portable == name
+
+
+@given(NAMES, NAMES)
+@example("CON", "con")
+@example("a:", "a?")
+@example("a.", "a")
+@example("x" * 150, "x" * 151)
+def test_two_names_stay_two(first, second):
+    assume(first != second)
+    a, b = portable_name(first), portable_name(second)
+    # Names that a system takes as they are may differ in upper and lower case alone.
+    assert a != b
+    if (a, b) != (first, second):
+        assert a.casefold() != b.casefold()

@@ -1,0 +1,163 @@
+"""The installed command: what it runs, and how messages name it."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import compare
+import enjoy
+import train
+from commands import yardstick
+from commands.parsing import COMMANDS, as_called, called_as, command_line, run_command
+
+ROOT = Path(train.__file__).parent
+QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
+SCRIPTS = {"train.py": train, "enjoy.py": enjoy, "compare.py": compare}
+
+
+@pytest.fixture
+def type_command(monkeypatch, capsys, tmp_path):
+    """Run a command line in this process, inside an empty folder."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", list(words))
+        script = Path(words[0]).name
+        with pytest.raises(SystemExit) as stop:
+            if script == "yardstick":
+                yardstick.main()
+            run_command(SCRIPTS[script].main)
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("program", "named"),
+    [
+        ("train.py", "python enjoy.py"),
+        ("/a place/compare.py", "python '/a place/enjoy.py'"),
+        ("../train.py", "python ../enjoy.py"),
+        ("yardstick compare", "yardstick enjoy"),
+        ("/somewhere/pytest", "python enjoy.py"),
+        ("", "python enjoy.py"),
+    ],
+)
+def test_commands_are_named_as_the_user_calls_them(monkeypatch, program, named):
+    monkeypatch.setattr(sys, "argv", [program])
+    assert called_as("enjoy") == named
+    assert as_called("  python enjoy.py X\n  python enjoy.py") == f"  {named} X\n  {named}"
+
+
+@pytest.mark.parametrize(
+    ("words", "typed"),
+    [
+        (["train.py", "--env", "A B"], "python train.py --env 'A B'"),
+        (["yardstick train", "--env", "A B"], "yardstick train --env 'A B'"),
+    ],
+)
+def test_the_command_line_can_be_typed_again(monkeypatch, words, typed):
+    monkeypatch.setattr(sys, "argv", words)
+    assert command_line() == typed
+
+
+@pytest.mark.parametrize("program", ["/venv/bin/yardstick", "yardstick"])
+def test_training_and_playing_by_the_installed_name(type_command, tmp_path, program):
+    code, out, err = type_command(program, "train", *QUICK)
+    assert (code, err) == (0, "")
+    assert "watch    yardstick enjoy --algo qlearning --env FrozenLake-v1\n" in re.sub(" +\n", "\n", out)
+    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    written = (run / "FrozenLake-v1" / "command.txt").read_text()
+    assert written == f"yardstick train {shlex.join(QUICK)}\n"
+    code, out, err = type_command(program, "enjoy", *QUICK[:4], "--render", "none")
+    assert (code, err) == (0, "")
+    assert "over 10 episodes" in out
+
+
+def test_mistakes_name_the_installed_command(type_command):
+    code, _, err = type_command("yardstick", "enjoy", "--algo", "dqn", "--env", "CartPole-v1")
+    assert code == 2
+    assert err == (
+        "yardstick enjoy: error: no run of dqn on CartPole-v1 in logs: "
+        "train one with: yardstick train --algo dqn --env CartPole-v1 -f logs\n"
+    )
+    code, _, err = type_command("yardstick", "train", "--evn", "X")
+    assert (code, err.count("\n")) == (2, 1)
+    assert err.startswith("yardstick train: error: unknown argument --evn")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_examples_for_the_one_who_asks(type_command, command):
+    code, out, _ = type_command("yardstick", command, "--help")
+    assert code == 0
+    assert out.startswith(f"usage: yardstick {command} [-h]")
+    assert f"\n  yardstick {command} --env" in out
+    assert ".py" not in out.replace("STUDY.py", "")
+    code, out, _ = type_command(f"{command}.py", "--help")
+    assert out.startswith(f"usage: {command}.py [-h]")
+    assert f"\n  python {command}.py --env" in out
+    assert "yardstick" not in out
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["trian"], "unknown command 'trian': did you mean 'train'?"),
+        (["trian", "--env", "X"], "unknown command 'trian': did you mean 'train'?"),
+        (["x"], "unknown command 'x': known are train, enjoy, compare"),
+        ([], "which command? train, enjoy, compare"),
+        (["--env", "train"], "unknown argument --env: known are -h, --help, --version"),
+    ],
+)
+def test_what_is_no_command_ends_in_one_line(type_command, words, complaint):
+    code, out, err = type_command("yardstick", *words)
+    assert (code, out) == (2, "")
+    assert err == f"yardstick: error: {complaint} (see --help)\n"
+
+
+def test_help_and_version(type_command):
+    code, out, _ = type_command("yardstick", "--help")
+    assert code == 0
+    assert all(f"  yardstick {command}" in out for command in COMMANDS)
+    assert type_command("yardstick", "--version") == (0, f"{version('rl-yardstick')}\n", "")
+
+
+HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib", "gymnasium")
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["train", "--help"], ["enjoy", "--help"], ["compare", "--help"]]
+)
+def test_help_loads_nothing_heavy(words, tmp_path):
+    program = (
+        "import sys; from commands.yardstick import main\n"
+        "try: main()\n"
+        f"finally: print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    assert (done.returncode, done.stderr) == (0, "[]\n")
+
+
+def test_a_study_of_ours_is_found_by_its_name(type_command, tmp_path):
+    """Here without its runs: what it should be compared by is a mistake."""
+    for given in ("mine-maze", "mine-maze.yml", "studies/mine-maze.yml"):
+        code, _, err = type_command("yardstick", "compare", given, "-params", "gama:1")
+        assert code == 2
+        assert str(ROOT / "studies" / "mine-maze.yml") in err
+    (tmp_path / "mine-maze.yml").write_text("agents: [sarsaa]\nenvironments: [Taxi-v4]\n")
+    code, _, err = type_command("yardstick", "compare", "mine-maze.yml")
+    assert err.startswith("yardstick compare: error: mine-maze.yml:1: unknown agent 'sarsaa'")
