@@ -28,15 +28,17 @@ from rich.table import Table
 ROOT = Path(__file__).resolve().parent.parent
 TRAINING = ("--algo", "qlearning", "--env", "Warehouse-v0", "--n-episodes", "1000")
 IMPORT = "import stable_baselines3"
+INSTALLED = "from commands.yardstick import main; main()"
 COMMANDS: dict[str, tuple[str, ...]] = {
     "train.py --help": ("train.py", "--help"),
+    "yardstick train --help": ("-c", INSTALLED, "train", "--help"),
     "train.py --list": ("train.py", "--list"),
     "train.py --env Warehose-v0": ("train.py", "--env", "Warehose-v0"),
     IMPORT: ("-c", IMPORT),
     f"train.py {' '.join(TRAINING)}": ("train.py", *TRAINING),
 }
 # Of the last one, the limit stands for what it takes beyond the import.
-LIMITS = dict(zip(COMMANDS, ("0.3", "0.3", "0.3", None, "1.5 beyond"), strict=True))
+LIMITS = dict(zip(COMMANDS, ("0.3", "0.3", "0.3", "0.3", None, "1.5 beyond"), strict=True))
 
 # A line of `-X importtime`: microseconds of the module alone, of all that it imports, its name.
 IMPORTED = re.compile(r"import time: +(\d+) \| +\d+ \| +([\w.]+)")

@@ -65,8 +65,8 @@ def main() -> int:
     """Parse the arguments and play; the exit code."""
     args = build_parser().parse_args()
     from commands.enjoy_request import model_request
-    from pipeline.filming import check_film_path
     from pipeline.errors import UserError
+    from pipeline.filming import check_film_path
     from pipeline.model_choice import choose_model
     from pipeline.run_folder import NoRunError
 

@@ -141,17 +141,17 @@ def start_server() -> None:
 
 def _start_fork_server() -> None:
     """Start the process that children are forked from, which ignores Ctrl-C while it imports."""
-    assert sys.platform != "win32"
-    from multiprocessing import forkserver, resource_tracker
+    if sys.platform != "win32":
+        from multiprocessing import forkserver, resource_tracker
 
-    _context.set_forkserver_preload(PRELOADED)
-    # It lets SIGINT through again after its own start, so that has to come first.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    try:
-        forkserver.ensure_running()
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        _context.set_forkserver_preload(PRELOADED)
+        # It lets SIGINT through again after its own start, so that has to come first.
+        resource_tracker.ensure_running()
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        try:
+            forkserver.ensure_running()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def stop_all() -> None:

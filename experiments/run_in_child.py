@@ -57,33 +57,31 @@ def make_folder(path: Path) -> None:
     path.mkdir(parents=True)
 
 
-def _is_alive(pid: int) -> bool:
-    if sys.platform == "win32":
-        return _is_alive_on_windows(pid)
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return True
-
-
-def _is_alive_on_windows(pid: int) -> bool:
-    """There, `os.kill` would send Ctrl-C or end the process, whatever the signal."""
-    assert sys.platform == "win32"
+if sys.platform == "win32":
     import _winapi
 
-    try:
-        process = _winapi.OpenProcess(_winapi.SYNCHRONIZE, False, pid)
-    except PermissionError:
+    def _is_alive(pid: int) -> bool:
+        # Here `os.kill` would end the process or send Ctrl-C to it, whatever the signal.
+        try:
+            process = _winapi.OpenProcess(_winapi.SYNCHRONIZE, False, pid)
+        except PermissionError:
+            return True
+        except OSError:
+            return False
+        try:
+            return _winapi.WaitForSingleObject(process, 0) == _winapi.WAIT_TIMEOUT
+        finally:
+            _winapi.CloseHandle(process)
+else:
+
+    def _is_alive(pid: int) -> bool:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            return True
         return True
-    except OSError:
-        return False
-    try:
-        return _winapi.WaitForSingleObject(process, 0) == _winapi.WAIT_TIMEOUT
-    finally:
-        _winapi.CloseHandle(process)
 
 
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:

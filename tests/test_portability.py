@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = "mdp verdicts envs agents pipeline experiments report commands".split()
+PACKAGES = ["mdp", "verdicts", "envs", "agents", "pipeline", "experiments", "report", "commands"]
 
 # What each of them does on Windows.
 ELSEWHERE = {
@@ -26,6 +26,8 @@ ELSEWHERE = {
     ".chmod": "knows no permissions but read-only",
 }
 
+ABSENT = ("/tmp", "/dev/", "/proc")  # noqa: S108  # nothing is written there
+
 # Where one of them stands all the same, and why.
 GUARDED = {("experiments/run_in_child.py", "os.kill"): "asks _winapi on Windows, before it"}
 
@@ -36,24 +38,22 @@ def name_of(function: ast.expr) -> str:
         return function.id
     if not isinstance(function, ast.Attribute):
         return ""
-    is_module = isinstance(function.value, ast.Name) and function.value.id in {"os", "io", "Image"}
+    is_module = isinstance(function.value, ast.Name) and function.value.id in {"os", "Image"}
     return f"{function.value.id if is_module else ''}.{function.attr}"
 
 
 def opens_text_anyhow(call: ast.Call) -> bool:
-    """Whether a text file is opened as the country's encoding has it."""
-    name, given = name_of(call.func), call.args[1:] if isinstance(call.func, ast.Name) else call.args
-    if name not in {"open", "io.open", ".open", ".read_text", ".write_text"}:
+    """Whether a text file is opened in whatever encoding the country has."""
+    name = name_of(call.func)
+    if "encoding" in {keyword.arg for keyword in call.keywords}:
         return False
-    keywords = {keyword.arg for keyword in call.keywords}
-    if "encoding" in keywords:
+    if name in {".read_text", ".write_text"}:
+        return len(call.args) < (1 if name == ".read_text" else 2)
+    if name not in {"open", ".open"}:
         return False
-    if name == ".read_text":
-        return not given
-    if name == ".write_text":
-        return len(given) < 2
-    mode = next((word.value for word in call.keywords if word.arg == "mode"), *given[:1])
-    return not (isinstance(mode, ast.Constant) and "b" in str(mode.value))
+    modes = [keyword.value for keyword in call.keywords if keyword.arg == "mode"]
+    modes += call.args[1:2] if name == "open" else call.args[:1]
+    return not any(isinstance(mode, ast.Constant) and "b" in str(mode.value) for mode in modes)
 
 
 def complaints(path: str, source: str) -> Iterator[str]:
@@ -64,7 +64,7 @@ def complaints(path: str, source: str) -> Iterator[str]:
             for name in {name_of(node), f".{node.attr}"} & ELSEWHERE.keys():
                 if (path, name) not in GUARDED:
                     yield f"{path}:{node.lineno}: {name} {ELSEWHERE[name]} on Windows"
-        if isinstance(node, ast.Constant) and str(node.value).startswith(("/tmp", "/dev/", "/proc")):  # noqa: S108
+        if isinstance(node, ast.Constant) and str(node.value).startswith(ABSENT):
             yield f"{path}:{node.lineno}: there is no {node.value} on Windows"
 
 

@@ -308,6 +308,50 @@ def test_ctrl_c_while_the_libraries_load(folder):
     assert not (folder / "studies" / "Slow-v0_qlearning" / "runs").exists()
 
 
+# The command as on Windows and macOS, where nothing is forked: each child imports this file anew.
+SPAWNING = """
+import multiprocessing
+from commands.compare_agents import main
+from commands.parsing import run_command
+
+if __name__ == "__main__":
+    from experiments import child_processes
+
+    child_processes._context = multiprocessing.get_context("spawn")
+    run_command(main)
+"""
+
+
+@pytest.fixture
+def spawning(folder, monkeypatch):
+    """Let the command start its children as Windows and macOS do."""
+    (folder / "compare.py").write_text(SPAWNING)
+    monkeypatch.setitem(globals(), "ROOT", folder)
+
+
+def test_where_nothing_can_be_forked_a_killed_worker_costs_nothing(spawning, folder):
+    words = ["--env", "Killed-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+    words += ["--seeds", 1, "-n", 500, "--no-report", "-f", "studies"]
+    code, out, err = finish(*words)
+    assert (code, err) == (0, "")
+    assert (folder / "mark").exists()
+    study = folder / "studies" / "Killed-v0_qlearning"
+    assert list(rows(study)["seed"]) == [0]
+    assert not (study / ".drafts").exists()
+    code, out, err = finish(*words)
+    assert "1 runs, 1 of them there already" in out
+
+
+def test_where_nothing_can_be_forked_ctrl_c_leaves_nothing(spawning, folder):
+    process, study = begin_slowly(folder)
+    started = session_of(process.pid)
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "compare.py: interrupted\n")
+    wait_for(lambda: not any(map(is_alive, started)))
+    assert not study.exists()
+
+
 STUDY = "agents: {qlearning: {gamma: 2}}\nenvironments: [FrozenLake-v1]\nn_timesteps: 9\n"
 MISTAKES = {
     "nothing": ([], "what to compare? give --env and --algos, or a study file"),

@@ -1,10 +1,10 @@
 """The installed command: what it runs, and how messages name it."""
 
 import os
-import re
 import shlex
 import subprocess
 import sys
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 
@@ -18,7 +18,12 @@ from commands.parsing import COMMANDS, as_called, called_as, command_line, run_c
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
-SCRIPTS = {"train.py": train, "enjoy.py": enjoy, "compare.py": compare}
+MAINS = {
+    "yardstick": yardstick.main,
+    "train.py": partial(run_command, train.main),
+    "enjoy.py": partial(run_command, enjoy.main),
+    "compare.py": partial(run_command, compare.main),
+}
 
 
 @pytest.fixture
@@ -28,11 +33,8 @@ def type_command(monkeypatch, capsys, tmp_path):
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", list(words))
-        script = Path(words[0]).name
         with pytest.raises(SystemExit) as stop:
-            if script == "yardstick":
-                yardstick.main()
-            run_command(SCRIPTS[script].main)
+            MAINS[Path(words[0]).name]()
         captured = capsys.readouterr()
         return stop.value.code, captured.out, captured.err
 
@@ -72,7 +74,7 @@ def test_the_command_line_can_be_typed_again(monkeypatch, words, typed):
 def test_training_and_playing_by_the_installed_name(type_command, tmp_path, program):
     code, out, err = type_command(program, "train", *QUICK)
     assert (code, err) == (0, "")
-    assert "watch    yardstick enjoy --algo qlearning --env FrozenLake-v1\n" in re.sub(" +\n", "\n", out)
+    assert "watch    yardstick enjoy --algo qlearning --env FrozenLake-v1 " in out
     run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
     written = (run / "FrozenLake-v1" / "command.txt").read_text()
     assert written == f"yardstick train {shlex.join(QUICK)}\n"

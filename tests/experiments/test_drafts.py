@@ -2,13 +2,21 @@
 
 import os
 import platform
+import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from experiments.run_in_child import draft_path, make_folder, remove_dead_drafts, remove_draft
+from experiments import run_in_child
+from experiments.run_in_child import (
+    do_run,
+    draft_path,
+    make_folder,
+    remove_dead_drafts,
+    remove_draft,
+)
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 
@@ -110,7 +118,7 @@ def test_on_windows_nothing_is_sent_to_the_process(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "platform", "win32")
     monkeypatch.delattr(os, "kill")
     drafts = [draft_of(tmp_path, pid) for pid in (1, 2, 3, 4)]
-    remove_dead_drafts(tmp_path)
+    runpy.run_path(run_in_child.__file__)["remove_dead_drafts"](tmp_path)
     assert [draft.exists() for draft in drafts] == [True, False, True, False]
     assert windows.n_open == 0
 
@@ -161,6 +169,26 @@ def test_a_draft_of_long_labels_has_a_name_that_can_be_made(tmp_path):
     assert len({path.name for path in paths}) == 2
     for path in paths:
         make_folder(path.with_name(f"{path.name}.dead"))
+
+
+@pytest.mark.parametrize(("algo", "env_id"), [("dqn", "CartPole-v1"), ("ucb", "GaussianBandit-v0")])
+def test_no_file_of_a_run_is_open_when_it_is_renamed_into_place(
+    tmp_path, monkeypatch, algo, env_id
+):
+    """Windows would not rename the folder."""
+
+    def note(draft, path):
+        names = [os.path.realpath(file) for file in Path("/proc/self/fd").iterdir()]
+        still_open.append([name for name in names if name.startswith(str(draft))])
+        assert (draft / "run.json").is_file()
+
+    still_open = []
+    monkeypatch.setattr(run_in_child, "put_in_place", note)
+    env = EnvironmentSpec(env_id, env_id, {"n_timesteps": 60})
+    study = StudySpec("s", "S", (AgentSpec(algo, algo),), (env,), n_seeds=1, tensorboard=True)
+    (planned,) = plan(study, tmp_path)
+    do_run(planned, draft_path(tmp_path, planned), "")
+    assert still_open == [[]]
 
 
 def test_a_folder_is_made_while_another_run_removes_it(tmp_path, monkeypatch):

@@ -155,7 +155,7 @@ def refusals(monkeypatch):
 
 
 @pytest.mark.parametrize(("n", "platform"), [(0, "linux"), (0, "win32"), (3, "win32")])
-def test_what_a_scanner_holds_is_renamed_a_moment_later(tmp_path, monkeypatch, refusals, n, platform):
+def test_what_a_scanner_holds_is_renamed_soon(tmp_path, monkeypatch, refusals, n, platform):
     monkeypatch.setattr(sys, "platform", platform)
     left, tried = refusals
     left[0] = n
