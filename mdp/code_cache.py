@@ -35,6 +35,10 @@ ROOT = Path(__file__).resolve().parent.parent
 # Folders of other digests that are left, so that one can go back and forth between two versions.
 KEPT_BESIDE = 3
 
+# What Numba's names and folders for one function come to, with some to spare. Windows takes paths
+# of 260 characters, and an environment deep in somebody's folders leaves too few.
+LONGEST_NAME = 120
+
 # The first field of a record of settings: after this come the algorithm's module and its class.
 RULE_PREFIX = "rule "
 
@@ -86,7 +90,7 @@ def folder() -> Path | None:
         chosen = parent / digest()
         try:
             chosen.mkdir(parents=True, exist_ok=True)
-            tempfile.TemporaryFile(dir=chosen).close()
+            tempfile.TemporaryFile(dir=chosen, prefix="n" * LONGEST_NAME).close()
             os.utime(chosen)
         except OSError:
             continue

@@ -171,7 +171,9 @@ def test_a_draft_of_long_labels_has_a_name_that_can_be_made(tmp_path):
         make_folder(path.with_name(f"{path.name}.dead"))
 
 
-@pytest.mark.parametrize(("algo", "env_id"), [("dqn", "CartPole-v1"), ("ucb", "GaussianBandit-v0")])
+@pytest.mark.parametrize(
+    ("algo", "env_id"), [("qlearning", "CartPole-v1"), ("ucb", "GaussianBandit-v0")]
+)
 def test_no_file_of_a_run_is_open_when_it_is_renamed_into_place(
     tmp_path, monkeypatch, algo, env_id
 ):
@@ -185,7 +187,7 @@ def test_no_file_of_a_run_is_open_when_it_is_renamed_into_place(
     still_open = []
     monkeypatch.setattr(run_in_child, "put_in_place", note)
     env = EnvironmentSpec(env_id, env_id, {"n_timesteps": 60})
-    study = StudySpec("s", "S", (AgentSpec(algo, algo),), (env,), n_seeds=1, tensorboard=True)
+    study = StudySpec("s", "S", (AgentSpec(algo, algo),), (env,), n_seeds=1)
     (planned,) = plan(study, tmp_path)
     do_run(planned, draft_path(tmp_path, planned), "")
     assert still_open == [[]]

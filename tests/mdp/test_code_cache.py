@@ -1,5 +1,6 @@
 """Machine code is what the sources say, whatever was compiled before."""
 
+import io
 import os
 import shutil
 import subprocess
@@ -89,6 +90,9 @@ def test_damaged_machine_code_is_compiled_anew(checkout):
     outcome(checkout)
     folder = checkout / "mdp" / "__pycache__" / "machine_code"
     for place, path in enumerate(sorted(folder.rglob("*.nb[ic]"))):
+        # Below the digest's folder; Numba writes each file under a longer name first.
+        name = path.relative_to(folder).as_posix().partition("/")[2] + ".tmp.0123456789abcdef"
+        assert len(name) < code_cache.LONGEST_NAME + 8
         size = path.stat().st_size
         path.write_bytes(b"" if place % 2 else path.read_bytes()[: size // 2])
     assert outcome(checkout) == (-13, "compiled", True)
@@ -113,6 +117,21 @@ def test_where_nothing_can_be_written_it_is_compiled_in_memory(checkout, tmp_pat
     assert warnings.strip() == (
         "no folder for machine code can be written: it is compiled anew in each process"
     )
+
+
+def test_a_folder_serves_only_if_its_paths_are_short_enough(tmp_path, monkeypatch):
+    """Windows takes 260 characters; Numba's own names add up to 120."""
+    deep, home = tmp_path / "deep" / ("x" * 100), tmp_path / "home"
+    limit = len(str(home)) + 1 + len(code_cache.digest()) + 1 + 130
+
+    def as_on_windows(dir, prefix=""):  # noqa: A002  # as it is called
+        if len(f"{dir}/{prefix}12345678") > limit:
+            raise OSError(2, "the system cannot find the path specified")
+        return io.BytesIO()
+
+    monkeypatch.setattr(code_cache.tempfile, "TemporaryFile", as_on_windows)
+    monkeypatch.setattr(code_cache, "parents", lambda: iter([deep, home]))
+    assert code_cache.folder.__wrapped__() == home / code_cache.digest()
 
 
 def test_a_home_serves_where_the_checkout_cannot_be_written(checkout, tmp_path):
