@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from commands.parsing import OneLineParser, command_line
+from commands.parsing import MODULES_HELP, OneLineParser, command_line
 
 EPILOG = """\
 examples:
@@ -43,7 +43,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="hyperparameters to change in every agent",
     )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
     add(
         "--quick",
         action="store_true",

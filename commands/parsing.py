@@ -15,6 +15,8 @@ from pipeline.errors import UserError, did_you_mean, one_line
 MISTAKE = 2
 INTERRUPT = 130
 
+MODULES_HELP = "modules of yours, with environments or agents: names or files"
+
 
 class OneLineParser(argparse.ArgumentParser):
     """An argument parser whose complaints are one line and name the nearest flag."""

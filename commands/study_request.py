@@ -18,9 +18,11 @@ from experiments.study_spec import (
     file_name,
     layered,
 )
-from pipeline.environments import check_env_id, import_gym_packages
+from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
+from pipeline.run_folder import environment_name
 from pipeline.settings.literals import parse_assignments
+from pipeline.user_modules import import_typed
 
 _MINIMUM = {
     "seeds": 1,
@@ -39,11 +41,12 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         UserError: if it is not clear what to compare, or on what.
     """
     _check_output(args)
-    import_gym_packages(tuple(args.gym_packages))
+    modules = import_typed(args.gym_packages, args.env)
     study = _study_of_file(args) if args.study else _study_of_flags(args)
     # A flag that has the name of a field goes there as it is, where it is given.
     named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
-    changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}
+    names = tuple(module.name for module in modules)
+    changes = {**named, "n_seeds": args.seeds, "gym_packages": names, "user_modules": modules}
     changes = {key: value for key, value in changes.items() if value is not None}
     study = replace(_with_settings(study, args), **changes)
     return study.quickened() if args.is_quick else study
@@ -80,7 +83,7 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
             raise UserError(f"{flag} names one of them twice")
     agents, environments = ", ".join(args.algos), ", ".join(args.env)
     return StudySpec(
-        name=file_name(f"{'-'.join(args.env)}_{'-'.join(args.algos)}"),
+        name=file_name(f"{'-'.join(map(environment_name, args.env))}_{'-'.join(args.algos)}"),
         title=f"{agents} on {environments}",
         agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
         environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),

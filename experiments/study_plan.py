@@ -24,6 +24,7 @@ from pipeline.train_spec import TrainSpec, completed
 _MAY_DIFFER = (
     "log_folder",
     "tensorboard_log",
+    "user_modules",
     "save_every_n_episodes",
     "verbose",
     "progress",

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from agents import ALGORITHMS, fitting_algorithms
+from typing import TYPE_CHECKING
+
+from agents import ALGORITHMS, fitting_algorithms, load_algorithm
 from agents.registry import is_bandit
 from pipeline.environments import make_single_env
-from pipeline.errors import UserError, unknown
+from pipeline.errors import UserError, one_line, unknown
 from pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
 
 
 def check_algorithm(algo: str) -> None:
@@ -20,9 +25,20 @@ def check_algorithm(algo: str) -> None:
         raise unknown("unknown agent", algo, ALGORITHMS)
     if not entry.is_installed:
         raise UserError(
-            f"{algo} needs {entry.package}, which is not installed: "
-            f"pip install 'rl-yardstick[{entry.extra}]'"
+            f"{algo} needs {entry.package}, which is not installed: {entry.install_command}"
         )
+
+
+def agent_class(algo: str) -> type[BaseAlgorithm]:
+    """Import the class of an agent that `check_algorithm` knows.
+
+    Raises:
+        UserError: if it was registered wrongly, or its module cannot be imported.
+    """
+    try:
+        return load_algorithm(algo)
+    except (ValueError, ImportError) as error:
+        raise UserError(one_line(error)) from error
 
 
 def check_fit(spec: TrainSpec) -> None:

@@ -98,6 +98,20 @@ def hand_written_algorithm(path: Path) -> str | None:
     with zipfile.ZipFile(path) as archive:
         class_name = json.loads(archive.read("data")).get("algorithm")
     for name, entry in ALGORITHMS.items():
-        if isinstance(class_name, str) and entry.entry_point.endswith(f":{class_name}"):
+        if (
+            isinstance(class_name, str)
+            and entry.entry_point.endswith(f":{class_name}")
+            and _holds_no_pickle(name)
+        ):
             return name
     return None
+
+
+def _holds_no_pickle(algo: str) -> bool:
+    """Whether zips of the agent are JSON; where its class is not to be had, they are not loaded."""
+    from agents.common.model_files import JsonAlgorithm
+
+    try:
+        return issubclass(load_algorithm(algo), JsonAlgorithm)
+    except ImportError:
+        return True

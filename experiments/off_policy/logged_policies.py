@@ -25,6 +25,7 @@ from pipeline.model_loading import (
     load_model,
     run_of,
 )
+from pipeline.user_modules import check_recorded
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
@@ -109,6 +110,8 @@ def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
     check_model_file(zip_path)
     run = run_of(zip_path)
     spec = {} if run is None else run.recorded_spec()
+    if run is not None:
+        check_recorded(spec, run.path)
     hand_written = hand_written_algorithm(zip_path)
     algo = hand_written or spec.get("algo")
     if algo is None:
