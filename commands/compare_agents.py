@@ -42,6 +42,14 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="KEY:VALUE",
         help="hyperparameters to change in every agent",
     )
+    add(
+        "-conf",
+        "--conf-file",
+        nargs="+",
+        default=[],
+        metavar="[AGENT:]YAML",
+        help="hyperparameters from another file; of several agents, say whose: dqn:mine.yml",
+    )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
     add(

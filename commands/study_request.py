@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,35 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
     )
 
 
+def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
+    """The files of ``--conf-file``, by the agents' names in the table of agents.
+
+    Raises:
+        UserError: if it is not clear whose a file is, or there is none.
+    """
+    algos = list(dict.fromkeys(agent.algo for agent in study.agents))
+    files: dict[str, Path] = {}
+    for word in words:
+        algo, colon, name = word.partition(":")
+        if not (colon and algo in algos):
+            if len(algos) > 1:
+                example = f"{algos[0]}:{word}"
+                raise UserError(
+                    f"--conf-file {word}: whose hyperparameters? a file has those of one "
+                    f"agent ({', '.join(algos)}): {example}"
+                )
+            algo, name = algos[0], word
+        if algo in files:
+            raise UserError(f"--conf-file names two files for {algo}")
+        files[algo] = Path(name).expanduser()
+        if not files[algo].is_file():
+            raise UserError(f"--conf-file: there is no file {files[algo]}")
+    return files
+
+
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
+    files = _conf_files(study, args.conf_file)
     changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
     if args.env_kwargs:
         changes["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
@@ -99,6 +127,11 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
         if getattr(args, key) is not None:
             changes[key] = getattr(args, key)
     agents = tuple(
-        replace(agent, settings=layered(agent.settings, changes)) for agent in study.agents
+        replace(
+            agent,
+            settings=layered(agent.settings, changes),
+            conf_file=files.get(agent.algo, agent.conf_file),
+        )
+        for agent in study.agents
     )
     return replace(study, agents=agents)

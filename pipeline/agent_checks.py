@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from agents import ALGORITHMS, fitting_algorithms, load_algorithm
+from agents import ALGORITHMS, fitting_algorithms
 from agents.registry import is_bandit
 from pipeline.environments import make_single_env
-from pipeline.errors import UserError, one_line, unknown
+from pipeline.errors import UserError, unknown
 from pipeline.train_spec import TrainSpec
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
 
 
 def check_algorithm(algo: str) -> None:
@@ -27,18 +22,6 @@ def check_algorithm(algo: str) -> None:
         raise UserError(
             f"{algo} needs {entry.package}, which is not installed: {entry.install_command}"
         )
-
-
-def agent_class(algo: str) -> type[BaseAlgorithm]:
-    """Import the class of an agent that `check_algorithm` knows.
-
-    Raises:
-        UserError: if it was registered wrongly, or its module cannot be imported.
-    """
-    try:
-        return load_algorithm(algo)
-    except (ValueError, ImportError) as error:
-        raise UserError(one_line(error)) from error
 
 
 def check_fit(spec: TrainSpec) -> None:

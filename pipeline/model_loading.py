@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.run_folder import Run
+from pipeline.settings.constructor_arguments import algorithm_parameters
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -54,6 +55,18 @@ def check_origin(path: Path, log_folder: Path, given: Path | None = None) -> Non
         )
 
 
+def agent_class(algo: str) -> type[BaseAlgorithm]:
+    """Import the class of an agent.
+
+    Raises:
+        UserError: if it was registered wrongly, or its module cannot be imported.
+    """
+    try:
+        return load_algorithm(algo)
+    except (ValueError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+
+
 def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) -> BaseAlgorithm:
     """Load an agent from its zip.
 
@@ -70,13 +83,31 @@ def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) 
         UserError: if the file is not a zip of such an agent, or does not fit ``env``.
     """
     check_model_file(path)
-    algorithm = load_algorithm(algo)
+    algorithm = agent_class(algo)
     try:
-        return algorithm.load(path, env=env, **kwargs)
+        model = _loadable(algorithm).load(path, env=env, **kwargs)
+        model.__class__ = algorithm
+        return model
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
         raise UserError(f"{path} cannot be loaded as a {algo} agent: {one_line(error)}") from error
+
+
+def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
+    """The class, or a subclass without those arguments of `load` that its constructor lacks."""
+    parameters = algorithm_parameters(algorithm)
+    asked = {"policy", "device", "_init_setup_model"}
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    if takes_any or asked <= parameters.keys() or "load" in vars(algorithm):
+        return algorithm
+    lacking = asked - parameters.keys()
+
+    def without_them(self: Any, **kwargs: Any) -> None:
+        initialise: Any = algorithm.__init__
+        initialise(self, **{name: value for name, value in kwargs.items() if name not in lacking})
+
+    return type(algorithm.__name__, (algorithm,), {"__init__": without_them})
 
 
 def run_of(path: Path) -> Run | None:

@@ -17,7 +17,7 @@ from experiments.off_policy.reward_models import CrossFit, cross_fit
 from mdp.array_types import Floats
 from pipeline.agent_checks import check_algorithm
 from pipeline.errors import UserError, one_line
-from pipeline.evaluation.exact import policy_matrix
+from pipeline.evaluation.exact import policy_matrix, why_not_exact
 from pipeline.model_loading import (
     check_model_file,
     check_origin,
@@ -193,6 +193,9 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
         observations = data.observations(agent.observation_space)
     except ValueError as error:
         raise UserError(f"{policy.name}: {one_line(error)}") from error
+    reason = why_not_exact(agent, observations)
+    if reason:
+        raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
     return policy_matrix(agent, observations)
 
 
