@@ -98,9 +98,10 @@ def main() -> int:
     root = Path(args.log_folder) / study.name
     planned = plan(study, root)
     from experiments.child_processes import start_server
+    from experiments.warm_ups import warm_ups
 
     if not all(run.is_finished for run in planned):
-        start_server()  # it imports the libraries while this process does
+        start_server(warm_ups(planned))  # it imports the libraries while this process does
     from commands.study_output import run_study
 
     return run_study(

@@ -108,7 +108,7 @@ def _at_path(typed: str) -> UserModule:
 
 def _by_name(typed: str) -> UserModule:
     """The module of that name, beside the place where the command is typed or installed."""
-    if not all(part.isidentifier() for part in typed.split(".")):
+    if typed.startswith("__") or not all(part.isidentifier() for part in typed.split(".")):
         raise _refused(typed, "it is neither the name of a module nor the path of one")
     here = Path.cwd()
     found = _source(here, typed)
