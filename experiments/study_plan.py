@@ -21,10 +21,12 @@ from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.train_spec import TrainSpec, completed
 
-# What a run of the same settings may differ in: where it is written, and what is shown meanwhile.
+# What a run of the same settings may differ in: where it is written, what is shown meanwhile, and
+# where the modules lie that its names come from.
 _MAY_DIFFER = (
     "log_folder",
     "tensorboard_log",
+    "gym_packages",
     "user_modules",
     "save_every_n_episodes",
     "verbose",
