@@ -95,17 +95,21 @@ def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) 
 
 
 def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
-    """The class, or a subclass without those arguments of `load` that its constructor lacks."""
+    """The class, or a subclass that does without the arguments that `load` hands a constructor."""
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
     parameters = algorithm_parameters(algorithm)
-    asked = {"policy", "device", "_init_setup_model"}
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    if takes_any or asked <= parameters.keys() or "load" in vars(algorithm):
+    is_own_load = getattr(algorithm.load, "__func__", None) is not vars(BaseAlgorithm)["load"].__func__
+    lacking = {"policy", "device", "_init_setup_model"} - parameters.keys()
+    if not lacking or is_own_load:
         return algorithm
-    lacking = asked - parameters.keys()
 
     def without_them(self: Any, **kwargs: Any) -> None:
         initialise: Any = algorithm.__init__
+        # What `_init_setup_model=False` is for: `load` sets up once it has restored the attributes.
+        vars(self)["_setup_model"] = lambda: None
         initialise(self, **{name: value for name, value in kwargs.items() if name not in lacking})
+        del vars(self)["_setup_model"]
 
     return type(algorithm.__name__, (algorithm,), {"__init__": without_them})
 

@@ -205,10 +205,8 @@ def _new_model(
     kwargs: dict[str, Any],
 ) -> BaseAlgorithm:
     """An agent; what its constructor does not take of the common arguments is set afterwards."""
-    parameters = algorithm_parameters(algorithm)
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    given = {"device": device, **common}
-    taken = {name: value for name, value in given.items() if takes_any or name in parameters}
+    given, parameters = {"device": device, **common}, algorithm_parameters(algorithm)
+    taken = {name: value for name, value in given.items() if name in parameters}
     if "seed" not in taken:
         set_random_seed(common["seed"])
     # The type checker knows the arguments of the base class, which has more of them.

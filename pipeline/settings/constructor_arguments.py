@@ -70,6 +70,8 @@ def algorithm_parameters(cls: type) -> dict[str, inspect.Parameter]:
     if rest is not None and len(owners) > 1:
         named = {name: p for name, p in own.items() if p.kind not in _STARRED}
         own = {**algorithm_parameters(owners[1]), **named, rest.name: rest}
+        if "env" in named and "policy" not in named:
+            own.pop("policy", None)  # which the constructor gives its base class itself
     return {name: _annotated(parameter) for name, parameter in own.items()}
 
 
