@@ -216,7 +216,7 @@ def register(name: str, entry_point: str, **fields: Any) -> None:
     """
     if not re.fullmatch(r"[A-Za-z0-9]\w*([.-]\w+)*", name, re.ASCII):
         raise ValueError(f"the name of an agent holds letters, digits and _, not {name!r}")
-    if not (isinstance(entry_point, str) and re.fullmatch(r"[\w.]+:\w+", entry_point)):
+    if not re.fullmatch(r"[\w.]+:\w+", str(entry_point)):
         raise ValueError(f"{name}: the class is named as 'module:Class', not {entry_point!r}")
     unknown = set(fields) - {key.name for key in dataclasses.fields(AlgorithmEntry)}
     if unknown:

@@ -111,7 +111,7 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
             algo, name = algos[0], word
         if algo in files:
             raise UserError(f"--conf-file names two files for {algo}")
-        files[algo] = Path(name).expanduser()
+        files[algo] = Path(name)
         if not files[algo].is_file():
             raise UserError(f"--conf-file: there is no file {files[algo]}")
     return files

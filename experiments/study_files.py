@@ -177,7 +177,7 @@ def _conf_file(document: _Document, entry: Mapping[str, Any], keys: Keys) -> Pat
     if given is None:
         return None
     place = f"{document.at(*keys, 'conf_file')}: conf_file"
-    path = document.path.parent / Path(coerce(given, str, place)).expanduser()
+    path = document.path.parent / str(coerce(given, str, place))
     if entry.get("tuned") is False:
         raise UserError(f"{place} says where to begin, and tuned: false not to: leave one out")
     if not path.is_file():

@@ -96,7 +96,8 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
     """
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders(
-        "environments", [(e.label, _environment_folder(e.label, e.env_id)) for e in study.environments]
+        "environments",
+        [(e.label, _environment_folder(e.label, e.env_id)) for e in study.environments],
     )
     specs = {}
     for environment in study.environments:

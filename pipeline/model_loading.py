@@ -99,7 +99,9 @@ def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
     parameters = algorithm_parameters(algorithm)
-    is_own_load = getattr(algorithm.load, "__func__", None) is not vars(BaseAlgorithm)["load"].__func__
+    is_own_load = (
+        getattr(algorithm.load, "__func__", None) is not vars(BaseAlgorithm)["load"].__func__
+    )
     lacking = {"policy", "device", "_init_setup_model"} - parameters.keys()
     if not lacking or is_own_load:
         return algorithm

@@ -88,7 +88,10 @@ def _is_path(typed: str) -> bool:
 
 def _at_path(typed: str) -> UserModule:
     """The module in a file or a folder; inside a package, under its full name."""
-    path = Path(typed).expanduser()
+    try:
+        path = Path(typed).expanduser()
+    except RuntimeError as error:  # there is no such user
+        raise _refused(typed, one_line(error)) from error
     path = path.resolve() if path.is_dir() else path.parent.resolve() / path.name
     path = path.parent if path.name == "__init__.py" else path
     if not path.exists():

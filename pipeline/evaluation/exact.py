@@ -157,7 +157,7 @@ def policy_matrix(
             distribution: Any = agent.policy.get_distribution(tensor).distribution
         return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
     if _is_epsilon_greedy(agent):
-        epsilon = float(agent.exploration_rate)
+        epsilon = float(vars(agent)["exploration_rate"])
         greedy = policy_matrix(agent, observations)
         return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
     raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")

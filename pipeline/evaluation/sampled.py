@@ -141,11 +141,13 @@ def takes_batches(model: BaseAlgorithm) -> bool:
     """Whether an agent can be asked for the actions of several environments at once."""
     if type(model).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return True
-    sample = model.observation_space.sample()
-    is_dict = isinstance(sample, dict)
-    twice = {k: np.stack([v, v]) for k, v in sample.items()} if is_dict else [sample, sample]
+    sample: Any = model.observation_space.sample()
     try:
-        actions, _ = model.predict(twice if is_dict else np.stack(twice), deterministic=True)
+        if isinstance(sample, dict):
+            twice: Any = {name: np.stack([part, part]) for name, part in sample.items()}
+        else:
+            twice = np.stack([sample, sample])
+        actions, _ = model.predict(twice, deterministic=True)
     except Exception:  # noqa: BLE001  # a stranger's code can fail in any way
         return False
     return len(np.atleast_1d(actions)) == 2

@@ -67,7 +67,7 @@ def test_the_same_twice_is_harmless():
 def test_what_cannot_be_registered(name, entry_point, fields, complaint):
     agents.register("taken", "some_module:Mine")
     before = dict(ALGORITHMS)
-    with pytest.raises(ValueError, match=".") as caught:
+    with pytest.raises(ValueError, match=r".") as caught:
         agents.register(name, entry_point, **fields)
     assert complaint in str(caught.value)
     assert before == ALGORITHMS

@@ -317,7 +317,7 @@ def test_environments_are_known_by_name_with_or_without_their_module():
     check_env_id("envs:Warehouse-v0")
     with pytest.raises(UserError, match=r"unknown environment 'Warehose-v0': .*'Warehouse-v0'"):
         check_env_id("Warehose-v0")
-    with pytest.raises(UserError, match="not imported .*: add --gym-packages no_such_module"):
+    with pytest.raises(UserError, match=r"not imported .*: add --gym-packages no_such_module"):
         check_env_id("no_such_module:Warehouse-v0")
 
 

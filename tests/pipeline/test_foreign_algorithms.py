@@ -47,9 +47,7 @@ class Plain(BaseAlgorithm):
     def _setup_model(self):
         self._setup_lr_schedule()
         self.set_random_seed(self.seed)
-        self.policy = self.policy_class(
-            self.observation_space, self.action_space, self.lr_schedule
-        )
+        self.policy = self.policy_class(self.observation_space, self.action_space, self.lr_schedule)
 
     def learn(
         self,
@@ -239,7 +237,7 @@ def test_what_cannot_be_asked_for_all_states_is_sampled(algo, reason, tmp_path):
 
 def test_a_class_that_is_none_is_told_before_anything_is_made(tmp_path):
     agents.register("typo", f"{__name__}:Typo")
-    with pytest.raises(UserError, match="typo is registered as .*:Typo, which does not exist"):
+    with pytest.raises(UserError, match=r"typo is registered as .*:Typo, which does not exist"):
         train(spec_of("typo", tmp_path / "logs"))
     assert list(tmp_path.iterdir()) == []
 
@@ -247,7 +245,9 @@ def test_a_class_that_is_none_is_told_before_anything_is_made(tmp_path):
 def test_any_space_may_be_refused_by_the_class(tmp_path):
     assert agents.ALGORITHMS["rising"].misfit(spaces.Text(2), spaces.Text(2)) == ""
     raw = {"n_timesteps": 10}
-    spec = TrainSpec("rising", "Pendulum-v1", split(raw), raw, 0, log_folder=tmp_path / "logs", verbose=0)
+    spec = TrainSpec(
+        "rising", "Pendulum-v1", split(raw), raw, 0, log_folder=tmp_path / "logs", verbose=0
+    )
     with pytest.raises(UserError, match="Discrete"):
         train(spec)
     assert list(tmp_path.iterdir()) == []

@@ -121,6 +121,7 @@ def test_a_module_with_the_name_of_ours_is_refused(write, name, form):
         (["my_first.no_such"], "cannot import my_first.no_such: it is neither in "),
         (["./no_such.py"], "there is no such file or folder"),
         (["./below"], "the folder is no package: it holds no __init__.py"),
+        (["~no_such_user/x.py"], "ould not determine home directory"),
         (["./notes.txt"], "it is no Python file"),
         (["./my-agents.py"], "'my-agents' is no name of a module: rename it"),
         (["my-agents"], "it is neither the name of a module nor the path of one"),
