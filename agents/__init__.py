@@ -5,8 +5,14 @@ compared, before anything heavy is paid for.
 """
 
 from agents.old_names import install
-from agents.registry import ALGORITHMS, AlgorithmEntry, fitting_algorithms, load_algorithm
+from agents.registry import (
+    ALGORITHMS,
+    AlgorithmEntry,
+    fitting_algorithms,
+    load_algorithm,
+    register,
+)
 
 install()
 
-__all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm"]
+__all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm", "register"]

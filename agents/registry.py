@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import importlib.util
+import re
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -26,8 +28,9 @@ class AlgorithmEntry:
     Attributes:
         entry_point: where the class lives, as ``"module:Class"``; imported only when needed.
         summary: what the agent is, in a few words.
-        observations: names of the Gymnasium spaces that it can observe.
-        actions: names of the Gymnasium spaces that it can act in.
+        observations: names of the Gymnasium spaces that it can observe; none for any space, and
+            the class itself says what it cannot do.
+        actions: names of the Gymnasium spaces that it can act in, likewise.
         observation_shape: the one observation shape that it understands, or None for any.
         for_bandits: whether it looks no further than the next reward.
         package: the import name of an optional package that it needs, or None.
@@ -36,8 +39,8 @@ class AlgorithmEntry:
 
     entry_point: str
     summary: str
-    observations: tuple[str, ...]
-    actions: tuple[str, ...]
+    observations: tuple[str, ...] = ()
+    actions: tuple[str, ...] = ()
     observation_shape: tuple[int, ...] | None = None
     for_bandits: bool = False
     package: str | None = None
@@ -54,12 +57,20 @@ class AlgorithmEntry:
         """Whether the package that the agent needs is there."""
         return self.package is None or importlib.util.find_spec(self.package) is not None
 
+    @property
+    def install_command(self) -> str:
+        """What to type where that package is missing."""
+        what = f"'rl-yardstick[{self.extra}]'" if self.extra else self.package
+        return f"pip install {what}"
+
     def misfit(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> str:
         """Say why the agent cannot work with these spaces; empty where it can."""
         for space, known, role in (
             (observation_space, self.observations, "observes"),
             (action_space, self.actions, "acts in"),
         ):
+            if not known:
+                continue
             if type(space).__name__ not in known:
                 return f"it {role} {' or '.join(known)} spaces, not {space}"
             # The one-hot encoding of Stable-Baselines3 and every table count from zero.
@@ -187,15 +198,68 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
 }
 
 
+def register(name: str, entry_point: str, **fields: Any) -> None:
+    """Add an agent of your own to the table, under which the commands find it.
+
+    Nothing is imported: call it where your module is imported, before its heavy imports if it has
+    any. Doing so twice changes nothing.
+
+    Args:
+        name: what ``--algo`` is to say.
+        entry_point: where the class lives, a subclass of `BaseAlgorithm`: ``"module:Class"``.
+        fields: further attributes of `AlgorithmEntry`, each with its default: ``summary`` (the
+            class's name), ``observations`` and ``actions`` (any space), ``observation_shape``,
+            ``for_bandits``, ``package`` and ``extra``.
+
+    Raises:
+        ValueError: if the name is taken, or an argument is none that an entry can have.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9]\w*([.-]\w+)*", name, re.ASCII):
+        raise ValueError(f"the name of an agent holds letters, digits and _, not {name!r}")
+    if not re.fullmatch(r"[\w.]+:\w+", str(entry_point)):
+        raise ValueError(f"{name}: the class is named as 'module:Class', not {entry_point!r}")
+    unknown = set(fields) - {key.name for key in dataclasses.fields(AlgorithmEntry)}
+    if unknown:
+        raise ValueError(f"{name}: an entry has no {', '.join(sorted(unknown))}")
+    for role in ("observations", "actions"):
+        fields[role] = _space_names(name, role, fields.get(role, ()))
+    fields.setdefault("summary", entry_point.rpartition(":")[2])
+    entry = AlgorithmEntry(entry_point, **fields)
+    taken = next((known for known in ALGORITHMS if known.lower() == name.lower()), None)
+    if taken is not None and (taken, ALGORITHMS[taken]) != (name, entry):
+        raise ValueError(
+            f"there is an agent {taken} already ({ALGORITHMS[taken].entry_point}): "
+            f"register {entry_point} under another name"
+        )
+    ALGORITHMS[name] = entry
+
+
+def _space_names(name: str, role: str, given: Any) -> tuple[str, ...]:
+    """The names of spaces as an entry holds them."""
+    names = tuple(given) if isinstance(given, list | tuple) else (given,)
+    for space in names:
+        kind = getattr(spaces, space, None) if isinstance(space, str) else None
+        if not (isinstance(kind, type) and issubclass(kind, spaces.Space)):
+            raise ValueError(f"{name}: {role} are names of Gymnasium's spaces, not {space!r}")
+    return names
+
+
 def load_algorithm(name: str) -> type[BaseAlgorithm]:
     """Import the class of the agent ``name``.
 
     Raises:
         KeyError: if there is no agent of that name.
         ModuleNotFoundError: if the optional package that it needs is missing.
+        ValueError: if there is no such class, or it is no algorithm of Stable-Baselines3's kind.
     """
-    module_name, class_name = ALGORITHMS[name].entry_point.split(":")
-    algorithm: type[BaseAlgorithm] = getattr(importlib.import_module(module_name), class_name)
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    entry_point = ALGORITHMS[name].entry_point
+    module_name, class_name = entry_point.split(":")
+    algorithm = getattr(importlib.import_module(module_name), class_name, None)
+    if not (isinstance(algorithm, type) and issubclass(algorithm, BaseAlgorithm)):
+        fault = "does not exist" if algorithm is None else "is no subclass of BaseAlgorithm"
+        raise ValueError(f"{name} is registered as {entry_point}, which {fault}")
     return algorithm
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from commands.parsing import OneLineParser, as_called, command_line, program_name
+from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
 
 EPILOG = """\
 examples:
@@ -42,8 +42,16 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="KEY:VALUE",
         help="hyperparameters to change in every agent",
     )
+    add(
+        "-conf",
+        "--conf-file",
+        nargs="+",
+        default=[],
+        metavar="[AGENT:]YAML",
+        help="hyperparameters from another file; of several agents, say whose: dqn:mine.yml",
+    )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
     add(
         "--quick",
         action="store_true",
@@ -90,9 +98,10 @@ def main() -> int:
     root = Path(args.log_folder) / study.name
     planned = plan(study, root)
     from experiments.child_processes import start_server
+    from experiments.warm_ups import warm_ups
 
     if not all(run.is_finished for run in planned):
-        start_server()  # it imports the libraries while this process does
+        start_server(warm_ups(planned))  # it imports the libraries while this process does
     from commands.study_output import run_study
 
     return run_study(

@@ -8,6 +8,7 @@ from pathlib import Path
 from commands.terminal import table_console
 from experiments.off_policy.logged_policies import compare_policies, read_logged, read_policy
 from pipeline.errors import UserError
+from pipeline.user_modules import import_typed
 from report.off_policy_table import print_comparison
 
 
@@ -21,6 +22,7 @@ def compare_on_log(args: argparse.Namespace) -> int:
         raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
     if args.study or args.env or args.algos:
         raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
+    import_typed(args.gym_packages)
     data = read_logged(args.logged)
     policies = [read_policy(Path(path), args.trust) for path in args.policy]
     names = [policy.name for policy in policies]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from commands.parsing import OneLineParser, as_called, called_as, program_name
+from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
 
 EPILOG = """\
 examples:
@@ -58,7 +58,7 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
     add("--record", metavar="FILE", help="write a film, .gif or .mp4")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
 
 
 def main() -> int:

@@ -8,13 +8,15 @@ from typing import Literal
 
 from pipeline.model_choice import ModelRequest
 from pipeline.settings.literals import parse_assignments
+from pipeline.user_modules import import_typed
 
 
 def model_request(args: argparse.Namespace) -> ModelRequest:
     """The model that the arguments ask for.
 
     Raises:
-        UserError: if the arguments of the environment cannot be read.
+        UserError: if a module of the user's cannot be imported, or the arguments of the environment
+            cannot be read.
     """
     return ModelRequest(
         path=None if args.model is None else Path(args.model),
@@ -25,7 +27,7 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
         which=_which(args),
         is_trusted=args.trust,
         env_kwargs=parse_assignments(args.env_kwargs),
-        gym_packages=tuple(args.gym_packages),
+        user_modules=import_typed(args.gym_packages, [args.env or ""]),
         seed=args.seed,
         device=args.device,
     )

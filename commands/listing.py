@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gymnasium as gym
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
@@ -25,8 +26,8 @@ def _print_agents(console: Console) -> None:
     table.add_column("agent (--algo)", style="bold", no_wrap=True)
     table.add_column("what it is")
     for name, entry in ALGORITHMS.items():
-        missing = f"  needs: pip install 'rl-yardstick\\[{entry.extra}]'"
-        table.add_row(name, entry.summary + ("" if entry.is_installed else missing))
+        missing = "" if entry.is_installed else f"  needs: {entry.install_command}"
+        table.add_row(escape(name), escape(entry.summary + missing))
     console.print(table)
 
 
@@ -47,5 +48,5 @@ def _print_environments(console: Console) -> None:
     console.print(table)
     console.print(
         "\nAny other environment registered with Gymnasium works where the spaces fit; "
-        "--gym-packages imports modules that register more."
+        "--gym-packages imports modules that register more, and agents of your own."
     )

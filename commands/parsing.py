@@ -52,6 +52,9 @@ def program_name() -> str:
     return os.path.basename(sys.argv[0])  # noqa: PTH119  # a name, not a path
 
 
+MODULES_HELP = "modules of yours, with environments or agents: names or files"
+
+
 class OneLineParser(argparse.ArgumentParser):
     """An argument parser whose complaints are one line and name the nearest flag."""
 

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from commands.run_output import describe
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.exact import exact_evaluator, why_not_exact
 from pipeline.filming import write_film
 from pipeline.model_choice import ChosenModel
 from pipeline.model_loading import load_model
@@ -134,7 +134,7 @@ def _print_returns(console: Console, returns: list[float], lengths: list[int]) -
 def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: bool) -> None:
     """Say what the policy is worth, where that can be computed."""
     evaluator = exact_evaluator(spec)
-    if evaluator is None:
+    if evaluator is None or why_not_exact(model, evaluator.observations):
         return
     try:
         evaluation = evaluator(model, deterministic)

@@ -5,11 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from commands.parsing import called_as
 from pipeline.run_folder import FINISHED
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import as_flag
 
 if TYPE_CHECKING:
     from pipeline.evaluation.sampled import Evaluation
@@ -84,5 +86,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
         )
     table.add_row("files", str(outcome.run.path))
     folder = "" if str(spec.log_folder) == "logs" else f" -f {spec.log_folder}"
-    table.add_row("watch", f"{called_as('enjoy')} --algo {spec.algo} --env {spec.env_id}{folder}")
+    modules = as_flag(spec.user_modules, spec.env_id)
+    watch = f"{called_as('enjoy')} --algo {spec.algo} --env {spec.env_id}{folder}{modules}"
+    table.add_row("watch", escape(watch))
     console.print(table, highlight=False)

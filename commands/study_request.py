@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -17,9 +18,11 @@ from experiments.study_spec import (
     file_name,
     layered,
 )
-from pipeline.environments import check_env_id, import_gym_packages
+from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
+from pipeline.run_folder import environment_name
 from pipeline.settings.literals import parse_assignments
+from pipeline.user_modules import import_typed
 
 LONGEST_STUDY_NAME = 200  # bytes
 
@@ -40,11 +43,12 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
         UserError: if it is not clear what to compare, or on what.
     """
     _check_output(args)
-    import_gym_packages(tuple(args.gym_packages))
+    modules = import_typed(args.gym_packages, args.env)
     study = _study_of_file(args) if args.study else _study_of_flags(args)
     # A flag that has the name of a field goes there as it is, where it is given.
     named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
-    changes = {**named, "n_seeds": args.seeds, "gym_packages": tuple(args.gym_packages)}
+    names = tuple(module.name for module in modules)
+    changes = {**named, "n_seeds": args.seeds, "gym_packages": names, "user_modules": modules}
     changes = {key: value for key, value in changes.items() if value is not None}
     study = replace(_with_settings(study, args), **changes)
     return study.quickened() if args.is_quick else study
@@ -81,15 +85,45 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
             raise UserError(f"{flag} names one of them twice")
     agents, environments = ", ".join(args.algos), ", ".join(args.env)
     return StudySpec(
-        name=file_name(f"{'-'.join(args.env)}_{'-'.join(args.algos)}", LONGEST_STUDY_NAME),
+        name=file_name(
+            f"{'-'.join(map(environment_name, args.env))}_{'-'.join(args.algos)}",
+            LONGEST_STUDY_NAME,
+        ),
         title=f"{agents} on {environments}",
         agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
         environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),
     )
 
 
+def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
+    """The files of ``--conf-file``, by the agents' names in the table of agents.
+
+    Raises:
+        UserError: if it is not clear whose a file is, or there is none.
+    """
+    algos = list(dict.fromkeys(agent.algo for agent in study.agents))
+    files: dict[str, Path] = {}
+    for word in words:
+        algo, colon, name = word.partition(":")
+        if not (colon and algo in algos):
+            if len(algos) > 1:
+                example = f"{algos[0]}:{word}"
+                raise UserError(
+                    f"--conf-file {word}: whose hyperparameters? a file has those of one "
+                    f"agent ({', '.join(algos)}): {example}"
+                )
+            algo, name = algos[0], word
+        if algo in files:
+            raise UserError(f"--conf-file names two files for {algo}")
+        files[algo] = Path(name)
+        if not files[algo].is_file():
+            raise UserError(f"--conf-file: there is no file {files[algo]}")
+    return files
+
+
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
+    files = _conf_files(study, args.conf_file)
     changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
     if args.env_kwargs:
         changes["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
@@ -97,6 +131,11 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
         if getattr(args, key) is not None:
             changes[key] = getattr(args, key)
     agents = tuple(
-        replace(agent, settings=layered(agent.settings, changes)) for agent in study.agents
+        replace(
+            agent,
+            settings=layered(agent.settings, changes),
+            conf_file=files.get(agent.algo, agent.conf_file),
+        )
+        for agent in study.agents
     )
     return replace(study, agents=agents)

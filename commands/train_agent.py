@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import argparse
 
-from commands.parsing import INTERRUPT, OneLineParser, as_called, command_line, program_name
+from commands.parsing import (
+    INTERRUPT,
+    MODULES_HELP,
+    OneLineParser,
+    as_called,
+    command_line,
+    program_name,
+)
 
 EPILOG = """\
 examples:
@@ -55,7 +62,7 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         metavar="KEY:VALUE",
         help="environment arguments for evaluation alone",
     )
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
     add("-i", "--trained-agent", default="", metavar="ZIP", help="go on training this agent")
     add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
     add("--device", default="auto", help="torch device (default: auto)")
@@ -86,7 +93,9 @@ def main() -> int:
     args = build_parser().parse_args()
     if args.list:
         from commands.listing import print_lists
+        from pipeline.user_modules import import_typed
 
+        import_typed(args.gym_packages)
         print_lists()
         return 0
     from commands.train_request import train_spec

@@ -10,12 +10,13 @@ from typing import Any
 
 from commands.parsing import check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit
-from pipeline.environments import check_env_id, import_gym_packages
+from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.settings.hyperparam_entries import NoEntryError, override, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.settings.literals import parse_assignments
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import import_typed
 
 
 def train_spec(args: argparse.Namespace) -> TrainSpec:
@@ -24,8 +25,8 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     Raises:
         UserError: if it would not work out.
     """
+    modules = import_typed(args.gym_packages, [args.env])
     check_algorithm(args.algo)
-    import_gym_packages(tuple(args.gym_packages))
     check_env_id(args.env)
     check_tensorboard(args.tensorboard_log)
     raw = _raw_hyperparams(args)
@@ -44,7 +45,8 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
         "log_folder": Path(args.log_folder),
         "tensorboard_log": Path(args.tensorboard_log) if args.tensorboard_log else None,
         "trained_agent": trained_agent,
-        "gym_packages": tuple(args.gym_packages),
+        "gym_packages": tuple(module.name for module in modules),
+        "user_modules": modules,
         "unique_id": args.uuid,
     }
     spec = TrainSpec(**{**named, **changed})

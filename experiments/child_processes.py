@@ -21,6 +21,7 @@ from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import ForkingPickler
+from pathlib import Path
 from typing import Any
 
 PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
@@ -29,6 +30,9 @@ PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 START_METHOD = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
+# Set for the server alone, which takes it away again.
+WARM_UPS = "YARDSTICK_WARM_UPS"
+OUR_OWN = "yardstick"
 
 _context: Any = multiprocessing.get_context(START_METHOD)
 _children: set[BaseProcess] = set()
@@ -131,19 +135,30 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
         executor.shutdown(cancel_futures=True)
 
 
-def start_server() -> None:
-    """Start what children begin from, in the background: start it early to have it sooner."""
+def start_server(warm_ups: str = "[]") -> None:
+    """Start what children begin from, in the background: start it early to have it sooner.
+
+    Args:
+        warm_ups: what it is to compile once for all runs, see `experiments.warm_ups`.
+    """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
+    # Python would look in the folder where the command is typed before everywhere else, and take a
+    # module of the user's that lies there for one of ours, or of its own.
+    os.environ.setdefault("PYTHONSAFEPATH", OUR_OWN)
+    paths = [str(Path(__file__).resolve().parents[1])]
+    paths += os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, dict.fromkeys(paths)))
     if _context.get_start_method() == "forkserver":
-        _start_fork_server()
+        _start_fork_server(warm_ups)
 
 
-def _start_fork_server() -> None:
+def _start_fork_server(warm_ups: str) -> None:
     """Start the process that children are forked from, which ignores Ctrl-C while it imports."""
     if sys.platform != "win32":
         from multiprocessing import forkserver, resource_tracker
 
+        os.environ[WARM_UPS] = warm_ups
         _context.set_forkserver_preload(PRELOADED)
         # It lets SIGINT through again after its own start, so that has to come first.
         resource_tracker.ensure_running()

@@ -6,22 +6,20 @@ both. Where nothing is compiled yet, it is done here too.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
+import os
 
-from rich.console import Console
-
+from experiments.child_processes import OUR_OWN, WARM_UPS
+from experiments.warm_ups import take_steps, train_aside
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
-from pipeline.training import train
 
 
 def _warm_up() -> None:
     raw = {"n_timesteps": 100}
-    spec = TrainSpec("qlearning", "Warehouse-v0", split(raw), raw, 0, pictures=False)
-    with TemporaryDirectory() as folder:
-        train(replace(spec, log_folder=Path(folder)), Console(quiet=True), {}, "")
+    train_aside(TrainSpec("qlearning", "Warehouse-v0", split(raw), raw, 0))
+    take_steps(os.environ.pop(WARM_UPS, "[]"))
 
 
+if os.environ.get("PYTHONSAFEPATH") == OUR_OWN:
+    del os.environ["PYTHONSAFEPATH"]  # what a run starts is to find its modules as usual
 _warm_up()

@@ -13,10 +13,10 @@ from rich.console import Console
 
 from experiments.bandit_batches import do_batch
 from experiments.study_plan import PlannedRun
-from pipeline.environments import import_gym_packages
 from pipeline.files import portable_name, put_in_place
 from pipeline.run_folder import Run
 from pipeline.training import train
+from pipeline.user_modules import import_again
 
 LONGEST_DRAFT_NAME = 150  # bytes, besides the numbers and names of process and machine
 
@@ -86,7 +86,7 @@ else:
 
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     """Train in ``draft``, and rename it into place; another's result that is there stays."""
-    import_gym_packages(planned.spec.gym_packages)
+    import_again(planned.spec.user_modules)
     run = Run(draft, planned.run.env_name)
     make_folder(run.params_path)
     if planned.spec.tensorboard_log is not None:

@@ -43,7 +43,7 @@ _STUDY_VALUES: dict[str, Any] = {
     "episodes_table": int,
 }
 _STUDY_KEYS = (*_STUDY_VALUES, "agents", "environments", "settings", "sweep", "quick")
-_AGENT_KEYS = ("algo", "tuned", "summary", "sweep")
+_AGENT_KEYS = ("algo", "tuned", "conf_file", "summary", "sweep")
 _QUICK_VALUES: dict[str, Any] = {"seeds": int, "budget": float}
 _NOT_NEGATIVE = ("margin", "episodes_table")
 _AT_LEAST_ONE = ("seeds", "n_timesteps", "n_episodes", "eval_freq", "eval_episodes")
@@ -186,11 +186,26 @@ def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[
             place = document.at(*keys, "algo") if "algo" in entry else document.at(*keys)
             raise unknown(f"{place}: unknown agent", str(algo), ALGORITHMS)
         values = document.values(entry, {"tuned": bool, "summary": str}, *keys)
+        values["conf_file"] = _conf_file(document, entry, keys)
         settings = {key: entry[key] for key in entry if key not in _AGENT_KEYS}
         values = {"tuned": tuned, "where": document.at(*keys), **values}
         agent = AgentSpec(label, algo, settings, **values)
         agents += swept(agent, {**shared_sweep, **_sweep(document, entry, *keys)})
     return tuple(agents)
+
+
+def _conf_file(document: _Document, entry: Mapping[str, Any], keys: Keys) -> Path | None:
+    """The agent's own file of hyperparameters, from the study's folder; it need not be tuned."""
+    given = entry.get("conf_file")
+    if given is None:
+        return None
+    place = f"{document.at(*keys, 'conf_file')}: conf_file"
+    path = document.path.parent / str(coerce(given, str, place))
+    if entry.get("tuned") is False:
+        raise UserError(f"{place} says where to begin, and tuned: false not to: leave one out")
+    if not path.is_file():
+        raise UserError(f"{place}: there is no file {path}")
+    return path
 
 
 def _sweep(document: _Document, data: Mapping[str, Any], *keys: str | int) -> dict[str, list[Any]]:

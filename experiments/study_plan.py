@@ -16,15 +16,19 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_n
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
+from pipeline.model_loading import agent_class
 from pipeline.run_folder import FINISHED, Run, environment_name
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.train_spec import TrainSpec, completed
 
-# What a run of the same settings may differ in: where it is written, and what is shown meanwhile.
+# What a run of the same settings may differ in: where it is written, what is shown meanwhile, and
+# where the modules lie that its names come from.
 _MAY_DIFFER = (
     "log_folder",
     "tensorboard_log",
+    "gym_packages",
+    "user_modules",
     "save_every_n_episodes",
     "verbose",
     "progress",
@@ -91,11 +95,11 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
     Raises:
         UserError: if an agent cannot be trained so, or does not fit an environment.
     """
-    for what, labels in (
-        ("agents", [agent.label for agent in study.agents]),
-        ("environments", [environment.label for environment in study.environments]),
-    ):
-        _check_folders(what, labels)
+    _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
+    _check_folders(
+        "environments",
+        [(e.label, _environment_folder(e.label, e.env_id)) for e in study.environments],
+    )
     specs = {}
     for environment in study.environments:
         check_env_id(environment.env_id)
@@ -123,7 +127,7 @@ def _planned_run(
     is_batch: bool,
 ) -> PlannedRun:
     # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
-    place = Path(file_name(agent), f"{file_name(environment)}_{seed + 1}")
+    place = Path(file_name(agent), f"{_environment_folder(environment, spec.env_id)}_{seed + 1}")
     spec = replace(
         spec,
         seed=seed,
@@ -132,6 +136,11 @@ def _planned_run(
     )
     path, n_runs = root / "runs" / place, study.n_seeds if is_batch else 1
     return PlannedRun(agent, environment, seed, spec, path, is_batch, n_runs)
+
+
+def _environment_folder(label: str, env_id: str) -> str:
+    """The label as a file name; where it is the id itself, as `train.py` writes that."""
+    return file_name(environment_name(label) if label == env_id else label)
 
 
 def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
@@ -161,18 +170,19 @@ def _naming_the_place(agent: AgentSpec) -> Iterator[None]:
         raise UserError(f"{agent.where}: {error}" if agent.where else str(error)) from error
 
 
-def _check_folders(what: str, labels: Sequence[str]) -> None:
+def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
     """Refuse labels that are the same, or would have the same folder."""
-    places: dict[str, int] = {}
-    for index, label in enumerate(labels):
+    taken: dict[str, str] = {}
+    for label, folder in places:
         # Some file systems do not tell upper from lower case, nor "ä" from "a" with two dots.
-        folder = normalize("NFC", file_name(label).casefold())
-        first = places.setdefault(folder, index)
-        if first != index:
+        key = normalize("NFC", folder.casefold())
+        first = taken.get(key)
+        if first is not None:
             raise UserError(
-                f"{what}: {labels[first]!r} and {label!r} would share the folder "
-                f"{file_name(label)}: give them labels that differ in letters or digits"
+                f"{what}: {first!r} and {label!r} would share the folder {folder}: "
+                "give them labels that differ in letters or digits"
             )
+        taken[key] = label
 
 
 def _is_batch(spec: TrainSpec) -> bool:
@@ -180,6 +190,8 @@ def _is_batch(spec: TrainSpec) -> bool:
     entry, special = ALGORITHMS[spec.algo], spec.hyperparams
     untouched = Hyperparams()
     if not (entry.for_bandits and entry.package is None) or special.n_timesteps is None:
+        return False
+    if entry.family != "bandits" and not _is_compiled_bandit(spec.algo):
         return False
     env = make_single_env(spec)
     episode = time_limit(env) or 0
@@ -191,6 +203,14 @@ def _is_batch(spec: TrainSpec) -> bool:
         for name in vars(untouched)
         if name not in _BATCH_SETTINGS
     )
+
+
+def _is_compiled_bandit(algo: str) -> bool:
+    """Whether an agent of the user's is of our bandit agents' kind."""
+    from agents.bandits.linear_bandits import LinearBanditAgent
+    from agents.bandits.table_bandit import TableBandit
+
+    return issubclass(agent_class(algo), TableBandit | LinearBanditAgent)
 
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
@@ -219,9 +239,9 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
 def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str, Any]:
     """The agent's file, changed by the environment's settings, and these by the agent's own."""
     raw: dict[str, Any] = {}
-    if agent.tuned:
+    if agent.tuned or agent.conf_file is not None:
         try:
-            raw = read_hyperparams(agent.algo, environment.env_id)
+            raw = read_hyperparams(agent.algo, environment.env_id, agent.conf_file)
         except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise

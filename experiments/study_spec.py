@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 from pipeline.files import LONGEST_NAME, portable_name
 from pipeline.settings.hyperparam_entries import override
+from pipeline.user_modules import UserModule
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
 METRICS = get_args(Metric)
@@ -56,6 +57,7 @@ class AgentSpec:
         settings: hyperparameters, which change those of its file.
         tuned: whether to begin with the entry of ``hyperparams/<algo>.yml``; otherwise with the
             defaults of its constructor.
+        conf_file: a file of hyperparameters to begin with, instead of that one; None for that one.
         summary: a few words on it, for the report.
         where: the place in a study file that asks for it, for error messages.
         group: for one of a sweep, the label that its members share.
@@ -66,6 +68,7 @@ class AgentSpec:
     algo: str
     settings: dict[str, Any] = field(default_factory=dict)
     tuned: bool = True
+    conf_file: Path | None = None
     summary: str = ""
     where: str = field(default="", compare=False)
     group: str = ""
@@ -122,7 +125,8 @@ class StudySpec:
         episodes_table: episodes in each row of the table of training returns; 0 for no table.
         quick: how it is cut down for a first look.
         is_quick: whether it has been.
-        gym_packages: modules to import for the environments that they register.
+        gym_packages: names of modules of the user's, whose classes settings may name.
+        user_modules: the same, as another process can import them.
         tensorboard: whether each run writes a TensorBoard log.
         render_every: episodes between two that are filmed; 0 for no films.
         source: the file that it was read from, or None.
@@ -143,6 +147,7 @@ class StudySpec:
     quick: QuickSpec = field(default_factory=QuickSpec)
     is_quick: bool = False
     gym_packages: tuple[str, ...] = ()
+    user_modules: tuple[UserModule, ...] = ()
     tensorboard: bool = False
     render_every: int = 0
     source: Path | None = None

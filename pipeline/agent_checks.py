@@ -20,8 +20,7 @@ def check_algorithm(algo: str) -> None:
         raise unknown("unknown agent", algo, ALGORITHMS)
     if not entry.is_installed:
         raise UserError(
-            f"{algo} needs {entry.package}, which is not installed: "
-            f"pip install 'rl-yardstick[{entry.extra}]'"
+            f"{algo} needs {entry.package}, which is not installed: {entry.install_command}"
         )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
+import shlex
+import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ from typing import Any
 import gymnasium as gym
 
 import envs  # noqa: F401  # registers the project's environments
-from pipeline.errors import UserError, one_line, unknown
+from pipeline.errors import UserError, one_line, shown, unknown
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import import_again
 
 # Where neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
 # policy that runs in a circle would never end.
@@ -33,28 +35,21 @@ Wrap = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 TRAINING_VEC_ENVS = {"dummy": "DummyVecEnv", "subproc": "SubprocVecEnv"}
 
 
-def import_gym_packages(packages: tuple[str, ...]) -> None:
-    """Import modules for the environments that they register.
-
-    Raises:
-        UserError: if one cannot be imported.
-    """
-    for package in packages:
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise UserError(f"--gym-packages: cannot import {package}: {error}") from error
-
-
 def check_env_id(env_id: str) -> None:
     """Make sure that the environment is registered.
 
+    A module before a colon is not imported here, whoever asks: `pipeline.user_modules` does that,
+    for what the user has typed.
+
     Raises:
-        UserError: if it is not; it names the nearest ids.
+        UserError: if it is not; it names the nearest ids, or the flag to type.
     """
     module, _, name = env_id.rpartition(":")
-    if module:
-        import_gym_packages((module,))
+    if module and module not in sys.modules:
+        raise UserError(
+            f"{shown(env_id)}: its module is not imported because a file asks: "
+            f"add --gym-packages {shlex.quote(module)}"
+        )
     if name not in gym.registry:
         raise unknown("unknown environment", name, gym.registry, n=3)
 
@@ -62,11 +57,13 @@ def check_env_id(env_id: str) -> None:
 def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """`gym.make`, with mistakes in the arguments put into one line.
 
+    Of ``module:Env-v0`` the name alone counts: Gymnasium would import the module.
+
     Raises:
         UserError: if the environment cannot be made with these arguments.
     """
     try:
-        return gym.make(env_id, **kwargs)
+        return gym.make(env_id.rpartition(":")[2], **kwargs)
     except MISTAKES as error:
         raise UserError(f"{env_id}: {one_line(error)}") from error
 
@@ -156,6 +153,7 @@ def _make_vec_env(
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
 
     def make(**given: Any) -> gym.Env[Any, Any]:
+        import_again(spec.user_modules)  # this may be another process
         env = make_env(spec.env_id, given)
         return env if wrap_innermost is None else wrap_innermost(env)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.agent_checks import check_algorithm
-from pipeline.environments import check_env_id, import_gym_packages
+from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.model_loading import (
     check_model_file,
@@ -20,6 +20,7 @@ from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import UserModule, check_recorded
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class ModelRequest:
             the checkpoint after so many steps.
         is_trusted: load a library zip from outside the log folder, which can run code.
         env_kwargs: arguments of the environment, to change those of the run.
-        gym_packages: modules to import for the environments that they register.
+        user_modules: modules of the user's, imported already; a run has no others imported.
         seed: of the episodes.
         device: torch device of the networks.
     """
@@ -50,7 +51,7 @@ class ModelRequest:
     which: Literal["final", "best", "last checkpoint"] | int = "final"
     is_trusted: bool = False
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    gym_packages: tuple[str, ...] = ()
+    user_modules: tuple[UserModule, ...] = ()
     seed: int = 0
     device: str = "auto"
 
@@ -76,18 +77,30 @@ def choose_model(request: ModelRequest) -> ChosenModel:
     Raises:
         UserError: if there is no such model, or it may not be loaded.
     """
-    import_gym_packages(request.gym_packages)
     if request.path is not None:
         return _model_at(request.path, request)
     algo, env_id = request.algo or "ppo", request.env_id or "CartPole-v1"
-    check_algorithm(algo)
-    check_env_id(env_id)
-    run = Run.find(request.log_folder, algo, env_id, request.run_number)
+    run = _find_run(algo, env_id, request)
     path = _file_in(run, request.which)
     if not path.exists():
         raise UserError(f"{run.path} holds no {path.name}: its training may not have ended")
     check_model_file(path)
     return ChosenModel(path, _spec(algo, env_id, run, request), run)
+
+
+def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
+    """The run that is asked for, whose modules have been imported."""
+    try:
+        run = Run.find(request.log_folder, algo, env_id, request.run_number)
+    except UserError:
+        # The better reason, where there is no such agent or environment.
+        check_algorithm(algo)
+        check_env_id(env_id)
+        raise
+    check_recorded(run.recorded_spec(), run.path)
+    check_algorithm(algo)
+    check_env_id(env_id)
+    return run
 
 
 def _file_in(run: Run, which: str | int) -> Path:
@@ -107,6 +120,8 @@ def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
     check_model_file(path)
     run = run_of(path)
     recorded = {} if run is None else run.recorded_spec()
+    if run is not None:
+        check_recorded(recorded, run.path)
     hand_written = hand_written_algorithm(path)
     algo = request.algo or hand_written or recorded.get("algo")
     env_id = request.env_id or recorded.get("env_id")
@@ -115,7 +130,8 @@ def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
         raise UserError(f"{path} lies in no run folder: say what it is with {missing}")
     check_algorithm(algo)
     check_env_id(env_id)
-    if hand_written is None and not request.is_trusted:
+    # What a zip says of itself counts where it is loaded as that, without a pickle.
+    if hand_written != algo and not request.is_trusted:
         check_origin(path, request.log_folder)
     return ChosenModel(path, _spec(algo, env_id, run, request), run)
 
@@ -132,5 +148,6 @@ def _spec(algo: str, env_id: str, run: Run | None, request: ModelRequest) -> Tra
         saved_hyperparams=raw,
         seed=request.seed,
         device=request.device,
-        gym_packages=(*recorded.get("gym_packages", ()), *request.gym_packages),
+        gym_packages=tuple(module.name for module in request.user_modules),
+        user_modules=request.user_modules,
     )

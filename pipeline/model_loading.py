@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.run_folder import Run
+from pipeline.settings.constructor_arguments import algorithm_parameters
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -54,6 +55,18 @@ def check_origin(path: Path, log_folder: Path, given: Path | None = None) -> Non
         )
 
 
+def agent_class(algo: str) -> type[BaseAlgorithm]:
+    """Import the class of an agent.
+
+    Raises:
+        UserError: if it was registered wrongly, or its module cannot be imported.
+    """
+    try:
+        return load_algorithm(algo)
+    except (ValueError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+
+
 def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) -> BaseAlgorithm:
     """Load an agent from its zip.
 
@@ -70,13 +83,37 @@ def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) 
         UserError: if the file is not a zip of such an agent, or does not fit ``env``.
     """
     check_model_file(path)
-    algorithm = load_algorithm(algo)
+    algorithm = agent_class(algo)
     try:
-        return algorithm.load(path, env=env, **kwargs)
+        model = _loadable(algorithm).load(path, env=env, **kwargs)
+        model.__class__ = algorithm
+        return model
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
         raise UserError(f"{path} cannot be loaded as a {algo} agent: {one_line(error)}") from error
+
+
+def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
+    """The class, or a subclass that does without the arguments that `load` hands a constructor."""
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    parameters = algorithm_parameters(algorithm)
+    is_own_load = (
+        getattr(algorithm.load, "__func__", None) is not vars(BaseAlgorithm)["load"].__func__
+    )
+    lacking = {"policy", "device", "_init_setup_model"} - parameters.keys()
+    if not lacking or is_own_load:
+        return algorithm
+
+    def without_them(self: Any, **kwargs: Any) -> None:
+        initialise: Any = algorithm.__init__
+        # What `_init_setup_model=False` is for: `load` sets up once it has restored the attributes.
+        vars(self)["_setup_model"] = lambda: None
+        initialise(self, **{name: value for name, value in kwargs.items() if name not in lacking})
+        del vars(self)["_setup_model"]
+
+    return type(algorithm.__name__, (algorithm,), {"__init__": without_them})
 
 
 def run_of(path: Path) -> Run | None:
@@ -98,6 +135,20 @@ def hand_written_algorithm(path: Path) -> str | None:
     with zipfile.ZipFile(path) as archive:
         class_name = json.loads(archive.read("data")).get("algorithm")
     for name, entry in ALGORITHMS.items():
-        if isinstance(class_name, str) and entry.entry_point.endswith(f":{class_name}"):
+        if (
+            isinstance(class_name, str)
+            and entry.entry_point.endswith(f":{class_name}")
+            and _holds_no_pickle(name)
+        ):
             return name
     return None
+
+
+def _holds_no_pickle(algo: str) -> bool:
+    """Whether zips of the agent are JSON; where its class is not to be had, they are not loaded."""
+    from agents.common.model_files import JsonAlgorithm
+
+    try:
+        return issubclass(load_algorithm(algo), JsonAlgorithm)
+    except ImportError:
+        return True

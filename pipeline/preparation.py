@@ -5,30 +5,37 @@ from __future__ import annotations
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
+from gymnasium import spaces
 from rich.console import Console
+from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents import load_algorithm
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
-from pipeline.environments import make_evaluation_env, make_training_env
+from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.sampled import evaluate, evaluation_seed
+from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator, why_not_exact
+from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
-from pipeline.model_loading import load_model
+from pipeline.model_loading import agent_class, load_model
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
-from pipeline.run_folder import Run
+from pipeline.run_folder import Run, environment_name
 from pipeline.settings import components
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.settings.algorithm_kwargs import (
+    build_algorithm_kwargs,
+    default_policy,
+    needs_policy,
+)
+from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.train_spec import TrainSpec
 
 EVALUATIONS_PER_RUN = 20
@@ -64,9 +71,13 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     Raises:
         UserError: if one is unknown or has a wrong type or range.
     """
-    return build_algorithm_kwargs(
-        load_algorithm(spec.algo), spec.hyperparams.algorithm, spec.algo, spec.gym_packages
-    )
+    algorithm, kwargs = agent_class(spec.algo), spec.hyperparams.algorithm
+    if needs_policy(algorithm, kwargs):
+        env = make_single_env(spec, training=True)
+        is_dict = isinstance(env.observation_space, spaces.Dict)
+        env.close()
+        kwargs = {"policy": default_policy(algorithm, is_dict), **kwargs}
+    return build_algorithm_kwargs(algorithm, kwargs, spec.algo, spec.gym_packages)
 
 
 def set_up(
@@ -78,10 +89,12 @@ def set_up(
     model = _make_model(spec, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
-    eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
+    n_eval_envs = min(spec.n_eval_envs, spec.eval_episodes) if takes_batches(model) else 1
+    eval_env = make_evaluation_env(spec, n_eval_envs)
     undo.callback(eval_env.close)
     is_bandit = are_bandits(env)
-    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit)
+    exact = _exact_evaluator(spec, model, console)
+    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, exact)
     display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
     callbacks = _named_callbacks(spec, run, model)
     pulls = _pull_recorder(model, run, console) if is_bandit else None
@@ -95,11 +108,26 @@ def set_up(
     return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls)
 
 
-def _evaluation(
-    spec: TrainSpec, run: Run, eval_env: VecEnv, n_envs: int, is_bandit: bool
-) -> EvaluationCallback:
-    """The evaluations during training: exact ones where the environment's model is known."""
+def _exact_evaluator(
+    spec: TrainSpec, model: BaseAlgorithm, console: Console
+) -> ExactEvaluator | None:
+    """What computes evaluations where the environment's model is known and the agent lets it."""
     exact = exact_evaluator(spec)
+    reason = "" if exact is None else why_not_exact(model, exact.observations)
+    if reason:
+        console.print(f"[dim]evaluations are sampled, not exact: {escape(reason)}[/]")
+    return None if reason else exact
+
+
+def _evaluation(
+    spec: TrainSpec,
+    run: Run,
+    eval_env: VecEnv,
+    n_envs: int,
+    is_bandit: bool,
+    exact: ExactEvaluator | None,
+) -> EvaluationCallback:
+    """The evaluations during training: exact ones where they can be."""
     seed = evaluation_seed(spec.seed, 1)
     sampled = partial(evaluate, env=eval_env, n_episodes=spec.eval_episodes, seed=seed)
     return EvaluationCallback(
@@ -156,18 +184,38 @@ def _has_moving_schedule(model: BaseAlgorithm) -> bool:
 
 
 def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlgorithm:
+    folder = spec.tensorboard_log
     common: dict[str, Any] = {
         "seed": spec.seed,
         "verbose": max(spec.verbose - 1, 0),
-        "tensorboard_log": None
-        if spec.tensorboard_log is None
-        else str(spec.tensorboard_log / spec.env_id),
+        "tensorboard_log": None if folder is None else str(folder / environment_name(spec.env_id)),
     }
     if spec.trained_agent is None:
-        return load_algorithm(spec.algo)(env=env, device=spec.device, **common, **kwargs)
+        return _new_model(agent_class(spec.algo), env, spec.device, common, kwargs)
     # The networks are those of the file: their shape cannot change.
     kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
     return load_model(spec.algo, spec.trained_agent, env, device=spec.device, **common, **kwargs)
+
+
+def _new_model(
+    algorithm: type[BaseAlgorithm],
+    env: VecEnv,
+    device: str,
+    common: dict[str, Any],
+    kwargs: dict[str, Any],
+) -> BaseAlgorithm:
+    """An agent; what its constructor does not take of the common arguments is set afterwards."""
+    given, parameters = {"device": device, **common}, algorithm_parameters(algorithm)
+    taken = {name: value for name, value in given.items() if name in parameters}
+    if "seed" not in taken:
+        set_random_seed(common["seed"])
+    # The type checker knows the arguments of the base class, which has more of them.
+    model: BaseAlgorithm = cast(Any, algorithm)(env=env, **taken, **kwargs)
+    for name in common.keys() - taken.keys():
+        setattr(model, name, common[name])
+    if "seed" not in taken:
+        model.set_random_seed(common["seed"])
+    return model
 
 
 def _evaluation_intervals(

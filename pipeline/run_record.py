@@ -13,14 +13,16 @@ import yaml
 from pipeline.files import write_text
 from pipeline.run_folder import Run
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import keep_copies
 
 RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
 
 
 def write_settings(run: Run, spec: TrainSpec, command: str) -> None:
-    """Write the hyperparameters and the command, where rl_zoo3 has them."""
+    """Write the hyperparameters and the command, where rl_zoo3 has them; keep the user's files."""
     write_text(run.params_path / "config.yml", yaml.safe_dump(spec.saved_hyperparams))
     write_text(run.params_path / "command.txt", command + "\n")
+    keep_copies(spec.user_modules, run.path)
 
 
 def write_arguments(run: Run, spec: TrainSpec, args: Mapping[str, Any]) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.settings.hyperparams import Hyperparams
+from pipeline.user_modules import UserModule
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,8 @@ class TrainSpec:
         log_interval: episodes (or rollouts) between two log records; below 0 for the default.
         verbose: 0 silent, 1 progress and summary, 2 the library's own log as well.
         progress: draw a live bar wherever the output goes.
-        gym_packages: modules to import for the environments that they register.
+        gym_packages: names of modules of the user's, whose classes settings may name.
+        user_modules: the same, as another process can import them.
         unique_id: give the folder a name that no other machine's run can have.
         pictures: draw the learning curve and the like into the run folder.
     """
@@ -60,6 +62,7 @@ class TrainSpec:
     verbose: int = 1
     progress: bool = False
     gym_packages: tuple[str, ...] = ()
+    user_modules: tuple[UserModule, ...] = ()
     unique_id: bool = False
     pictures: bool = True
 

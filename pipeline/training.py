@@ -179,7 +179,8 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     save_model(model, run.model_path)
     save_normalization(model, run)
     if evaluation.is_asked_for and not evaluation.evaluations_timesteps:
-        # The run was shorter than the time to its first evaluation.
+        # The run was shorter than the time to its first evaluation, or called no callback.
+        evaluation.init_callback(model)
         evaluation.evaluate_now()
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"

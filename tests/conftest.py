@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import sys
 from types import SimpleNamespace
 
 import hypothesis
@@ -42,6 +43,49 @@ def small_study():
         environments=environments,
         n_seeds=2,
     )
+
+
+@pytest.fixture
+def own_folder(monkeypatch, tmp_path):
+    """A user's folder, in which commands are typed; what is imported from there goes afterwards."""
+    import gymnasium as gym
+
+    from agents import ALGORITHMS
+
+    (tmp_path / "own").mkdir()
+    folder = (tmp_path / "own").resolve()
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    tables = [(table, dict(table)) for table in (ALGORITHMS, gym.registry, sys.modules)]
+    yield folder
+    for table, before in tables:
+        for name in table.keys() - before.keys():
+            if table is not sys.modules or _is_of(table[name], tmp_path):
+                del table[name]
+
+
+def _is_of(module, folder):
+    return str(folder) in str(getattr(module, "__file__", "") or "")
+
+
+@pytest.fixture
+def type_in_own_folder(own_folder, monkeypatch, capsys):
+    """Run a command line in this process, inside a user's folder: exit code, output, errors."""
+    import compare
+    import enjoy
+    import train
+    from commands.parsing import run_command
+
+    commands = {"train.py": train.main, "enjoy.py": enjoy.main, "compare.py": compare.main}
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+        with pytest.raises(SystemExit) as stop:
+            run_command(commands[words[0]])
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
 
 
 @pytest.fixture(scope="session")

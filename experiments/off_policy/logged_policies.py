@@ -17,7 +17,7 @@ from experiments.off_policy.reward_models import CrossFit, cross_fit
 from mdp.array_types import Floats
 from pipeline.agent_checks import check_algorithm
 from pipeline.errors import UserError, one_line
-from pipeline.evaluation.exact import policy_matrix
+from pipeline.evaluation.exact import policy_matrix, why_not_exact
 from pipeline.model_loading import (
     check_model_file,
     check_origin,
@@ -25,6 +25,7 @@ from pipeline.model_loading import (
     load_model,
     run_of,
 )
+from pipeline.user_modules import check_recorded
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
@@ -109,6 +110,8 @@ def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
     check_model_file(zip_path)
     run = run_of(zip_path)
     spec = {} if run is None else run.recorded_spec()
+    if run is not None:
+        check_recorded(spec, run.path)
     hand_written = hand_written_algorithm(zip_path)
     algo = hand_written or spec.get("algo")
     if algo is None:
@@ -190,6 +193,9 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
         observations = data.observations(agent.observation_space)
     except ValueError as error:
         raise UserError(f"{policy.name}: {one_line(error)}") from error
+    reason = why_not_exact(agent, observations)
+    if reason:
+        raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
     return policy_matrix(agent, observations)
 
 

@@ -30,7 +30,7 @@ from mdp import (
 )
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
-from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.evaluation.sampled import KNOWN_LIBRARIES, Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec
 
 # Beyond this, episodes are sampled: exact evaluation would take longer than training.
@@ -106,6 +106,30 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     return ExactEvaluator(model, observations, horizon, success, yardstick, layout)
 
 
+def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
+    """Say why an agent cannot be asked for all states at once; empty where it can.
+
+    Agents of this project and of Stable-Baselines3 can. Of others, what `predict` returns is looked
+    at: it has to be one action a state, the same when it is asked again, and nothing to remember.
+
+    Args:
+        agent: any agent with discrete actions.
+        observations: what it observes in each state, states along the first axis.
+    """
+    if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
+        return ""
+    try:
+        asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
+        first, second = (np.asarray(actions) for actions, _ in asked)
+    except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
+        return f"predict takes no batch of observations ({type(error).__name__})"
+    if first.shape != observations.shape[:1]:
+        return f"predict returns actions of shape {first.shape} for {len(observations)} states"
+    if any(state is not None for _, state in asked):
+        return "predict remembers what it saw before"
+    return "" if np.array_equal(first, second) else "predict draws its actions at random"
+
+
 def policy_matrix(
     agent: BaseAlgorithm, observations: NDArray[Any], deterministic: bool = True
 ) -> Floats:
@@ -132,9 +156,14 @@ def policy_matrix(
             tensor, _ = agent.policy.obs_to_tensor(observations)
             distribution: Any = agent.policy.get_distribution(tensor).distribution
         return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
-    if hasattr(agent, "exploration_rate"):
-        # DQN and agents like it: QR-DQN too, which may not be installed and is no subclass of DQN.
-        epsilon = float(agent.exploration_rate)
+    if _is_epsilon_greedy(agent):
+        epsilon = float(vars(agent)["exploration_rate"])
         greedy = policy_matrix(agent, observations)
         return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
     raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
+
+
+def _is_epsilon_greedy(agent: BaseAlgorithm) -> bool:
+    """Whether it is DQN or QR-DQN, which may not be installed and is no subclass of it."""
+    homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
+    return any(base.__module__.startswith(homes) for base in type(agent).__mro__)

@@ -13,6 +13,9 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from mdp.array_types import Floats
 
+# The agents of these packages take any number of observations at once.
+KNOWN_LIBRARIES = ("agents", "stable_baselines3")
+
 
 @dataclass(frozen=True)
 class Yardstick:
@@ -132,6 +135,22 @@ def evaluate(
         np.asarray(lengths, dtype=np.int64),
         np.array(successes) if len(successes) == n_episodes else None,
     )
+
+
+def takes_batches(model: BaseAlgorithm) -> bool:
+    """Whether an agent can be asked for the actions of several environments at once."""
+    if type(model).__module__.partition(".")[0] in KNOWN_LIBRARIES:
+        return True
+    sample: Any = model.observation_space.sample()
+    try:
+        if isinstance(sample, dict):
+            twice: Any = {name: np.stack([part, part]) for name, part in sample.items()}
+        else:
+            twice = np.stack([sample, sample])
+        actions, _ = model.predict(twice, deterministic=True)
+    except Exception:  # noqa: BLE001  # a stranger's code can fail in any way
+        return False
+    return len(np.atleast_1d(actions)) == 2
 
 
 def evaluation_seed(seed: int, purpose: int) -> int:

@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING, Any, get_args, get_origin
 from pipeline.errors import UserError, unknown
 from pipeline.settings.class_names import find_class
 from pipeline.settings.components import build_value
-from pipeline.settings.constructor_arguments import check_arguments, constructor_parameters
+from pipeline.settings.constructor_arguments import (
+    algorithm_parameters,
+    check_arguments,
+    constructor_parameters,
+)
 from pipeline.settings.hyperparams import check_algorithm_kwargs
 from pipeline.settings.literals import DottedName
 
@@ -27,7 +31,7 @@ def build_algorithm_kwargs(
     """An agent's constructor arguments, checked to the last one and built.
 
     Beyond `check_algorithm_kwargs` and `build_value`, the policy must exist and know what
-    ``policy_kwargs`` says.
+    ``policy_kwargs`` says, where the class tells by ``policy_aliases`` which policies it has.
 
     Args:
         algorithm: the agent's class.
@@ -38,10 +42,10 @@ def build_algorithm_kwargs(
     Raises:
         UserError: naming the argument, and what it must be.
     """
-    parameters = constructor_parameters(algorithm)
+    parameters = algorithm_parameters(algorithm)
     checked = check_algorithm_kwargs(kwargs, parameters, where)
     policy = _policy_class(algorithm, checked, parameters, where, extra_packages)
-    if checked.get("policy_kwargs") is not None:
+    if policy is not None and checked.get("policy_kwargs") is not None:
         accepted = constructor_parameters(policy)
         policy_kwargs = check_arguments(
             checked["policy_kwargs"], accepted, f"{where}: policy_kwargs"
@@ -52,23 +56,44 @@ def build_algorithm_kwargs(
     return _build(checked, parameters, where, extra_packages)
 
 
+def needs_policy(algorithm: type[BaseAlgorithm], kwargs: Mapping[str, Any]) -> bool:
+    """Whether the constructor wants a policy that the arguments do not say."""
+    policy = algorithm_parameters(algorithm).get("policy")
+    return policy is not None and policy.default is policy.empty and "policy" not in kwargs
+
+
+def default_policy(algorithm: type[BaseAlgorithm], is_dict: bool) -> str:
+    """The policy of an agent for which none is said.
+
+    Args:
+        algorithm: the agent's class.
+        is_dict: whether it observes a dictionary.
+    """
+    usual = "MultiInputPolicy" if is_dict else "MlpPolicy"
+    known = algorithm.policy_aliases
+    return usual if usual in known or not known else next(iter(known))
+
+
 def _policy_class(
     algorithm: type[BaseAlgorithm],
     kwargs: Mapping[str, Any],
     parameters: Mapping[str, inspect.Parameter],
     where: str,
     extra_packages: Sequence[str],
-) -> type[BasePolicy]:
+) -> type[BasePolicy] | None:
+    """The class of the policy; None where only the agent's constructor knows it."""
     from stable_baselines3.common.policies import BasePolicy
 
-    policy = kwargs.get("policy", parameters["policy"].default)
+    if needs_policy(algorithm, kwargs):
+        raise UserError(f"{where}: policy is missing: {', '.join(algorithm.policy_aliases)}")
+    default = parameters["policy"].default if "policy" in parameters else None
+    policy = kwargs.get("policy", default)
     if isinstance(policy, DottedName):
         return find_class(policy.name, (BasePolicy,), f"{where}: policy", extra_packages)
-    if policy is inspect.Parameter.empty:
-        raise UserError(f"{where}: policy is missing: {', '.join(algorithm.policy_aliases)}")
-    if policy not in algorithm.policy_aliases:
-        raise unknown(f"{where}: unknown policy", str(policy), algorithm.policy_aliases)
-    return algorithm.policy_aliases[policy]
+    known = algorithm.policy_aliases
+    if isinstance(policy, str) and known and policy not in known and "policy" in kwargs:
+        raise unknown(f"{where}: unknown policy", policy, known)
+    return known.get(policy) if isinstance(policy, str) else None
 
 
 def _build(

@@ -5,13 +5,14 @@ from __future__ import annotations
 import inspect
 import math
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from pipeline.errors import UserError, shown, unknown
 from pipeline.settings.coercion import ScheduleSpec, coerce
 
 _FINITE = sys.float_info.max
+_STARRED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 # Bounds, both included, of hyperparameters that mean the same in every algorithm.
 RANGES: Mapping[str, tuple[float, float]] = {
@@ -55,6 +56,35 @@ def constructor_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
     except (NameError, AttributeError, TypeError, SyntaxError):
         # A name that only type checkers import; annotations that stay texts go unchecked.
         return inspect.signature(cls).parameters
+
+
+def algorithm_parameters(cls: type) -> dict[str, inspect.Parameter]:
+    """The arguments of an algorithm's constructor, and those that ``**kwargs`` may hand on.
+
+    ``**kwargs`` stays among them, since it may go elsewhere than to the base class. An argument
+    without annotation whose default is a number is read as one wherever it can be.
+    """
+    own = dict(constructor_parameters(cls))
+    rest = next((p for p in own.values() if p.kind is p.VAR_KEYWORD), None)
+    owners = [base for base in cls.__mro__[:-1] if "__init__" in vars(base)]
+    if rest is not None and len(owners) > 1:
+        named = {name: p for name, p in own.items() if p.kind not in _STARRED}
+        own = {**algorithm_parameters(owners[1]), **named, rest.name: rest}
+        if "env" in named and "policy" not in named:
+            own.pop("policy", None)  # which the constructor gives its base class itself
+    return {name: _annotated(parameter) for name, parameter in own.items()}
+
+
+def _annotated(parameter: inspect.Parameter) -> inspect.Parameter:
+    """The argument, with what its default says where it has no annotation."""
+    default = parameter.default
+    if parameter.annotation is not parameter.empty or isinstance(default, bool):
+        return parameter
+    kinds: dict[type, Any] = {
+        int: int | float | Any,
+        float: float | Callable[[float], float] | Any,
+    }
+    return parameter.replace(annotation=kinds.get(type(default), parameter.empty))
 
 
 def check_arguments(

@@ -33,12 +33,15 @@ def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> 
         path: another file to read.
 
     Returns:
-        The entry as it stands there, see `pipeline.settings.hyperparams.split`.
+        The entry as it stands there, see `pipeline.settings.hyperparams.split`; an empty one for an
+        algorithm that has no file here, such as one of the user's own.
 
     Raises:
         UserError: if the file cannot be read or is not of this format.
         NoEntryError: if it has no entry that fits.
     """
+    if path is None and not _path(algo, None).is_file():
+        return {}
     path = _path(algo, path)
     if path.suffix == ".py":
         raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from agents import ALGORITHMS
 from experiments import study_files
 from experiments.study_files import find_study, read_study, swept
+from experiments.study_plan import plan
 from experiments.study_spec import METRICS, AgentSpec, QuickSpec, file_name, layered
 from pipeline.errors import UserError
 from pipeline.files import portable_name
@@ -73,6 +74,26 @@ MISTAKES = {
     "no agents": ("agents: []\nenvironments: [Taxi-v4]\n", 1, "at least one name"),
     "agents left empty": ("agents:\nenvironments: [Taxi-v4]\n", 1, "at least one name"),
     "no environments": ("agents: [dqn]\n", 1, "environments must list at least one name"),
+    "no file of settings": (
+        "environments: [Taxi-v4]\nagents:\n  dqn:\n    conf_file: no.yml\n",
+        4,
+        "conf_file: there is no file ",
+    ),
+    "settings and none": (
+        "environments: [Taxi-v4]\nagents:\n  dqn:\n    conf_file: lakes.yml\n    tuned: false\n",
+        4,
+        "says where to begin, and tuned: false not to",
+    ),
+    "file of settings that is none": (
+        "environments: [Taxi-v4]\nagents:\n  dqn: {conf_file: [a]}\n",
+        3,
+        "conf_file must be a text",
+    ),
+    "module of an id": (
+        "agents: [dqn]\nenvironments: ['no_such_module:Taxi-v4']\n",
+        2,
+        "not imported because a file asks: add --gym-packages no_such_module",
+    ),
     "list of mappings": (
         "agents:\n  - algo: dqn\nenvironments: [Taxi-v4]\n",
         1,
@@ -304,3 +325,17 @@ def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
     assert find_study("other/mine-maze.yml") == Path("other/mine-maze.yml")
     with pytest.raises(UserError, match=r"mine-mase: cannot be read: .* did you mean 'mine-maze'"):
         find_study("mine-mase")
+
+
+def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
+    (tmp_path / "mine.yml").write_text("FrozenLake-v1: {n_timesteps: 7, gamma: 0.5}\n")
+    study = read(
+        "environments: [FrozenLake-v1]\ntuned: false\nagents:\n  sarsa: {n_timesteps: 9}\n"
+        "  mine: {algo: sarsa, conf_file: mine.yml, learning_rate: 0.25}\n"
+    )
+    assert [agent.conf_file for agent in study.agents] == [None, tmp_path / "mine.yml"]
+    raws = [run.spec.saved_hyperparams for run in plan(study, tmp_path) if run.seed == 0]
+    assert raws == [
+        {"n_timesteps": 9},
+        {"n_timesteps": 7, "gamma": 0.5, "learning_rate": 0.25},
+    ]

@@ -1,0 +1,268 @@
+"""Modules of the user's: environments and agents that live outside of this project.
+
+They are imported because the user typed their names on the command line, and for no other reason: a
+file may say what it needs, and is told what to type. Their folders go to the end of Python's search
+path, so that an ``agents.py`` of the user's never comes before ours; where two modules share a
+name, it is refused instead.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import os
+import shlex
+import sys
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from pipeline.errors import UserError, one_line, shown
+
+_PROJECT = Path(__file__).resolve().parents[1]
+# The folder of a run that keeps copies of single files.
+COPIES = "modules"
+MAX_COPY_BYTES = 1_000_000
+
+
+@dataclass(frozen=True)
+class UserModule:
+    """A module that the user asked for.
+
+    Attributes:
+        typed: the words for it on the command line.
+        name: what it is imported as.
+        path: its file, or the folder of a package, from the root; None where it is installed.
+    """
+
+    typed: str
+    name: str
+    path: str | None = None
+
+    @property
+    def search_folder(self) -> str | None:
+        """The folder that Python has to search for it; None where it searches it anyway."""
+        return None if self.path is None else str(Path(self.path).parents[self.name.count(".")])
+
+
+def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[UserModule, ...]:
+    """Import what the user typed after ``--gym-packages``, and before the colon of ids.
+
+    Args:
+        words: names of modules, and paths of files and packages.
+        env_ids: ids that were typed, such as ``module:Env-v0``.
+
+    Returns:
+        The modules, as another process can `import_again`; without those of this project.
+
+    Raises:
+        UserError: if one is not there, cannot be imported, or shares its name with another.
+    """
+    prefixes = [env_id.rpartition(":")[0] for env_id in env_ids]
+    modules = []
+    for typed in dict.fromkeys([*words, *filter(None, prefixes)]):
+        module = _at_path(typed) if _is_path(typed) else _by_name(typed)
+        _import(module)
+        if not _is_ours(module.name):
+            modules.append(module)
+    return tuple(modules)
+
+
+def import_again(modules: Iterable[UserModule]) -> None:
+    """Import what `import_typed` did, in another process and from any folder.
+
+    Raises:
+        UserError: as there.
+    """
+    for module in modules:
+        if module.name not in sys.modules:
+            _import(module)
+
+
+def _is_path(typed: str) -> bool:
+    return os.sep in typed or typed.startswith((".", "~")) or typed.endswith(".py")
+
+
+def _at_path(typed: str) -> UserModule:
+    """The module in a file or a folder; inside a package, under its full name."""
+    try:
+        path = Path(typed).expanduser()
+    except RuntimeError as error:  # there is no such user
+        raise _refused(typed, one_line(error)) from error
+    path = path.resolve() if path.is_dir() else path.parent.resolve() / path.name
+    path = path.parent if path.name == "__init__.py" else path
+    if not path.exists():
+        raise _refused(typed, "there is no such file or folder")
+    if path.is_dir() and not (path / "__init__.py").is_file():
+        raise _refused(typed, "the folder is no package: it holds no __init__.py")
+    if path.is_file() and path.suffix != ".py":
+        raise _refused(typed, "it is no Python file")
+    parts, folder = [path.stem if path.is_file() else path.name], path.parent
+    while (folder / "__init__.py").is_file():
+        parts, folder = [folder.name, *parts], folder.parent
+    for part in parts:
+        if not part.isidentifier():
+            raise _refused(typed, f"{shown(part)} is no name of a module: rename it")
+    return UserModule(typed, ".".join(parts), str(path))
+
+
+def _by_name(typed: str) -> UserModule:
+    """The module of that name, beside the place where the command is typed or installed."""
+    if typed.startswith("__") or not all(part.isidentifier() for part in typed.split(".")):
+        raise _refused(typed, "it is neither the name of a module nor the path of one")
+    here = Path.cwd()
+    found = _source(here, typed)
+    if found is None and _source(here, typed.partition(".")[0]) is None:
+        return UserModule(typed, typed)
+    return UserModule(typed, typed, str(found or here.joinpath(*typed.split("."))))
+
+
+def _source(folder: Path, name: str) -> Path | None:
+    """The file or the package of that dotted name in a folder, or None."""
+    path = folder.joinpath(*name.split("."))
+    if (path / "__init__.py").is_file() or (path.is_dir() and any(path.glob("*.py"))):
+        return path
+    file = path.with_suffix(".py")
+    return file if file.is_file() else None
+
+
+def _import(module: UserModule) -> ModuleType:
+    """Import one module, with its folder at the end of the search path."""
+    importlib.invalidate_caches()
+    folder = module.search_folder
+    if folder is not None:
+        if folder not in sys.path:
+            sys.path.append(folder)
+        _check_name(module, Path(folder))
+    try:
+        return importlib.import_module(module.name)
+    except (Exception, SystemExit) as error:  # whatever a stranger's module does when imported
+        raise _refused(module.typed, _what_failed(error, module)) from error
+
+
+def _check_name(module: UserModule, folder: Path) -> None:
+    """Make sure that the user's module is the one that is found under its name.
+
+    Raises:
+        UserError: if that is one of ours, of Python's, or of a library.
+    """
+    top = module.name.partition(".")[0]
+    wanted = _source(folder, top) or folder / top
+    found = _places(top)
+    if not found & {wanted.resolve(), (wanted / "__init__.py").resolve()}:
+        if _is_ours(top):
+            whose = f"{top} is the name of one of Yardstick's own modules"
+        elif not found or top in sys.stdlib_module_names:
+            whose = f"{top} is the name of one of Python's own modules"
+        else:
+            whose = f"Python finds another {top} first, at {min(found)}"
+        raise _refused(
+            module.typed, f"{whose}: rename {wanted}, or put it into a package of another name"
+        )
+
+
+def _places(top: str) -> set[Path]:
+    """Where Python finds a module of that name, which lies in no package."""
+    try:
+        spec = importlib.util.find_spec(top)
+    except ValueError:  # of `__main__`
+        return set()
+    places = [] if spec is None else [spec.origin, *(spec.submodule_search_locations or ())]
+    return {Path(place).resolve() for place in places if place}
+
+
+def _is_ours(name: str) -> bool:
+    """Whether a module of that name is one of this project's."""
+    top = name.partition(".")[0]
+    own = {_PROJECT / f"{top}.py", _PROJECT / top / "__init__.py"}
+    return not own.isdisjoint(_places(top))
+
+
+def _what_failed(error: BaseException, module: UserModule) -> str:
+    """What went wrong in an import, with file and line."""
+    if isinstance(error, ModuleNotFoundError) and _is_within(module, error.name or "?"):
+        return f"cannot import {error.name}: it is neither in {Path.cwd()} nor installed"
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"{error.filename}:{error.lineno}: {type(error).__name__}: {error.msg}"
+    what = f"{type(error).__name__}: {one_line(error)}"
+    frames = traceback.extract_tb(error.__traceback__)[1:]
+    own = [frame for frame in frames if _is_users(frame.filename, module)]
+    return f"{own[-1].filename}:{own[-1].lineno}: {what}" if own else what
+
+
+def _is_within(module: UserModule, name: str) -> bool:
+    """Whether ``name`` is the module itself or a package that it lies in."""
+    return f"{module.name}.".startswith(f"{name}.")
+
+
+def _is_users(filename: str, module: UserModule) -> bool:
+    """Whether a file is the user's own, rather than a library that it calls."""
+    if module.search_folder is None:  # it is installed itself
+        return not filename.startswith(("<", str(Path(importlib.__file__).parent)))
+    return Path(filename).is_relative_to(module.search_folder)
+
+
+def _refused(typed: str, reason: str) -> UserError:
+    return UserError(f"--gym-packages {shlex.quote(typed)}: {reason}")
+
+
+def as_flag(modules: Iterable[UserModule], env_id: str = "") -> str:
+    """The flag that imports the modules again, to be typed; empty where none is needed.
+
+    Args:
+        modules: as `import_typed` returned them.
+        env_id: typed beside it; the module before its colon needs no flag.
+    """
+    words = [m.typed for m in modules if m.typed != env_id.rpartition(":")[0]]
+    return f" --gym-packages {shlex.join(words)}" if words else ""
+
+
+def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
+    """Put copies of the modules that are single small files into a run folder."""
+    for module in modules:
+        path = Path(module.path or "")
+        if "." in module.name or not path.is_file() or path.stat().st_size > MAX_COPY_BYTES:
+            continue
+        (folder / COPIES).mkdir(exist_ok=True)
+        (folder / COPIES / path.name).write_bytes(path.read_bytes())
+
+
+def check_recorded(recorded: Mapping[str, Any], folder: Path) -> None:
+    """Make sure that the modules that a run was trained with have been imported.
+
+    Args:
+        recorded: what the run folder says was asked for.
+        folder: the run folder.
+
+    Raises:
+        UserError: if one has not; it says what to type.
+    """
+    names = [name for name in recorded.get("gym_packages") or () if isinstance(name, str)]
+    missing = [name for name in names if name not in sys.modules]
+    if not missing:
+        return
+    known = [m for m in recorded.get("user_modules") or () if isinstance(m, dict)]
+    words = [_to_type(name, known, folder) for name in missing]
+    raise UserError(
+        f"{folder} was made with modules of yours ({', '.join(map(_printable, missing))}), and no "
+        f"module is imported because a file asks: add --gym-packages {' '.join(words)}"
+    )
+
+
+def _to_type(name: str, known: Sequence[Mapping[str, Any]], folder: Path) -> str:
+    """What to type for a module that a run recorded: where it was, or else the run's copy."""
+    path = next((m.get("path") for m in known if m.get("name") == name), None)
+    copy = folder / COPIES / f"{name}.py"
+    if isinstance(path, str) and Path(path).exists():
+        near = Path(path)
+        if near.is_relative_to(Path.cwd()):
+            return _printable(f".{os.sep}{near.relative_to(Path.cwd())}")
+        return _printable(path)
+    return _printable(str(copy) if name.isidentifier() and copy.is_file() else name)
+
+
+def _printable(word: str) -> str:
+    return shlex.quote(word) if word.isprintable() else shown(word)

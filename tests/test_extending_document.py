@@ -1,0 +1,25 @@
+"""What docs/extending.md writes and types, as it stands there, in a folder outside the checkout."""
+
+import re
+import shlex
+from pathlib import Path
+
+import gymnasium as gym
+
+DOCUMENT = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
+FILES = re.findall(r"^`(\w+\.\w+)`[^\n]*(?:\n[^\n]+)*\n\n```\w+\n(.*?)```", DOCUMENT, re.M | re.S)
+COMMANDS = re.findall(r"^python ~/yardstick/(.*)$", DOCUMENT, re.M)
+
+
+def test_the_document_can_be_followed(type_in_own_folder, own_folder):
+    for name, text in FILES:
+        (own_folder / name).write_text(text)
+    assert len(FILES) >= 6
+    assert len(COMMANDS) >= 8
+    for command in COMMANDS:
+        code, out, err = type_in_own_folder(*shlex.split(command))
+        assert (code, err) == (0, ""), f"{command}\n{out}{err}"
+    assert gym.make("my/Corridor-v0").unwrapped.length == 6
+    logs = own_folder / "logs"
+    assert (logs / "qlearning" / "my-Corridor-v0_1" / "modules" / "my_corridor.py").is_file()
+    assert len(list(logs.glob("studies/*/runs/*/my-Corridor-v0_*/run.json"))) == 8
