@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.table import Table
 
-from pipeline.run_folder import FINISHED
+from pipeline.run_folder import FINISHED, Run, numbered_runs
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from pipeline.evaluation.sampled import Evaluation
     from pipeline.pull_recording import PullSummary
     from pipeline.training import Outcome
+
+_LONGEST_SETTING = 200
 
 
 def describe(evaluation: Evaluation) -> str:
@@ -59,7 +64,7 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     console.print(
         f"[bold]{spec.algo}[/] on [bold]{spec.env_id}[/], seed {spec.seed}, {budget:,} {unit}"
     )
-    settings = "  ".join(f"{key}={value}" for key, value in spec.saved_hyperparams.items())
+    settings = "  ".join(f"{key}={_brief(value)}" for key, value in spec.saved_hyperparams.items())
     console.print(f"[dim]{settings}[/]", highlight=False)
 
 
@@ -82,6 +87,26 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
             "best", f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
         )
     table.add_row("files", str(outcome.run.path))
-    folder = "" if str(spec.log_folder) == "logs" else f" -f {spec.log_folder}"
-    table.add_row("watch", f"python enjoy.py --algo {spec.algo} --env {spec.env_id}{folder}")
+    table.add_row("watch", watch_command(spec, outcome.run))
     console.print(table, highlight=False)
+
+
+def watch_command(spec: TrainSpec, run: Run) -> str:
+    """The command that plays the agent of a run, as it can be typed where the run was begun."""
+    command = ["python", str(Path(sys.argv[0]).with_name("enjoy.py"))]
+    numbers = [number for number, _ in numbered_runs(run.path.parent, run.env_name)]
+    if numbers.count(run.number) != 1 or run.path.parent != spec.log_folder / spec.algo:
+        command.append(str(run.path))
+    else:
+        command += ["--algo", spec.algo, "--env", spec.env_id]
+        command += [] if str(spec.log_folder) == "logs" else ["-f", str(spec.log_folder)]
+        command += [] if run.number == numbers[-1] else ["--exp-id", str(run.number)]
+    if spec.gym_packages:
+        command += ["--gym-packages", *spec.gym_packages]
+    return shlex.join(command)
+
+
+def _brief(value: object) -> str:
+    """A setting as the header shows it; a whole map would fill the screen."""
+    text = str(value)
+    return text if len(text) <= _LONGEST_SETTING else f"{text[:_LONGEST_SETTING]}..."

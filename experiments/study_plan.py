@@ -15,6 +15,7 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_n
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
+from pipeline.map_contents import with_maps_read
 from pipeline.run_folder import FINISHED, Run, environment_name
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import Hyperparams, split
@@ -90,11 +91,11 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
     Raises:
         UserError: if an agent cannot be trained so, or does not fit an environment.
     """
-    for what, labels in (
-        ("agents", [agent.label for agent in study.agents]),
-        ("environments", [environment.label for environment in study.environments]),
-    ):
-        _check_folders(what, labels)
+    _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
+    _check_folders(
+        "environments",
+        [(env.label, _environment_folder(env.label, env.env_id)) for env in study.environments],
+    )
     specs = {}
     for environment in study.environments:
         check_env_id(environment.env_id)
@@ -122,7 +123,8 @@ def _planned_run(
     is_batch: bool,
 ) -> PlannedRun:
     # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
-    place = Path(file_name(agent), f"{file_name(environment)}_{seed + 1}")
+    folder = _environment_folder(environment, spec.env_id)
+    place = Path(file_name(agent), f"{folder}_{seed + 1}")
     spec = replace(
         spec,
         seed=seed,
@@ -160,16 +162,21 @@ def _naming_the_place(agent: AgentSpec) -> Iterator[None]:
         raise UserError(f"{agent.where}: {error}" if agent.where else str(error)) from error
 
 
-def _check_folders(what: str, labels: Sequence[str]) -> None:
+def _environment_folder(label: str, env_id: str) -> str:
+    """The folder of an environment; of one that goes by its id, as every other command names it."""
+    return file_name(environment_name(env_id) if label == env_id else label)
+
+
+def _check_folders(what: str, labelled: Sequence[tuple[str, str]]) -> None:
     """Refuse labels that are the same, or would have the same folder."""
     places: dict[str, int] = {}
-    for index, label in enumerate(labels):
+    for index, (label, folder) in enumerate(labelled):
         # Some file systems do not tell upper from lower case.
-        first = places.setdefault(file_name(label).lower(), index)
+        first = places.setdefault(folder.lower(), index)
         if first != index:
             raise UserError(
-                f"{what}: {labels[first]!r} and {label!r} would share the folder "
-                f"{file_name(label)}: give them labels that differ in letters or digits"
+                f"{what}: {labelled[first][0]!r} and {label!r} would share the folder "
+                f"{folder}: give them labels that differ in letters or digits"
             )
 
 
@@ -193,7 +200,7 @@ def _is_batch(spec: TrainSpec) -> bool:
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
     check_algorithm(agent.algo)
-    raw = _raw_hyperparams(agent, environment)
+    raw = with_maps_read(environment.env_id, _raw_hyperparams(agent, environment))
     place = f"{agent.label} on {environment.label}"
     if study.is_quick:
         raw = _shortened(raw, study.quick.budget)

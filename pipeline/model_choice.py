@@ -1,23 +1,33 @@
-"""Finding the model to play: the newest of a run, its best, a checkpoint, or a zip by its path."""
+"""Finding the model to play, and what it is played on: the newest of a run, or one by its path.
+
+What the environment is made of comes from, the first first:
+
+1. the request: agent, environment, arguments of the environment, statistics;
+2. for hand-written agents, the zip, which says what agent it holds;
+3. what the model's folder says, see `pipeline.recorded_runs`;
+4. the entry of ``hyperparams/<algo>.yml``, apart from ``normalize``, where the folder says nothing.
+
+Statistics of VecNormalize are used wherever there are some that belong to the model, see
+`pipeline.companions`, since they lie there for no other reason than that it was trained on them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pipeline.agent_checks import check_algorithm
+from pipeline.companions import statistics_of
 from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError
-from pipeline.model_loading import (
-    check_model_file,
-    check_origin,
-    hand_written_algorithm,
-    run_of,
-)
+from pipeline.model_finding import Which, model_at, model_of
+from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm
+from pipeline.normalization import normalising, read_statistics
+from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
 from pipeline.run_folder import Run
-from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 
@@ -27,15 +37,16 @@ class ModelRequest:
     """Which model is asked for.
 
     Attributes:
-        path: a zip, instead of looking for a run.
+        path: a zip or a run folder, instead of looking for a run.
         algo: name of the agent; None for what the zip or its run folder says, or else ``"ppo"``.
         env_id: id of the environment; None for what the run folder says, or else
             ``"CartPole-v1"``.
         log_folder: the folder above all runs.
-        run_number: number of the run; 0 for the newest.
+        run_number: number of the run; 0 for the newest, -1 for one without a number.
         which: the model at the end of training, the best, that of the last checkpoint, or that of
             the checkpoint after so many steps.
-        is_trusted: load a library zip from outside the log folder, which can run code.
+        is_trusted: read what can run code from outside the log folder too.
+        statistics: a file of VecNormalize's statistics, instead of those that lie with the model.
         env_kwargs: arguments of the environment, to change those of the run.
         gym_packages: modules to import for the environments that they register.
         seed: of the episodes.
@@ -47,8 +58,9 @@ class ModelRequest:
     env_id: str | None = None
     log_folder: Path = Path("logs")
     run_number: int = 0
-    which: Literal["final", "best", "last checkpoint"] | int = "final"
+    which: Which = "final"
     is_trusted: bool = False
+    statistics: Path | None = None
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     gym_packages: tuple[str, ...] = ()
     seed: int = 0
@@ -63,11 +75,20 @@ class ChosenModel:
         path: the zip.
         spec: how its environments are made.
         run: the run folder, or None for a zip that lies elsewhere.
+        named_statistics: a file of VecNormalize's statistics to use, or None for those that lie
+            with the model.
     """
 
     path: Path
     spec: TrainSpec
     run: Run | None
+    named_statistics: Path | None = None
+
+    @property
+    def statistics(self) -> Path | None:
+        """The file of VecNormalize's statistics that it is played with, or None."""
+        params_path = None if self.run is None else self.run.params_path
+        return self.named_statistics or statistics_of(self.path, params_path)
 
 
 def choose_model(request: ModelRequest) -> ChosenModel:
@@ -77,54 +98,64 @@ def choose_model(request: ModelRequest) -> ChosenModel:
         UserError: if there is no such model, or it may not be loaded.
     """
     import_gym_packages(request.gym_packages)
-    if request.path is not None:
-        return _model_at(request.path, request)
+    if request.path is None:
+        chosen = _newest(request)
+    else:
+        chosen = _model_at(model_at(request.path, request.which), request)
+    return _checked_statistics(chosen, request)
+
+
+def _newest(request: ModelRequest) -> ChosenModel:
     algo, env_id = request.algo or "ppo", request.env_id or "CartPole-v1"
     check_algorithm(algo)
     check_env_id(env_id)
     run = Run.find(request.log_folder, algo, env_id, request.run_number)
-    path = _file_in(run, request.which)
-    if not path.exists():
-        raise UserError(f"{run.path} holds no {path.name}: its training may not have ended")
-    check_model_file(path)
-    return ChosenModel(path, _spec(algo, env_id, run, request), run)
-
-
-def _file_in(run: Run, which: str | int) -> Path:
-    if isinstance(which, int):
-        return run.checkpoint_path(which)
-    if which == "best":
-        return run.best_model_path
-    if which == "last checkpoint":
-        checkpoints = run.checkpoints()
-        if not checkpoints:
-            raise UserError(f"{run.path} holds no checkpoint: train with --save-freq")
-        return checkpoints[-1]
-    return run.model_path
+    path = model_of(run, request.which)
+    return ChosenModel(path, _spec(algo, env_id, recorded_run(run), request), run)
 
 
 def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
-    check_model_file(path)
-    run = run_of(path)
-    recorded = {} if run is None else run.recorded_spec()
+    run = run_around(path)
+    recorded = recorded_run(run)
     hand_written = hand_written_algorithm(path)
-    algo = request.algo or hand_written or recorded.get("algo")
-    env_id = request.env_id or recorded.get("env_id")
+    algo = request.algo or hand_written or recorded.algo
+    env_id = request.env_id or recorded.env_id
     if algo is None or env_id is None:
         missing = "--algo" if algo is None else "--env"
         raise UserError(f"{path} lies in no run folder: say what it is with {missing}")
     check_algorithm(algo)
-    check_env_id(env_id)
+    _check_known(env_id, recorded, request)
     if hand_written is None and not request.is_trusted:
         check_origin(path, request.log_folder)
-    return ChosenModel(path, _spec(algo, env_id, run, request), run)
+    return ChosenModel(path, _spec(algo, env_id, recorded, request), run)
 
 
-def _spec(algo: str, env_id: str, run: Run | None, request: ModelRequest) -> TrainSpec:
-    """The settings of the run, or the default ones where there is none."""
-    recorded = {} if run is None else run.recorded_spec()
-    raw = recorded.get("hyperparams") or read_hyperparams(algo, env_id)
-    raw = {**raw, "env_kwargs": {**(raw.get("env_kwargs") or {}), **request.env_kwargs}}
+def _check_known(env_id: str, recorded: RecordedRun, request: ModelRequest) -> None:
+    """Make sure that the environment is registered; modules that a file names are not imported."""
+    module = env_id.rpartition(":")[0]
+    if request.env_id is None and module not in ("", "envs", *request.gym_packages):
+        raise UserError(
+            f"the model was trained on {env_id}: modules are imported only where you name them, "
+            f"with --env {env_id}"
+        )
+    try:
+        check_env_id(env_id)
+    except UserError as error:
+        packages = [name for name in recorded.gym_packages if name not in request.gym_packages]
+        if not packages:
+            raise
+        raise UserError(
+            f"{error}; the model was trained with --gym-packages {' '.join(packages)}"
+        ) from error
+
+
+def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) -> TrainSpec:
+    """How the environments are made, by the order at the head of this module."""
+    raw = recorded.hyperparams
+    if raw is None:
+        raw = _without_normalize(algo, env_id)
+    # Where episodes are judged, these win over all others.
+    raw = {**raw, "eval_env_kwargs": {**(raw.get("eval_env_kwargs") or {}), **request.env_kwargs}}
     return TrainSpec(
         algo=algo,
         env_id=env_id,
@@ -132,5 +163,33 @@ def _spec(algo: str, env_id: str, run: Run | None, request: ModelRequest) -> Tra
         saved_hyperparams=raw,
         seed=request.seed,
         device=request.device,
-        gym_packages=(*recorded.get("gym_packages", ()), *request.gym_packages),
+        gym_packages=(*(recorded.gym_packages if recorded.is_own else ()), *request.gym_packages),
     )
+
+
+def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
+    """The default settings; whether a model was trained on normalised observations is its own."""
+    try:
+        entry = read_hyperparams(algo, env_id)
+    except NoEntryError:
+        return {}
+    return {key: value for key, value in entry.items() if key != "normalize"}
+
+
+def _checked_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
+    """The model with the statistics that it is played with, which are there and may be read."""
+    path, normalize = request.statistics, chosen.spec.hyperparams.normalize
+    if path is not None and not path.is_file():
+        raise UserError(f"no such file of statistics: {path}")
+    path = path or chosen.statistics
+    if path is None:
+        if normalize is not None and normalize.get("norm_obs", True):
+            raise UserError(
+                f"{chosen.path} was trained on normalised observations, and the statistics of them "
+                "are not there: name their file with --vec-normalize"
+            )
+        return chosen
+    if not request.is_trusted:
+        check_origin(path, request.log_folder, what=STATISTICS)
+    spec = normalising(chosen.spec, read_statistics(path).settings)
+    return ChosenModel(chosen.path, spec, chosen.run, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,11 @@ from pipeline.run_folder import Run
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
+
+# What is done with files that are unpickled.
+LIBRARY_ZIP = "loading a zip of a library agent"
+STATISTICS = "reading statistics of VecNormalize"
+REPLAY_BUFFER = "reading a replay buffer"
 
 
 def check_model_file(path: Path) -> None:
@@ -36,21 +42,24 @@ def check_model_file(path: Path) -> None:
         raise UserError(f"{path} is no whole zip of an agent: it lacks parts that one has")
 
 
-def check_origin(path: Path, log_folder: Path, given: Path | None = None) -> None:
-    """Make sure that a zip of one of the library's agents lies where our own runs do.
+def check_origin(
+    path: Path, log_folder: Path, given: Path | None = None, what: str = LIBRARY_ZIP
+) -> None:
+    """Make sure that a file that can run code lies where our own runs do.
 
     Args:
-        path: the zip.
+        path: the file.
         log_folder: the folder above all runs.
-        given: what to call the zip in a mistake; by default its path.
+        given: what to call the file in a mistake; by default its path.
+        what: what is about to be done with it: `LIBRARY_ZIP`, `STATISTICS` or `REPLAY_BUFFER`.
 
     Raises:
         UserError: if it lies elsewhere.
     """
     if not path.resolve().is_relative_to(log_folder.resolve()):
         raise UserError(
-            f"{given or path} lies outside {log_folder}, and loading a zip of a library agent can "
-            "run code that is hidden in it: add --trust if you know where it comes from"
+            f"{given or path} lies outside {log_folder}, and {what} can run code that is hidden in "
+            "it: add --trust if you know where it comes from"
         )
 
 
@@ -77,6 +86,79 @@ def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) 
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
         raise UserError(f"{path} cannot be loaded as a {algo} agent: {one_line(error)}") from error
+
+
+def load_to_play(algo: str, path: Path, env: VecEnv, device: str = "auto") -> BaseAlgorithm:
+    """As `load_model`, for an agent that is not to learn any more.
+
+    What only learning needs is left out: a replay buffer, and schedules, which zips of older
+    versions of Python hold as functions that cannot be read. Observations may have other bounds.
+
+    Raises:
+        UserError: as `load_model`; and if the agent was trained on observations of another shape.
+    """
+    check_model_file(path)
+    if hand_written_algorithm(path) is not None:
+        return load_model(algo, path, env, device=device)
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+    from stable_baselines3.common.utils import ConstantSchedule
+
+    saved, given = _saved_observation(path), _shown_space(vars(env.observation_space))
+    if saved != given and saved is not None:
+        raise UserError(
+            f"{path} was trained on observations of {saved}, and the environment as it is made "
+            f"here gives {given}: args.yml and config.yml beside the zip would say how it was made "
+            "there, or --env-kwargs"
+        )
+    unused = ConstantSchedule(0.0)
+    replaced: dict[str, Any] = {"learning_rate": 0.0, "lr_schedule": unused, "clip_range": unused}
+    if saved is not None:
+        replaced["observation_space"] = env.observation_space
+    small = {"buffer_size": 1, "optimize_memory_usage": False}
+    extra = small if issubclass(load_algorithm(algo), OffPolicyAlgorithm) else {}
+    return load_model(algo, path, env, device=device, custom_objects=replaced, **extra)
+
+
+def _saved_observation(path: Path) -> str | None:
+    """What a library's zip says of the space that its agent observes; None if nothing plain."""
+    with zipfile.ZipFile(path) as archive:
+        data = json.loads(archive.read("data"))
+    space = data.get("observation_space") if isinstance(data, dict) else None
+    return _shown_space(space) if isinstance(space, dict) else None
+
+
+def _shown_space(attributes: Mapping[str, Any]) -> str | None:
+    if "n" in attributes:
+        return f"{attributes['n']} kinds"
+    shape = attributes.get("_shape")
+    return f"shape {tuple(shape)}" if shape else None
+
+
+def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
+    """Give an agent the replay buffer in a file, where it is of a kind that has one.
+
+    The file is unpickled, which can run code: load those that you trust.
+
+    Raises:
+        UserError: if it cannot be read, or was filled by other environments than the agent's.
+    """
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    if not isinstance(model, OffPolicyAlgorithm):
+        return
+    try:
+        model.load_replay_buffer(path)
+    except Exception as error:  # a pickle can fail in any way
+        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+    buffer: Any = model.replay_buffer
+    if buffer.n_envs != model.n_envs:
+        raise UserError(
+            f"{path} was filled by {buffer.n_envs} environments at once, and cannot be by "
+            f"{model.n_envs}: give -params n_envs:{buffer.n_envs}"
+        )
+    for kind in ("observation_space", "action_space"):
+        if getattr(buffer, kind) != getattr(model, kind):
+            raise UserError(f"{path} was filled by environments of another {kind}")
 
 
 def run_of(path: Path) -> Run | None:

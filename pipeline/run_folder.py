@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,17 +74,23 @@ class Run:
 
     @classmethod
     def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
-        """The run of that number, or the newest where the number is 0.
+        """The run of that number, the newest where it is 0, that without a number where it is -1.
+
+        The one without a number lies in ``<log folder>/<algo>/`` itself, and is also the newest
+        where no other is, as in rl_zoo3.
 
         Raises:
             UserError: if there is none; it names those that there are.
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
+        unnumbered = cls(log_folder / algo, name)
+        if number < 0 or (number == 0 and not runs and unnumbered.model_path.exists()):
+            return unnumbered
         if not runs:
+            command = ["python", "train.py", "--algo", algo, "--env", env_id, "-f", str(log_folder)]
             raise UserError(
-                f"no run of {algo} on {name} in {log_folder}: "
-                f"train one with: python train.py --algo {algo} --env {env_id} -f {log_folder}"
+                f"no run of {algo} on {name} in {log_folder}: train one with: {shlex.join(command)}"
             )
         if number == 0:
             return cls(runs[-1][1], name)
@@ -118,6 +125,11 @@ class Run:
             re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name) for path in self.path.iterdir()
         )
         return [self.checkpoint_path(n) for n in sorted(int(match[1]) for match in steps if match)]
+
+    @property
+    def number(self) -> int:
+        """The number in the folder's name; 0 if there is none."""
+        return _run_number(self.path.name, self.env_name)
 
     @property
     def evaluations_path(self) -> Path:
