@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from pipeline.run_folder import FINISHED, Run, numbered_runs
@@ -71,36 +72,39 @@ def print_header(console: Console, spec: TrainSpec) -> None:
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
     speed = outcome.n_steps / max(outcome.seconds, 1e-9)
-    table = Table.grid(padding=(0, 2))
     done = "trained" if outcome.state == FINISHED else "interrupted"
-    table.add_row(
-        done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)"
-    )
+    rows = [(done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)")]
     if outcome.engine:
-        table.add_row("engine", outcome.engine)
+        rows.append(("engine", outcome.engine))
     if outcome.pulls is not None:
-        table.add_row("regret", describe_pulls(outcome.pulls))
+        rows.append(("regret", describe_pulls(outcome.pulls)))
     if outcome.final is not None:
-        table.add_row("final", describe(outcome.final))
+        rows.append(("final", describe(outcome.final)))
     if outcome.best_return is not None:
-        table.add_row(
-            "best", f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
-        )
-    table.add_row("files", str(outcome.run.path))
-    table.add_row("watch", watch_command(spec, outcome.run))
+        best = f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
+        rows.append(("best", best))
+    rows.append(("files", str(outcome.run.path)))
+    table = Table.grid(padding=(0, 2))
+    for row in rows:
+        table.add_row(*map(escape, row))
     console.print(table, highlight=False)
+    # On one line, however long: it is there to be copied.
+    width = max(len(label) for label, _ in rows) + 2
+    command = f"{'watch':<{width}}{watch_command(spec, outcome.run)}"
+    console.print(command, highlight=False, markup=False, soft_wrap=True)
 
 
 def watch_command(spec: TrainSpec, run: Run) -> str:
     """The command that plays the agent of a run, as it can be typed where the run was begun."""
     command = ["python", str(Path(sys.argv[0]).with_name("enjoy.py"))]
     numbers = [number for number, _ in numbered_runs(run.path.parent, run.env_name)]
-    if numbers.count(run.number) != 1 or run.path.parent != spec.log_folder / spec.algo:
+    if numbers.count(run.number) > 1:  # told apart by their unique suffixes alone
         command.append(str(run.path))
     else:
         command += ["--algo", spec.algo, "--env", spec.env_id]
         command += [] if str(spec.log_folder) == "logs" else ["-f", str(spec.log_folder)]
-        command += [] if run.number == numbers[-1] else ["--exp-id", str(run.number)]
+        newest = max(numbers, default=run.number)
+        command += [] if run.number == newest else ["--exp-id", str(run.number)]
     if spec.gym_packages:
         command += ["--gym-packages", *spec.gym_packages]
     return shlex.join(command)

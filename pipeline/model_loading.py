@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -81,7 +82,10 @@ def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) 
     check_model_file(path)
     algorithm = load_algorithm(algo)
     try:
-        return algorithm.load(path, env=env, **kwargs)
+        with warnings.catch_warnings():
+            # Said of the buffer that the library itself chose when the agent was made.
+            warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
+            return algorithm.load(path, env=env, **kwargs)
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
