@@ -43,5 +43,5 @@ def _names_a_file(env_kwargs: object) -> bool:
 
 def _is_grid_world(env_id: str) -> bool:
     entry_point = gym.spec(env_id.rpartition(":")[2]).entry_point
-    creator = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    creator: object = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
     return isinstance(creator, type) and issubclass(creator, GridWorld)

@@ -123,11 +123,21 @@ def load_to_play(algo: str, path: Path, env: VecEnv, device: str = "auto") -> Ba
     return load_model(algo, path, env, device=device, custom_objects=replaced, **extra)
 
 
+def _plain_data(path: Path) -> dict[str, Any]:
+    """The JSON that a zip of any agent holds; what is pickled in it stays text."""
+    with zipfile.ZipFile(path) as archive:
+        try:
+            data = json.loads(archive.read("data"))
+        except (ValueError, RecursionError) as error:
+            raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
+    if not isinstance(data, dict):
+        raise UserError(f"{path} is no whole zip of an agent: its data maps no names to values")
+    return data
+
+
 def _saved_observation(path: Path) -> str | None:
     """What a library's zip says of the space that its agent observes; None if nothing plain."""
-    with zipfile.ZipFile(path) as archive:
-        data = json.loads(archive.read("data"))
-    space = data.get("observation_space") if isinstance(data, dict) else None
+    space = _plain_data(path).get("observation_space")
     return _shown_space(space) if isinstance(space, dict) else None
 
 
@@ -180,9 +190,11 @@ def hand_written_algorithm(path: Path) -> str | None:
     """The name of the hand-written agent that a zip says it holds, or None for the library's.
 
     Reads plain JSON and nothing else.
+
+    Raises:
+        UserError: if that is damaged.
     """
-    with zipfile.ZipFile(path) as archive:
-        class_name = json.loads(archive.read("data")).get("algorithm")
+    class_name = _plain_data(path).get("algorithm")
     for name, entry in ALGORITHMS.items():
         if isinstance(class_name, str) and entry.entry_point.endswith(f":{class_name}"):
             return name

@@ -10,6 +10,8 @@ from pipeline.companions import replay_buffer_of, statistics_of
 from pipeline.continuation import agent_to_continue
 from pipeline.errors import UserError
 from pipeline.model_choice import ModelRequest, choose_model
+from pipeline.model_loading import load_to_play
+from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
@@ -165,6 +167,14 @@ def test_a_replay_buffer_goes_on(replayed, tmp_path):
     # An update follows every fourth step, and training ends with one.
     assert after.pos == 252
     np.testing.assert_array_equal(after.observations[:200], before.observations[:200])
+
+
+def test_playing_needs_no_replay_buffer(replayed):
+    request = ModelRequest(replayed.model_path, log_folder=replayed.path, device="cpu")
+    chosen = choose_model(request)
+    env = playing_env(chosen, None)
+    assert load_to_play("dqn", chosen.path, env).replay_buffer.buffer_size == 1
+    env.close()
 
 
 def test_a_replay_buffer_of_other_environments(replayed, tmp_path):

@@ -3,8 +3,10 @@
 The folders are made with the library alone, as rl_zoo3 and the hubs make them.
 """
 
+import json
 from collections import OrderedDict
 from pathlib import Path
+from zipfile import ZipFile
 
 import gymnasium as gym
 import numpy as np
@@ -206,6 +208,31 @@ def test_statistics_that_the_log_folder_only_links_to_want_trust(zoo, tmp_path):
     )
     with pytest.raises(UserError, match=r"lies outside .*logs, and reading statistics"):
         choose_model(ModelRequest(run / "a2c-CartPole-v1.zip", log_folder=logs))
+
+
+def test_bounds_and_schedules_of_other_versions_do_not_matter(tmp_path):
+    model = A2C("MlpPolicy", "CartPole-v1", seed=0, policy_kwargs={"net_arch": [4]})
+    model.observation_space = gym.spaces.Box(-9, 9, (4,))
+    model.save(tmp_path / "new.zip")
+    with ZipFile(tmp_path / "new.zip") as new, ZipFile(tmp_path / "old.zip", "w") as old:
+        for name in new.namelist():
+            content = new.read(name)
+            if name == "data":
+                data = json.loads(content)
+                data["lr_schedule"][":serialized:"] = "AAAA"  # as of a Python that is gone
+                content = json.dumps(data)
+            old.writestr(name, content)
+    request = ModelRequest(tmp_path / "old.zip", "a2c", "CartPole-v1", is_trusted=True)
+    assert len(returns_of(request, 2)) == 2
+
+
+@pytest.mark.parametrize("data", ["no JSON", "[1]", "[" * 100_000])
+def test_a_zip_that_holds_no_agent(tmp_path, data):
+    with ZipFile(tmp_path / "odd.zip", "w") as archive:
+        archive.writestr("data", data)
+        archive.writestr("policy.pth", "")
+    with pytest.raises(UserError, match=r"odd\.zip is no whole zip of an agent"):
+        choose_model(ModelRequest(tmp_path / "odd.zip"))
 
 
 # --- modules and files that only a folder names --------------------------------------------------
