@@ -11,6 +11,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents import load_algorithm
 from pipeline.companions import replay_buffer_of, statistics_of
 from pipeline.model_finding import model_at
 from pipeline.model_loading import (
@@ -77,8 +78,13 @@ def load_to_continue(
     Raises:
         UserError: if it cannot be loaded so.
     """
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
     # The networks are those of the file: their shape cannot change.
     kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
+    if "n_steps" in kwargs and issubclass(load_algorithm(spec.algo), OffPolicyAlgorithm):
+        # The library chooses a kind of buffer by it, and would leave that of the file.
+        kwargs = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **kwargs}
     model = load_model(spec.algo, trained_agent, env, device=spec.device, **kwargs)
     replay_buffer = replay_buffer_of(trained_agent)
     if replay_buffer is not None:

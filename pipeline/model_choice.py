@@ -14,7 +14,7 @@ Statistics of VecNormalize are used wherever there are some that belong to the m
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,12 +154,13 @@ def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) 
     raw = recorded.hyperparams
     if raw is None:
         raw = _without_normalize(algo, env_id)
+    hyperparams = split(raw)
     # Where episodes are judged, these win over all others.
-    raw = {**raw, "eval_env_kwargs": {**(raw.get("eval_env_kwargs") or {}), **request.env_kwargs}}
+    env_kwargs = {**hyperparams.eval_env_kwargs, **request.env_kwargs}
     return TrainSpec(
         algo=algo,
         env_id=env_id,
-        hyperparams=split(raw),
+        hyperparams=replace(hyperparams, eval_env_kwargs=env_kwargs),
         saved_hyperparams=raw,
         seed=request.seed,
         device=request.device,

@@ -160,6 +160,7 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
 
     if not isinstance(model, OffPolicyAlgorithm):
         return
+    wanted: Any = model.replay_buffer
     try:
         model.load_replay_buffer(path)
     except Exception as error:  # a pickle can fail in any way
@@ -173,6 +174,10 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
     for kind in ("observation_space", "action_space"):
         if getattr(buffer, kind) != getattr(model, kind):
             raise UserError(f"{path} was filled by environments of another {kind}")
+    kinds = [(type(one).__name__, getattr(one, "n_steps", 1)) for one in (buffer, wanted)]
+    if kinds[0] != kinds[1]:
+        found, needed = (f"{name} with n_steps {n_steps}" for name, n_steps in kinds)
+        raise UserError(f"{path} holds a {found}; these hyperparameters need a {needed}")
 
 
 def run_of(path: Path) -> Run | None:

@@ -84,9 +84,13 @@ def recorded_run(run: Run | None) -> RecordedRun:
         return RecordedRun()
     spec = run.recorded_spec()
     if spec:
-        packages = tuple(spec.get("gym_packages") or ())
+        entry = spec.get("hyperparams")
         return RecordedRun(
-            spec.get("algo"), spec.get("env_id"), spec.get("hyperparams"), packages, is_own=True
+            _text(spec.get("algo")),
+            _text(spec.get("env_id")),
+            entry if isinstance(entry, dict) else None,
+            _texts(spec.get("gym_packages")),
+            is_own=True,
         )
     if not _has_settings(run.params_path):
         return RecordedRun()

@@ -184,6 +184,20 @@ def test_a_replay_buffer_of_other_environments(replayed, tmp_path):
     assert not logs.exists()
 
 
+def test_the_kind_of_buffer_follows_the_new_entry(tmp_path):
+    """Returns of several steps take another kind, which the library writes into the zip."""
+    first = train_to(tmp_path, "dqn", {**DQN, "n_steps": 3}, 40, eval_freq=-1)
+    fields = {"trained_agent": first.model_path, "eval_freq": -1, "save_replay_buffer": True}
+    for n_steps, kind in ((1, "ReplayBuffer"), (2, "NStepReplayBuffer")):
+        run = train_to(tmp_path, "dqn", {**DQN, "n_steps": n_steps}, 20, **fields)
+        buffer = read(run.path / "replay_buffer.pkl")
+        assert (type(buffer).__name__, getattr(buffer, "n_steps", 1)) == (kind, n_steps)
+    fields["trained_agent"] = run.model_path
+    said = "holds a NStepReplayBuffer with n_steps 2; these hyperparameters need a ReplayBuffer"
+    with pytest.raises(UserError, match=said):
+        train_to(tmp_path, "dqn", {**DQN, "n_steps": 1}, 20, **fields)
+
+
 def test_none_is_kept_unless_asked_for_or_where_there_is_none(tmp_path):
     for algo, entry, asked in (("dqn", DQN, False), ("a2c", A2C, True)):
         run = train_to(

@@ -353,3 +353,18 @@ def test_each_environment_plays_its_share():
     assert Memory.starts[:2] == [[True, True], [True, False]]
     assert [start for _, start in Memory.starts].count(True) == 3
     assert len(list(play_episodes(Memory(), env, None, 6))) == 3
+
+
+@pytest.mark.parametrize(
+    "settings", ["{eval_env_kwargs: 5}", "{normalize: [1]}", "{frame_stack: x}"]
+)
+def test_settings_that_make_no_sense(zoo, tmp_path, settings):
+    folder = hub(zoo, tmp_path, "args.yml")
+    (folder / "config.yml").write_text(settings)
+    with pytest.raises(UserError, match=settings.strip("{").partition(":")[0]):
+        choose_model(
+            ModelRequest(folder, is_trusted=True, env_kwargs={"sutton_barto_reward": True})
+        )
+    (folder / "run.json").write_text('{"env_name": "X", "spec": {"algo": 1, "hyperparams": 7}}')
+    with pytest.raises(UserError, match="say what it is with --algo"):
+        choose_model(ModelRequest(folder, is_trusted=True))
