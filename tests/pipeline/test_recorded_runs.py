@@ -367,4 +367,4 @@ def test_settings_that_make_no_sense(zoo, tmp_path, settings):
         )
     (folder / "run.json").write_text('{"env_name": "X", "spec": {"algo": 1, "hyperparams": 7}}')
     with pytest.raises(UserError, match="say what it is with --algo"):
-        choose_model(ModelRequest(folder, is_trusted=True))
+        choose_model(ModelRequest(folder / "a2c-CartPole-v1.zip", is_trusted=True))
