@@ -13,6 +13,7 @@ examples:
   python enjoy.py --env FrozenLake-v1 --algo qlearning --load-best --n-episodes 1000 --render none
   python enjoy.py --env Warehouse-v0 --algo sarsa --record route.gif --n-episodes 1
   python enjoy.py logs/dqn/CartPole-v1_3/rl_model_20000_steps.zip
+  python enjoy.py --algo ppo --env MountainCar-v0 -f rl-trained-agents
 """
 
 
@@ -25,15 +26,30 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("model", nargs="?", help="path of a model zip, instead of looking for a run")
+    add("model", nargs="?", help="path of a model zip or run folder, instead of looking for a run")
     add("--algo", help="agent (default: ppo, or what the zip's run folder says)")
     add("--env", help="environment id (default: CartPole-v1, or what the run folder says)")
     add("-f", "--folder", default="logs", help="folder above all runs (default: logs)")
-    add("--exp-id", type=int, default=0, metavar="N", help="number of the run (default: newest)")
+    add(
+        "--exp-id",
+        type=int,
+        default=0,
+        metavar="N",
+        help="number of the run (default: 0, the newest; -1 for FOLDER/ALGO/ENV.zip itself)",
+    )
     add("--load-best", action="store_true", help="the model that evaluated best in training")
     add("--load-checkpoint", type=int, metavar="STEPS", help="the checkpoint after that many steps")
     add("--load-last-checkpoint", action="store_true", help="the last checkpoint")
-    add("--trust", action="store_true", help="load a library zip from outside the log folder")
+    add(
+        "--vec-normalize",
+        metavar="FILE",
+        help="statistics of VecNormalize (default: those that lie with the model)",
+    )
+    add(
+        "--trust",
+        action="store_true",
+        help="load a library zip, or statistics, from outside the log folder",
+    )
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=int, default=1, help="torch threads (default: 1)")
     _add_playing_flags(parser)
@@ -43,7 +59,19 @@ def build_parser() -> argparse.ArgumentParser:
 def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("playing").add_argument
     add("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="stop after so many steps")
-    add("--n-episodes", type=int, default=10, metavar="N", help="episodes to play (default: 10)")
+    add(
+        "--n-episodes",
+        type=int,
+        metavar="N",
+        help="episodes to play (default: 10, or as many as end within the steps of -n)",
+    )
+    add(
+        "--n-envs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="environments to play on at once, each an equal share of the episodes (default: 1)",
+    )
     policy = parser.add_mutually_exclusive_group()
     policy.add_argument(
         "--deterministic", action="store_true", help="the policy's best actions (default)"
@@ -57,19 +85,31 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     )
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
     add("--record", metavar="FILE", help="write a film, .gif or .mp4")
+    add("--reward-log", metavar="DIR", help="write the returns there too, as Monitor's CSV files")
+    add("--verbose", type=int, default=1, help="0 for no output (default: 1)")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
+    _add_flags_of_rl_zoo3(parser)
+
+
+def _add_flags_of_rl_zoo3(parser: argparse.ArgumentParser) -> None:
+    """Flags of its command that have nothing to do here; `check_playing` says so."""
+    for flags in (["--norm-reward"], ["-P", "--progress"]):
+        parser.add_argument(*flags, action="store_true", help=argparse.SUPPRESS)
+    # It always does what this flag asks for, and so does this command.
+    parser.add_argument("--custom-objects", action="store_true", help=argparse.SUPPRESS)
 
 
 def main() -> int:
     """Parse the arguments and play; the exit code."""
     args = build_parser().parse_args()
-    from commands.enjoy_request import model_request
+    from commands.enjoy_request import check_playing, model_request
     from pipeline.errors import UserError
     from pipeline.filming import check_film_path
     from pipeline.model_choice import choose_model
     from pipeline.run_folder import NoRunError
 
+    check_playing(args)
     film = None if args.record is None else Path(args.record)
     if film is not None:
         check_film_path(film)
@@ -80,13 +120,17 @@ def main() -> int:
         raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error
     from commands.playing_output import PlayingRequest, play
 
+    n_steps = args.n_timesteps if args.n_timesteps >= 0 else None
     request = PlayingRequest(
-        n_episodes=args.n_episodes,
-        n_steps=args.n_timesteps if args.n_timesteps >= 0 else None,
+        n_episodes=10 if args.n_episodes is None and n_steps is None else args.n_episodes,
+        n_steps=n_steps,
+        n_envs=args.n_envs,
         deterministic=not args.stochastic,
         render=args.render,
         film=film,
+        monitor_folder=Path(args.reward_log) if args.reward_log else None,
         num_threads=args.num_threads,
+        verbose=args.verbose,
     )
     play(chosen, request)
     return 0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Literal
 
+from pipeline.errors import UserError
 from pipeline.model_choice import ModelRequest
+from pipeline.model_finding import Which
 from pipeline.settings.literals import parse_assignments
 from pipeline.user_modules import import_typed
 
@@ -26,6 +27,7 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
         run_number=args.exp_id,
         which=_which(args),
         is_trusted=args.trust,
+        statistics=None if args.vec_normalize is None else Path(args.vec_normalize),
         env_kwargs=parse_assignments(args.env_kwargs),
         user_modules=import_typed(args.gym_packages, [args.env or ""]),
         seed=args.seed,
@@ -33,7 +35,24 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
     )
 
 
-def _which(args: argparse.Namespace) -> Literal["final", "best", "last checkpoint"] | int:
+def check_playing(args: argparse.Namespace) -> None:
+    """Refuse what cannot be done, in one line that says what can.
+
+    Raises:
+        UserError: if it is asked for.
+    """
+    if args.norm_reward:
+        raise UserError("--norm-reward: returns are those of the environment, never normalised")
+    if args.progress:
+        raise UserError("-P: there is no bar; each episode is printed as it ends")
+    if args.n_envs < 1:
+        raise UserError(f"--n-envs must be at least 1, not {args.n_envs}")
+    if args.n_envs > 1 and (args.record is not None or args.render in ("human", "ansi")):
+        flag = "--record" if args.record is not None else f"--render {args.render}"
+        raise UserError(f"{flag} shows one environment: leave out --n-envs")
+
+
+def _which(args: argparse.Namespace) -> Which:
     if args.load_best:
         return "best"
     if args.load_checkpoint is not None:

@@ -17,7 +17,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator, why_not_exact
 from pipeline.filming import write_film
 from pipeline.model_choice import ChosenModel
-from pipeline.model_loading import load_model
+from pipeline.model_loading import load_to_play
 from pipeline.playing import KEPT_MODES, FrameTaker, RenderMode, play_episodes, playing_env
 from pipeline.train_spec import TrainSpec
 
@@ -27,28 +27,34 @@ class PlayingRequest:
     """How an agent is to be played.
 
     Attributes:
-        n_episodes: episodes to play.
-        n_steps: steps to play at most, or None for any number.
+        n_episodes: episodes to play, or None for any number.
+        n_steps: steps to play at most, over all environments, or None for any number.
+        n_envs: environments to play on at once.
         deterministic: the policy's best actions rather than samples of them.
         render: how to watch: ``"human"``, ``"ansi"``, ``"none"``, or None for a window where there
             is a display to show it on.
         film: a file to write a film to, instead, or None.
+        monitor_folder: where to write the returns of the episodes, or None.
         num_threads: torch threads.
+        verbose: 0 for no output.
     """
 
-    n_episodes: int = 10
+    n_episodes: int | None = 10
     n_steps: int | None = None
+    n_envs: int = 1
     deterministic: bool = True
     render: str | None = None
     film: Path | None = None
+    monitor_folder: Path | None = None
     num_threads: int = 1
+    verbose: int = 1
 
     @property
     def mode(self) -> RenderMode | None:
         """The render mode of the environment."""
         if self.film is not None:
             return "rgb_array"
-        if self.render == "none":
+        if self.render == "none" or (self.render is None and self.n_envs > 1):
             return None
         if self.render == "ansi":
             return "ansi"
@@ -89,10 +95,10 @@ def play(chosen: ChosenModel, request: PlayingRequest) -> None:
         UserError: if the model cannot be loaded or the environment cannot be rendered so.
     """
     th.set_num_threads(request.num_threads)
-    console = Console(highlight=False)
-    env = playing_env(chosen, request.mode)
+    console = Console(highlight=False, quiet=request.verbose < 1)
+    env = playing_env(chosen, request.mode, request.n_envs, request.monitor_folder)
     spec = chosen.spec
-    model = load_model(spec.algo, chosen.path, env, device=spec.device)
+    model = load_to_play(spec.algo, chosen.path, env, spec.device)
     env.seed(spec.seed)
     show = _Show(console, request.mode, FrameTaker(env))
     returns, lengths = [], []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -9,7 +10,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from commands.parsing import called_as
-from pipeline.run_folder import FINISHED
+from pipeline.run_folder import FINISHED, Run, numbered_runs
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import as_flag
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from pipeline.evaluation.sampled import Evaluation
     from pipeline.pull_recording import PullSummary
     from pipeline.training import Outcome
+
+_LONGEST_SETTING = 200
 
 
 def describe(evaluation: Evaluation) -> str:
@@ -62,31 +65,51 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     console.print(
         f"[bold]{spec.algo}[/] on [bold]{spec.env_id}[/], seed {spec.seed}, {budget:,} {unit}"
     )
-    settings = "  ".join(f"{key}={value}" for key, value in spec.saved_hyperparams.items())
+    settings = "  ".join(f"{key}={_brief(value)}" for key, value in spec.saved_hyperparams.items())
     console.print(f"[dim]{settings}[/]", highlight=False)
 
 
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
     speed = outcome.n_steps / max(outcome.seconds, 1e-9)
-    table = Table.grid(padding=(0, 2))
     done = "trained" if outcome.state == FINISHED else "interrupted"
-    table.add_row(
-        done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)"
-    )
+    rows = [(done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)")]
     if outcome.engine:
-        table.add_row("engine", outcome.engine)
+        rows.append(("engine", outcome.engine))
     if outcome.pulls is not None:
-        table.add_row("regret", describe_pulls(outcome.pulls))
+        rows.append(("regret", describe_pulls(outcome.pulls)))
     if outcome.final is not None:
-        table.add_row("final", describe(outcome.final))
+        rows.append(("final", describe(outcome.final)))
     if outcome.best_return is not None:
-        table.add_row(
-            "best", f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
-        )
-    table.add_row("files", str(outcome.run.path))
-    folder = "" if str(spec.log_folder) == "logs" else f" -f {spec.log_folder}"
-    modules = as_flag(spec.user_modules, spec.env_id)
-    watch = f"{called_as('enjoy')} --algo {spec.algo} --env {spec.env_id}{folder}{modules}"
-    table.add_row("watch", escape(watch))
+        best = f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
+        rows.append(("best", best))
+    rows.append(("files", str(outcome.run.path)))
+    table = Table.grid(padding=(0, 2))
+    for row in rows:
+        table.add_row(*map(escape, row))
     console.print(table, highlight=False)
+    # On one line, however long: it is there to be copied.
+    width = max(len(label) for label, _ in rows) + 2
+    command = f"{'watch':<{width}}{watch_command(spec, outcome.run)}"
+    console.print(command, highlight=False, markup=False, soft_wrap=True)
+
+
+def watch_command(spec: TrainSpec, run: Run) -> str:
+    """The command that plays the agent of a run, as it can be typed where the run was begun."""
+    command: list[str] = []
+    numbers = [number for number, _ in numbered_runs(run.path.parent, run.env_name)]
+    if numbers.count(run.number) > 1:  # told apart by their unique suffixes alone
+        command.append(str(run.path))
+    else:
+        command += ["--algo", spec.algo, "--env", spec.env_id]
+        command += [] if str(spec.log_folder) == "logs" else ["-f", str(spec.log_folder)]
+        newest = max(numbers, default=run.number)
+        command += [] if run.number == newest else ["--exp-id", str(run.number)]
+    flag = as_flag(spec.user_modules, spec.env_id)
+    return f"{called_as('enjoy')} {shlex.join(command)}{flag}"
+
+
+def _brief(value: object) -> str:
+    """A setting as the header shows it; a whole map would fill the screen."""
+    text = str(value)
+    return text if len(text) <= _LONGEST_SETTING else f"{text[:_LONGEST_SETTING]}..."

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from dataclasses import fields, replace
+from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
@@ -84,6 +85,7 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
         if len(set(names)) < len(names):
             raise UserError(f"{flag} names one of them twice")
     agents, environments = ", ".join(args.algos), ", ".join(args.env)
+    folders = "-".join(map(environment_name, args.env))
     return StudySpec(
         name=file_name(
             f"{'-'.join(map(environment_name, args.env))}_{'-'.join(args.algos)}",

@@ -63,7 +63,16 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         help="environment arguments for evaluation alone",
     )
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
-    add("-i", "--trained-agent", default="", metavar="ZIP", help="go on training this agent")
+    add(
+        "-i",
+        "--trained-agent",
+        default="",
+        metavar="ZIP",
+        help="go on with this agent (a zip or run folder) for -n further steps, in a new run "
+        "folder: its statistics, replay buffer, step counter and schedules go on, and "
+        "hyperparameters are those given here, or of the file",
+    )
+    add("--trust", action="store_true", help="let -i load what can run code from outside -f")
     add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=int, default=1, help="torch threads (default: 1)")
@@ -75,6 +84,7 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add("--eval-episodes", type=int, default=20, metavar="N", help="episodes of each (default: 20)")
     add("--n-eval-envs", type=int, default=10, metavar="N", help="environments for it (10)")
     add("--save-freq", type=int, default=-1, metavar="N", help="steps between checkpoints")
+    add("--save-replay-buffer", action="store_true", help="save it too, where the agent has one")
     add("-f", "--log-folder", default="logs", help="folder above all runs (default: logs)")
     add("-uuid", "--uuid", action="store_true", help="add a unique id to the run folder's name")
     add("-tb", "--tensorboard-log", default="", metavar="DIR", help="write TensorBoard logs there")

@@ -12,6 +12,7 @@ from commands.parsing import check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
+from pipeline.map_contents import with_maps_read
 from pipeline.settings.hyperparam_entries import NoEntryError, override, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.settings.literals import parse_assignments
@@ -29,12 +30,14 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     check_algorithm(args.algo)
     check_env_id(args.env)
     check_tensorboard(args.tensorboard_log)
-    raw = _raw_hyperparams(args)
-    trained_agent = Path(args.trained_agent) if args.trained_agent else None
-    if trained_agent is not None:
-        from pipeline.model_loading import check_model_file
+    raw = with_maps_read(args.env, _raw_hyperparams(args))
+    trained_agent = None
+    if args.trained_agent:
+        from pipeline.continuation import agent_to_continue
 
-        check_model_file(trained_agent)
+        trained_agent = agent_to_continue(
+            Path(args.trained_agent), Path(args.log_folder), args.trust
+        )
     # A flag that has the name of a field goes there as it is.
     named = {key.name: getattr(args, key.name) for key in fields(TrainSpec) if key.name in args}
     changed = {

@@ -122,6 +122,15 @@ def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
     return padded[1:-1, 1:-1].copy()
 
 
+def read_rows(desc: Description) -> tuple[str, ...]:
+    """The rows of a map, not checked yet; see `GridMap.read`.
+
+    Raises:
+        ValueError: if there is no such file, or it is no text.
+    """
+    return _read_rows(desc)[0]
+
+
 def _read_rows(desc: object) -> tuple[tuple[str, ...], str]:
     """The rows, and what to call the map in an error message."""
     if isinstance(desc, str) and "\n" in desc:

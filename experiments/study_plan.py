@@ -16,6 +16,7 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_n
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
+from pipeline.map_contents import with_maps_read
 from pipeline.model_loading import agent_class
 from pipeline.run_folder import FINISHED, Run, environment_name
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
@@ -127,7 +128,8 @@ def _planned_run(
     is_batch: bool,
 ) -> PlannedRun:
     # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
-    place = Path(file_name(agent), f"{_environment_folder(environment, spec.env_id)}_{seed + 1}")
+    folder = _environment_folder(environment, spec.env_id)
+    place = Path(file_name(agent), f"{folder}_{seed + 1}")
     spec = replace(
         spec,
         seed=seed,
@@ -215,7 +217,7 @@ def _is_compiled_bandit(algo: str) -> bool:
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
     check_algorithm(agent.algo)
-    raw = _raw_hyperparams(agent, environment)
+    raw = with_maps_read(environment.env_id, _raw_hyperparams(agent, environment))
     place = f"{agent.label} on {environment.label}"
     if study.is_quick:
         raw = _shortened(raw, study.quick.budget)

@@ -15,23 +15,32 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import ConstantSchedule
 
 from agents.common.callback_horizons import BlockCallback, Horizon
-from pipeline.model_saving import save_model
+from pipeline.companions import replay_buffer_path, statistics_path
+from pipeline.model_saving import save_model, save_normalization, save_replay_buffer
 
 
 class Checkpoint(BlockCallback):
     """Keeps the agent as it is at some moments, as ``rl_model_<steps>_steps.zip``.
 
+    Statistics of VecNormalize go with it, under the name that `CheckpointCallback` gives them.
+
     Args:
         save_path: folder to write to.
+        with_replay_buffer: write the agent's replay buffer each time too, where it has one.
     """
 
-    def __init__(self, save_path: str | Path) -> None:
+    def __init__(self, save_path: str | Path, with_replay_buffer: bool = False) -> None:
         super().__init__()
         self.save_path = Path(save_path)
+        self.with_replay_buffer = with_replay_buffer
 
     def save(self) -> None:
         """Write the agent as it is now."""
-        save_model(self.model, self.save_path / f"rl_model_{self.num_timesteps}_steps.zip")
+        path = self.save_path / f"rl_model_{self.num_timesteps}_steps.zip"
+        save_model(self.model, path)
+        save_normalization(self.model, statistics_path(path))
+        if self.with_replay_buffer:
+            save_replay_buffer(self.model, replay_buffer_path(path))
 
 
 class StepCheckpoint(Checkpoint):
@@ -41,8 +50,10 @@ class StepCheckpoint(Checkpoint):
         ValueError: if the number is below 1.
     """
 
-    def __init__(self, every_n_steps: int, save_path: str | Path) -> None:
-        super().__init__(save_path)
+    def __init__(
+        self, every_n_steps: int, save_path: str | Path, with_replay_buffer: bool = False
+    ) -> None:
+        super().__init__(save_path, with_replay_buffer)
         if every_n_steps < 1:
             raise ValueError(f"every_n_steps must be at least 1, not {every_n_steps}")
         self.every_n_steps = every_n_steps
@@ -63,13 +74,16 @@ class EpisodeCheckpoint(Checkpoint):
     Args:
         every_n_episodes: episodes between two checkpoints.
         save_path: folder to write to; in a hyperparameter file, the run's unless given.
+        with_replay_buffer: write the agent's replay buffer each time too, where it has one.
 
     Raises:
         ValueError: if the number is below 1.
     """
 
-    def __init__(self, every_n_episodes: int, save_path: str | Path) -> None:
-        super().__init__(save_path)
+    def __init__(
+        self, every_n_episodes: int, save_path: str | Path, with_replay_buffer: bool = False
+    ) -> None:
+        super().__init__(save_path, with_replay_buffer)
         if every_n_episodes < 1:
             raise ValueError(f"every_n_episodes must be at least 1, not {every_n_episodes}")
         self.every_n_episodes = every_n_episodes

@@ -119,7 +119,11 @@ def make_training_env(spec: TrainSpec, monitor_folder: Path | None) -> Any:
 
 
 def make_evaluation_env(
-    spec: TrainSpec, n_envs: int, wrap_innermost: Wrap | None = None, **extra: Any
+    spec: TrainSpec,
+    n_envs: int,
+    wrap_innermost: Wrap | None = None,
+    monitor_folder: Path | None = None,
+    **extra: Any,
 ) -> Any:
     """Environments to evaluate on, without what is meant for training alone.
 
@@ -127,12 +131,13 @@ def make_evaluation_env(
         spec: the run.
         n_envs: how many.
         wrap_innermost: a wrapper to put around each environment before all others.
+        monitor_folder: where each writes the returns of its episodes, or None.
         extra: further arguments of the environment, such as ``render_mode``.
 
     Returns:
         A VecEnv.
     """
-    return _make_vec_env(spec, n_envs, None, False, None, extra, wrap_innermost)
+    return _make_vec_env(spec, n_envs, None, False, monitor_folder, extra, wrap_innermost)
 
 
 def _make_vec_env(

@@ -11,6 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from agents.common.callback_horizons import Horizon, calls_until_multiple
+from pipeline.companions import statistics_path
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
@@ -21,8 +22,8 @@ from pipeline.run_folder import Run
 class EvaluationCallback(EvalCallback):
     """`EvalCallback` with the evaluation handed to it, and files that are never half-written.
 
-    It writes ``evaluations.npz`` and ``best_model.zip`` and feeds the same callbacks and log
-    entries as its parent.
+    It writes ``evaluations.npz`` and ``best_model.zip`` with its statistics of VecNormalize, and
+    feeds the same callbacks and log entries as its parent.
 
     Args:
         run: where the files go.
@@ -88,8 +89,7 @@ class EvaluationCallback(EvalCallback):
 
     def evaluate_now(self) -> bool:
         """Evaluate the agent as it is; False where a callback asks to stop the training."""
-        if self.model.get_vec_normalize_env() is not None:
-            sync_envs_normalization(self.training_env, self.eval_env)
+        self.take_statistics()
         evaluation = self.evaluator(self.model)
         self.last_evaluation = evaluation
         self.last_mean_reward = evaluation.mean_return
@@ -100,9 +100,15 @@ class EvaluationCallback(EvalCallback):
         if evaluation.mean_return > self.best_mean_reward:
             self.best_mean_reward = evaluation.mean_return
             self.best_timesteps = self.num_timesteps
-            save_model(self.model, self.run.best_model_path)
-            save_normalization(self.model, self.run)
+            best = self.run.best_model_path
+            save_model(self.model, best)
+            save_normalization(self.model, statistics_path(best))
         return self._on_event() if self.callback is not None else True
+
+    def take_statistics(self) -> None:
+        """Let evaluation normalise by the statistics that training has now."""
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
 
     def _append_to_file(self, evaluation: Evaluation) -> None:
         self.evaluations_timesteps.append(self.num_timesteps)

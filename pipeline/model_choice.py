@@ -1,23 +1,33 @@
-"""Finding the model to play: the newest of a run, its best, a checkpoint, or a zip by its path."""
+"""Finding the model to play, and what it is played on: the newest of a run, or one by its path.
+
+What the environment is made of comes from, the first first:
+
+1. the request: agent, environment, arguments of the environment, statistics;
+2. for hand-written agents, the zip, which says what agent it holds;
+3. what the model's folder says, see `pipeline.recorded_runs`;
+4. the entry of ``hyperparams/<algo>.yml``, apart from ``normalize``, where the folder says nothing.
+
+Statistics of VecNormalize are used wherever there are some that belong to the model, see
+`pipeline.companions`, since they lie there for no other reason than that it was trained on them.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pipeline.agent_checks import check_algorithm
+from pipeline.companions import statistics_of
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
-from pipeline.model_loading import (
-    check_model_file,
-    check_origin,
-    hand_written_algorithm,
-    run_of,
-)
+from pipeline.model_finding import Which, model_at, model_of
+from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm
+from pipeline.normalization import normalising, read_statistics
+from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
 from pipeline.run_folder import Run
-from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule, check_recorded
@@ -28,15 +38,16 @@ class ModelRequest:
     """Which model is asked for.
 
     Attributes:
-        path: a zip, instead of looking for a run.
+        path: a zip or a run folder, instead of looking for a run.
         algo: name of the agent; None for what the zip or its run folder says, or else ``"ppo"``.
         env_id: id of the environment; None for what the run folder says, or else
             ``"CartPole-v1"``.
         log_folder: the folder above all runs.
-        run_number: number of the run; 0 for the newest.
+        run_number: number of the run; 0 for the newest, -1 for one without a number.
         which: the model at the end of training, the best, that of the last checkpoint, or that of
             the checkpoint after so many steps.
-        is_trusted: load a library zip from outside the log folder, which can run code.
+        is_trusted: read what can run code from outside the log folder too.
+        statistics: a file of VecNormalize's statistics, instead of those that lie with the model.
         env_kwargs: arguments of the environment, to change those of the run.
         user_modules: modules of the user's, imported already; a run has no others imported.
         seed: of the episodes.
@@ -48,8 +59,9 @@ class ModelRequest:
     env_id: str | None = None
     log_folder: Path = Path("logs")
     run_number: int = 0
-    which: Literal["final", "best", "last checkpoint"] | int = "final"
+    which: Which = "final"
     is_trusted: bool = False
+    statistics: Path | None = None
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     user_modules: tuple[UserModule, ...] = ()
     seed: int = 0
@@ -64,11 +76,20 @@ class ChosenModel:
         path: the zip.
         spec: how its environments are made.
         run: the run folder, or None for a zip that lies elsewhere.
+        named_statistics: a file of VecNormalize's statistics to use, or None for those that lie
+            with the model.
     """
 
     path: Path
     spec: TrainSpec
     run: Run | None
+    named_statistics: Path | None = None
+
+    @property
+    def statistics(self) -> Path | None:
+        """The file of VecNormalize's statistics that it is played with, or None."""
+        params_path = None if self.run is None else self.run.params_path
+        return self.named_statistics or statistics_of(self.path, params_path)
 
 
 def choose_model(request: ModelRequest) -> ChosenModel:
@@ -77,15 +98,18 @@ def choose_model(request: ModelRequest) -> ChosenModel:
     Raises:
         UserError: if there is no such model, or it may not be loaded.
     """
-    if request.path is not None:
-        return _model_at(request.path, request)
+    if request.path is None:
+        chosen = _newest(request)
+    else:
+        chosen = _model_at(model_at(request.path, request.which), request)
+    return _checked_statistics(chosen, request)
+
+
+def _newest(request: ModelRequest) -> ChosenModel:
     algo, env_id = request.algo or "ppo", request.env_id or "CartPole-v1"
     run = _find_run(algo, env_id, request)
-    path = _file_in(run, request.which)
-    if not path.exists():
-        raise UserError(f"{run.path} holds no {path.name}: its training may not have ended")
-    check_model_file(path)
-    return ChosenModel(path, _spec(algo, env_id, run, request), run)
+    path = model_of(run, request.which)
+    return ChosenModel(path, _spec(algo, env_id, recorded_run(run), request), run)
 
 
 def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
@@ -97,34 +121,26 @@ def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
         check_algorithm(algo)
         check_env_id(env_id)
         raise
-    check_recorded(run.recorded_spec(), run.path)
+    _check_modules(run)
     check_algorithm(algo)
     check_env_id(env_id)
     return run
 
 
-def _file_in(run: Run, which: str | int) -> Path:
-    if isinstance(which, int):
-        return run.checkpoint_path(which)
-    if which == "best":
-        return run.best_model_path
-    if which == "last checkpoint":
-        checkpoints = run.checkpoints()
-        if not checkpoints:
-            raise UserError(f"{run.path} holds no checkpoint: train with --save-freq")
-        return checkpoints[-1]
-    return run.model_path
+def _check_modules(run: Run | None) -> None:
+    """Make sure that what a run needs has been imported, whoever recorded it."""
+    if run is not None:
+        packages = list(recorded_run(run).gym_packages)
+        check_recorded({"gym_packages": packages, **run.recorded_spec()}, run.path)
 
 
 def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
-    check_model_file(path)
-    run = run_of(path)
-    recorded = {} if run is None else run.recorded_spec()
-    if run is not None:
-        check_recorded(recorded, run.path)
+    run = run_around(path)
+    _check_modules(run)
+    recorded = recorded_run(run)
     hand_written = hand_written_algorithm(path)
-    algo = request.algo or hand_written or recorded.get("algo")
-    env_id = request.env_id or recorded.get("env_id")
+    algo = request.algo or hand_written or recorded.algo
+    env_id = request.env_id or recorded.env_id
     if algo is None or env_id is None:
         missing = "--algo" if algo is None else "--env"
         raise UserError(f"{path} lies in no run folder: say what it is with {missing}")
@@ -133,21 +149,52 @@ def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
     # What a zip says of itself counts where it is loaded as that, without a pickle.
     if hand_written != algo and not request.is_trusted:
         check_origin(path, request.log_folder)
-    return ChosenModel(path, _spec(algo, env_id, run, request), run)
+    return ChosenModel(path, _spec(algo, env_id, recorded, request), run)
 
 
-def _spec(algo: str, env_id: str, run: Run | None, request: ModelRequest) -> TrainSpec:
-    """The settings of the run, or the default ones where there is none."""
-    recorded = {} if run is None else run.recorded_spec()
-    raw = recorded.get("hyperparams") or read_hyperparams(algo, env_id)
-    raw = {**raw, "env_kwargs": {**(raw.get("env_kwargs") or {}), **request.env_kwargs}}
+def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) -> TrainSpec:
+    """How the environments are made, by the order at the head of this module."""
+    raw = recorded.hyperparams
+    if raw is None:
+        raw = _without_normalize(algo, env_id)
+    hyperparams = split(raw)
+    # Where episodes are judged, these win over all others.
+    env_kwargs = {**hyperparams.eval_env_kwargs, **request.env_kwargs}
     return TrainSpec(
         algo=algo,
         env_id=env_id,
-        hyperparams=split(raw),
+        hyperparams=replace(hyperparams, eval_env_kwargs=env_kwargs),
         saved_hyperparams=raw,
         seed=request.seed,
         device=request.device,
         gym_packages=tuple(module.name for module in request.user_modules),
         user_modules=request.user_modules,
     )
+
+
+def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
+    """The default settings; whether a model was trained on normalised observations is its own."""
+    try:
+        entry = read_hyperparams(algo, env_id)
+    except NoEntryError:
+        return {}
+    return {key: value for key, value in entry.items() if key != "normalize"}
+
+
+def _checked_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
+    """The model with the statistics that it is played with, which are there and may be read."""
+    path, normalize = request.statistics, chosen.spec.hyperparams.normalize
+    if path is not None and not path.is_file():
+        raise UserError(f"no such file of statistics: {path}")
+    path = path or chosen.statistics
+    if path is None:
+        if normalize is not None and normalize.get("norm_obs", True):
+            raise UserError(
+                f"{chosen.path} was trained on normalised observations, and the statistics of them "
+                "are not there: name their file with --vec-normalize"
+            )
+        return chosen
+    if not request.is_trusted:
+        check_origin(path, request.log_folder, what=STATISTICS)
+    spec = normalising(chosen.spec, read_statistics(path).settings)
+    return ChosenModel(chosen.path, spec, chosen.run, path)

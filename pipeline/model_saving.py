@@ -7,7 +7,6 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from pipeline.files import replacing
-from pipeline.run_folder import Run
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
@@ -16,9 +15,16 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
         model.save(draft)
 
 
-def save_normalization(model: BaseAlgorithm, run: Run) -> None:
+def save_normalization(model: BaseAlgorithm, path: Path) -> None:
     """Write the running statistics of VecNormalize, where the agent trains under one."""
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
-        with replacing(run.vecnormalize_path) as draft:
+        with replacing(path) as draft:
             normalization.save(str(draft))
+
+
+def save_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
+    """Write the replay buffer, where the agent has one."""
+    if getattr(model, "replay_buffer", None) is not None:
+        with replacing(path) as draft:
+            model.save_replay_buffer(draft)  # type: ignore[attr-defined]

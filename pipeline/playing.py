@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from pipeline.environments import make_evaluation_env
-from pipeline.errors import UserError, one_line
+from pipeline.errors import UserError
 from pipeline.model_choice import ChosenModel
+from pipeline.normalization import normalising, read_statistics, take_over
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -23,10 +24,22 @@ RenderMode = Literal["human", "ansi", "rgb_array"]
 KEPT_MODES: tuple[RenderMode, ...] = ("ansi", "rgb_array")
 
 
-def playing_env(chosen: ChosenModel, mode: RenderMode | None) -> VecEnv:
+def playing_env(
+    chosen: ChosenModel,
+    mode: RenderMode | None,
+    n_envs: int = 1,
+    monitor_folder: Path | None = None,
+) -> VecEnv:
     """The VecEnv that a model is played on, drawn in that render mode.
 
-    What is drawn to be handed over is kept until `FrameTaker` asks for it.
+    Observations are normalised by the statistics that belong to the model; rewards are left as they
+    are. What is drawn to be handed over is kept until `FrameTaker` asks for it.
+
+    Args:
+        chosen: the model.
+        mode: how to draw, or None.
+        n_envs: how many environments to play on at once.
+        monitor_folder: where each writes the returns of its episodes, or None.
 
     Raises:
         UserError: if the environment cannot be drawn so, or the statistics of its observations
@@ -38,11 +51,15 @@ def playing_env(chosen: ChosenModel, mode: RenderMode | None) -> VecEnv:
     extra = {} if mode is None else {"render_mode": mode}
     # A VecEnv resets a finished environment at once: frames are kept before that happens.
     wrap_innermost = keep_frames if mode in KEPT_MODES else None
-    env: VecEnv = make_evaluation_env(chosen.spec, 1, wrap_innermost=wrap_innermost, **extra)
+    statistics = None if chosen.statistics is None else read_statistics(chosen.statistics)
+    spec = chosen.spec if statistics is None else normalising(chosen.spec, statistics.settings)
+    env: VecEnv = make_evaluation_env(
+        spec, n_envs, wrap_innermost=wrap_innermost, monitor_folder=monitor_folder, **extra
+    )
     if mode is not None and mode not in env.get_attr("metadata")[0].get("render_modes", []):
-        raise UserError(f"{chosen.spec.env_id} cannot be rendered as {mode}")
-    if chosen.run is not None and chosen.run.vecnormalize_path.exists():
-        return _with_statistics(env, chosen.run.vecnormalize_path)
+        raise UserError(f"{spec.env_id} cannot be rendered as {mode}")
+    if statistics is not None:
+        take_over(env, statistics)
     return env
 
 
@@ -53,24 +70,10 @@ def keep_frames(env: Any) -> Any:
     return RenderCollection(env, pop_frames=True, reset_clean=False)
 
 
-def _with_statistics(env: VecEnv, path: Path) -> VecEnv:
-    """The environment with the statistics of training, where it normalises by some."""
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    if not isinstance(env, VecNormalize):
-        return env
-    try:
-        env = VecNormalize.load(str(path), env.venv)
-    except Exception as error:  # a pickle can fail in any way
-        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-    env.training = env.norm_reward = False
-    return env
-
-
 def play_episodes(
     model: BaseAlgorithm,
     env: VecEnv,
-    n_episodes: int,
+    n_episodes: int | None,
     n_steps: int | None = None,
     *,
     deterministic: bool = True,
@@ -80,29 +83,41 @@ def play_episodes(
 
     Args:
         model: the agent.
-        env: a VecEnv of one environment.
-        n_episodes: how many episodes.
-        n_steps: how many steps at most, over all episodes; None for any number.
+        env: a VecEnv. Each of its environments plays an equal share of the episodes, as in
+            `evaluate_policy`: were it the first to end that count, they would be the short ones.
+        n_episodes: how many episodes; None for any number.
+        n_steps: how many steps at most, over all environments; None for any number.
         deterministic: the policy's best actions rather than samples of them.
-        after_step: told after each step whether it ended an episode.
+        after_step: told after each step whether it ended an episode of the first environment.
 
     Yields:
         Return and length of each episode as it ends.
     """
     obs: Any = env.reset()
     state = None
-    starts = np.ones(1, dtype=bool)
-    steps = finished = 0
-    while finished < n_episodes and (n_steps is None or steps < n_steps):
+    starts = np.ones(env.num_envs, dtype=bool)
+    due = _shares(n_episodes, env.num_envs)
+    steps = 0
+    while any(due > 0) and (n_steps is None or steps < n_steps):
         actions, state = model.predict(
             obs, state=state, episode_start=starts, deterministic=deterministic
         )
         obs, _, starts, infos = env.step(actions)
-        steps += 1
+        steps += env.num_envs
         after_step(bool(starts[0]))
-        if starts[0]:
-            finished += 1
-            yield infos[0]["episode"]["r"], infos[0]["episode"]["l"]
+        for index in np.flatnonzero(starts & (due > 0)):
+            # Missing where a wrapper begins anew although the episode itself has not ended.
+            episode = infos[index].get("episode")
+            if episode is not None:
+                due[index] -= 1
+                yield episode["r"], episode["l"]
+
+
+def _shares(n_episodes: int | None, n_envs: int) -> Any:
+    """How many episodes each environment plays, shape (n_envs,)."""
+    if n_episodes is None:
+        return np.full(n_envs, np.inf)
+    return (n_episodes + np.arange(n_envs)) // n_envs
 
 
 class FrameTaker:

@@ -19,13 +19,15 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
+from pipeline.continuation import continuing, load_to_continue, statistics_to_continue
 from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator, why_not_exact
 from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
-from pipeline.model_loading import agent_class, load_model
+from pipeline.model_loading import agent_class
+from pipeline.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.run_folder import Run, environment_name
@@ -84,8 +86,7 @@ def set_up(
     spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
 ) -> Training:
     """Make all parts of the training, and add to ``undo`` how to remove them again."""
-    env = make_training_env(spec, run.path)
-    undo.callback(env.close)
+    spec, env = _training_env(spec, run, undo)
     model = _make_model(spec, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
@@ -119,6 +120,18 @@ def _exact_evaluator(
     return None if reason else exact
 
 
+def _training_env(spec: TrainSpec, run: Run, undo: ExitStack) -> tuple[TrainSpec, VecEnv]:
+    """What the agent is trained on; and the spec, which follows one that goes on."""
+    statistics = statistics_to_continue(spec)
+    if statistics is not None:
+        spec = continuing(spec, statistics)
+    env = make_training_env(spec, run.path)
+    undo.callback(env.close)
+    if statistics is not None:
+        take_over(env, statistics)
+    return spec, env
+
+
 def _evaluation(
     spec: TrainSpec,
     run: Run,
@@ -146,9 +159,10 @@ def _named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[Ba
     )
     _check_callbacks(spec, model, callbacks)
     if spec.save_freq > 0:
-        callbacks.append(StepCheckpoint(spec.save_freq, run.path))
+        callbacks.append(StepCheckpoint(spec.save_freq, run.path, spec.save_replay_buffer))
     if spec.save_every_n_episodes > 0:
-        callbacks.append(EpisodeCheckpoint(spec.save_every_n_episodes, run.path))
+        every = spec.save_every_n_episodes
+        callbacks.append(EpisodeCheckpoint(every, run.path, spec.save_replay_buffer))
     return callbacks
 
 
@@ -192,9 +206,7 @@ def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlg
     }
     if spec.trained_agent is None:
         return _new_model(agent_class(spec.algo), env, spec.device, common, kwargs)
-    # The networks are those of the file: their shape cannot change.
-    kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
-    return load_model(spec.algo, spec.trained_agent, env, device=spec.device, **common, **kwargs)
+    return load_to_continue(spec, spec.trained_agent, env, **common, **kwargs)
 
 
 def _new_model(

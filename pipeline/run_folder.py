@@ -81,7 +81,10 @@ class Run:
 
     @classmethod
     def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
-        """The run of that number, or the newest where the number is 0.
+        """The run of that number, the newest where it is 0, that without a number where it is -1.
+
+        The one without a number lies in ``<log folder>/<algo>/`` itself, and is also the newest
+        where no other is, as in rl_zoo3.
 
         Raises:
             NoRunError: if there is none at all.
@@ -89,6 +92,9 @@ class Run:
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
+        unnumbered = cls(log_folder / algo, name)
+        if number < 0 or (number == 0 and not runs and unnumbered.model_path.exists()):
+            return unnumbered
         if not runs:
             raise NoRunError(algo, env_id, log_folder)
         if number == 0:
@@ -124,6 +130,11 @@ class Run:
             re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name) for path in self.path.iterdir()
         )
         return [self.checkpoint_path(n) for n in sorted(int(match[1]) for match in steps if match)]
+
+    @property
+    def number(self) -> int:
+        """The number in the folder's name; 0 if there is none."""
+        return _run_number(self.path.name, self.env_name)
 
     @property
     def evaluations_path(self) -> Path:

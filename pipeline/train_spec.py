@@ -27,9 +27,12 @@ class TrainSpec:
         n_eval_envs: environments that an evaluation plays on at once.
         save_freq: environment steps between two checkpoints; below 1 for none.
         save_every_n_episodes: episodes between two checkpoints; below 1 for none.
+        save_replay_buffer: write the agent's replay buffer, if it has one, at the end and at
+            checkpoints.
         log_folder: the folder above all runs.
         tensorboard_log: folder for TensorBoard, or None.
-        trained_agent: a zip to go on training, or None.
+        trained_agent: a zip to go on training, with the statistics of VecNormalize and the replay
+            buffer that belong to it, or None.
         vec_env: ``"dummy"`` or ``"subproc"``.
         device: torch device of the networks.
         num_threads: torch threads; results may differ between numbers of threads.
@@ -52,6 +55,7 @@ class TrainSpec:
     n_eval_envs: int = 10
     save_freq: int = -1
     save_every_n_episodes: int = -1
+    save_replay_buffer: bool = False
     log_folder: Path = Path("logs")
     tensorboard_log: Path | None = None
     trained_agent: Path | None = None

@@ -13,11 +13,12 @@ import torch as th
 from rich.console import Console
 
 from mdp.machine_code import compile_timer
+from pipeline.companions import final_replay_buffer_path
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import value_map
-from pipeline.model_saving import save_model, save_normalization
+from pipeline.model_saving import save_model, save_normalization, save_replay_buffer
 from pipeline.pictures.learning_curve import draw_learning_curve
 from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
@@ -90,6 +91,7 @@ def prepare(
     with ExitStack() as undo, _library_errors_in_one_line():
         undo.callback(run.discard)
         training = set_up(spec, run, kwargs, console, undo)
+        spec = training.spec  # with what an agent that goes on has brought along
         write_settings(run, spec, command)
         write_arguments(run, spec, args)
         run.update_info(
@@ -177,7 +179,9 @@ def _finish(training: Training, state: str, seconds: float) -> Outcome:
     """Save what was learnt, judge it, draw it; ``run.json`` says so when all else is there."""
     run, model, evaluation = training.run, training.model, training.evaluation
     save_model(model, run.model_path)
-    save_normalization(model, run)
+    save_normalization(model, run.vecnormalize_path)
+    if training.spec.save_replay_buffer:
+        save_replay_buffer(model, final_replay_buffer_path(run.path))
     if evaluation.is_asked_for and not evaluation.evaluations_timesteps:
         # The run was shorter than the time to its first evaluation, or called no callback.
         evaluation.init_callback(model)
@@ -248,6 +252,7 @@ def _final_evaluation(training: Training) -> Evaluation | None:
     evaluator = training.evaluation.evaluator
     if not training.evaluation.is_asked_for:
         return None
+    training.evaluation.take_statistics()
     if isinstance(evaluator, ExactEvaluator):
         return evaluator(training.model)
     return evaluate(

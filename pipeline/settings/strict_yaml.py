@@ -22,12 +22,16 @@ _TAG = "tag:yaml.org,2002:"
 _PLAIN_TAGS = frozenset(
     _TAG + name for name in ("null", "bool", "int", "float", "str", "seq", "map")
 )
+# How rl_zoo3 writes the settings of a run.
+_ORDERED_DICT = _TAG + "python/object/apply:collections.OrderedDict"
 _MAX_DEPTH = 50
 _MAX_VALUES = 100_000
 
 
 class _StrictLoader(yaml.SafeLoader):
     """Refuses repeated keys and every tag but those of plain data."""
+
+    admitted_tags = _PLAIN_TAGS
 
     yaml_implicit_resolvers = {  # noqa: RUF012 # PyYAML copies it itself before it adds to it
         first: [(tag, regexp) for tag, regexp in resolvers if tag != _TAG + "timestamp"]
@@ -47,7 +51,7 @@ class _StrictLoader(yaml.SafeLoader):
         return node
 
     def construct_object(self, node: Node, deep: bool = False) -> Any:
-        if node.tag not in _PLAIN_TAGS:
+        if node.tag not in self.admitted_tags:
             problem = f"{node.tag.replace(_TAG, '!!')} is not allowed here"
             raise ConstructorError(None, None, problem, node.start_mark)
         try:
@@ -60,6 +64,28 @@ class _StrictLoader(yaml.SafeLoader):
 _StrictLoader.add_implicit_resolver(
     _TAG + "float", re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), "-+0123456789"
 )
+
+
+class _SavedSettingsLoader(_StrictLoader):
+    """Reads rl_zoo3's tag for an OrderedDict too: as the data that it is, looking nothing up."""
+
+    admitted_tags = _PLAIN_TAGS | {_ORDERED_DICT}
+
+
+def _ordered_dict(loader: _SavedSettingsLoader, node: Node) -> dict[str, Any]:
+    arguments = loader.construct_sequence(node, deep=True) if isinstance(node, SequenceNode) else 0
+    match arguments:
+        case [] | [[]]:
+            return {}
+        case [list(pairs)] if all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
+            keys = [key for key, _ in pairs]
+            if all(isinstance(key, str) for key in keys) and len(set(keys)) == len(keys):
+                return dict(pairs)
+    problem = "is no OrderedDict of different keys, as rl_zoo3 writes it"
+    raise ConstructorError(None, None, problem, node.start_mark)
+
+
+_SavedSettingsLoader.add_constructor(_ORDERED_DICT, _ordered_dict)
 
 
 def parse_yaml(content: str | bytes, where: str) -> Any:
@@ -75,8 +101,12 @@ def parse_yaml(content: str | bytes, where: str) -> Any:
     Raises:
         UserError: if it is not YAML, holds anything but plain data, or a key twice.
     """
+    return _parse(content, where, _StrictLoader)
+
+
+def _parse(content: str | bytes, where: str, loader: type[_StrictLoader]) -> Any:
     try:
-        value = _load(content)
+        value = _load(content, loader)
         _check_size(value)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
@@ -95,12 +125,29 @@ def read_yaml(path: Path) -> Any:
     Raises:
         UserError: if the file cannot be read, or is not such a document.
     """
+    return _parse(_content(path), str(path), _StrictLoader)
+
+
+def read_saved_settings(path: Path) -> dict[str, Any]:
+    """Read the settings that a run folder keeps, ours or rl_zoo3's; see `parse_yaml`.
+
+    rl_zoo3 writes them as an OrderedDict with the name of its class, the one tag that is admitted.
+
+    Raises:
+        UserError: if the file cannot be read, or does not map names to plain data.
+    """
+    value = _parse(_content(path), str(path), _SavedSettingsLoader)
+    if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
+        raise UserError(f"{path}: must map names to values")
+    return value
+
+
+def _content(path: Path) -> bytes:
     try:
-        content = path.read_bytes()
+        return path.read_bytes()
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UserError(f"{path}: cannot be read: {reason}") from error
-    return parse_yaml(content, str(path))
 
 
 def key_lines(path: Path) -> dict[tuple[str | int, ...], int]:
@@ -135,8 +182,8 @@ def _node_lines(
             yield from _node_lines(value, (*keys, index))
 
 
-def _load(content: str | bytes) -> Any:
-    loader = _StrictLoader(content)
+def _load(content: str | bytes, loader_class: type[_StrictLoader]) -> Any:
+    loader = loader_class(content)
     try:
         return loader.get_single_data()
     finally:

@@ -1,8 +1,11 @@
 """What is said of a run, and what the lists of agents and environments hold, to the letter."""
 
 import io
+import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from uuid import uuid4
 
 import numpy as np
 import pytest
@@ -10,10 +13,25 @@ from rich.console import Console
 
 from agents import ALGORITHMS
 from commands import listing
-from commands.run_output import describe, describe_pulls, print_header, print_outcome
+from commands.run_output import (
+    describe,
+    describe_pulls,
+    print_header,
+    print_outcome,
+    watch_command,
+)
 from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.run_folder import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
+
+
+@pytest.fixture(autouse=True)
+def typed(monkeypatch):
+    """How the command was begun."""
+    words = ["train.py"]
+    monkeypatch.setattr(sys, "argv", words)
+    return words
 
 
 def console_of(width=200):
@@ -38,7 +56,7 @@ EXACT = Evaluation(
 
 def outcome_of(**changes):
     fields = {
-        "run": SimpleNamespace(path=Path("logs/qlearning/Lake-v1_3")),
+        "run": Run(Path("logs/qlearning/Lake-v1_3"), "Lake-v1"),
         "state": "finished",
         "n_steps": 12_345,
         "seconds": 2.0,
@@ -123,7 +141,7 @@ def test_a_run_with_everything():
         "final        return 2.00 ± 1.00 over 2 episodes",
         "best         return 3.25, first at step 10,000",
         "files        logs/qlearning/Lake-v1_3",
-        "watch        python enjoy.py --algo qlearning --env Lake-v1 -f else where",
+        "watch        python enjoy.py --algo qlearning --env Lake-v1 -f 'else where'",
     ]
 
 
@@ -171,3 +189,41 @@ def test_an_environment_names_the_agents_that_are_tuned_for_it_and_those_that_fi
     assert set(tuned.split()) | set(fitting.split()) <= set(ALGORITHMS)
     assert lists[-2] == ""
     assert lists[-1].startswith("Any other environment registered with Gymnasium works where")
+
+
+def test_the_command_to_watch_with_is_one_line_however_long():
+    folder = "a folder/" * 20
+    (line,) = printed(outcome_of(), spec_of(folder))[-1:]
+    assert line.startswith("watch    python enjoy.py --algo qlearning --env Lake-v1 -f 'a folder/")
+    assert line.endswith("a folder'")
+
+
+@pytest.mark.parametrize(
+    ("others", "choice"),
+    [
+        ([], "--algo qlearning --env Lake-v1 -f {logs}"),
+        (["Lake-v1_2"], "--algo qlearning --env Lake-v1 -f {logs}"),
+        (["Lake-v1_4"], "--algo qlearning --env Lake-v1 -f {logs} --exp-id 3"),
+        # Two that only the unique suffix tells apart.
+        ([f"Lake-v1_3_{uuid4()}"], "{logs}/qlearning/Lake-v1_3"),
+    ],
+)
+def test_the_command_to_watch_with_names_this_run(tmp_path, typed, others, choice):
+    typed[0] = "/some where/train.py"
+    spec = spec_of(tmp_path)
+    for name in ("Lake-v1_3", *others):
+        (tmp_path / "qlearning" / name).mkdir(parents=True)
+    command = watch_command(spec, Run(tmp_path / "qlearning" / "Lake-v1_3", "Lake-v1"))
+    assert command == f"python '/some where/enjoy.py' {choice.format(logs=tmp_path)}"
+
+
+def test_the_command_to_watch_with_names_modules():
+    spec = replace(spec_of(), gym_packages=("one", "two"))
+    command = watch_command(spec, outcome_of().run)
+    assert command.endswith(" --env Lake-v1 --gym-packages one two")
+
+
+def test_a_long_setting_is_cut_short_in_the_header():
+    console = console_of(1000)
+    print_header(console, spec_of(env_kwargs={"desc": ["S" * 100] * 100}, n_timesteps=1))
+    assert len(console.file.getvalue()) < 400

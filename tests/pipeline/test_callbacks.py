@@ -28,6 +28,7 @@ from pipeline.callbacks import (
     ExponentialExploration,
     StepCheckpoint,
 )
+from pipeline.companions import statistics_path
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.run_folder import Run
@@ -228,7 +229,9 @@ def test_evaluation_sees_the_normalisation_of_training(run):
     assert not np.array_equal(*seen)
     np.testing.assert_array_equal(seen[1], env.obs_rms.mean)
     # The statistics belong to the best model, and lie where they are looked for.
-    loaded = VecNormalize.load(str(run.vecnormalize_path), make_vec_env("CartPole-v1", 1))
+    loaded = VecNormalize.load(
+        str(statistics_path(run.best_model_path)), make_vec_env("CartPole-v1", 1)
+    )
     np.testing.assert_array_equal(loaded.obs_rms.mean, seen[1])
 
 

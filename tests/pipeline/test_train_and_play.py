@@ -1,16 +1,18 @@
 """What a training leaves beside its results, and what a trained agent is played on."""
 
 import io
-from types import SimpleNamespace
+import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
+from pipeline.model_choice import ChosenModel
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -79,8 +81,7 @@ def test_a_bar_lets_go_of_the_terminal_whatever_happens(tmp_path, monkeypatch, e
 
 
 def chosen_of(spec, statistics=None):
-    run = None if statistics is None else SimpleNamespace(vecnormalize_path=statistics)
-    return SimpleNamespace(spec=spec, run=run, path=None)
+    return ChosenModel(Path("no.zip"), spec, None, statistics)
 
 
 def saved_statistics(spec, path):
@@ -89,32 +90,49 @@ def saved_statistics(spec, path):
     env.reset()
     for _ in range(50):
         env.step([env.action_space.sample()])
-    env.save(path)
-    return env.obs_rms.mean.copy()
+    unwrap_vec_normalize(env).save(path)
+    return unwrap_vec_normalize(env).obs_rms.mean.copy()
 
 
-def test_observations_are_normalised_as_in_training_and_rewards_left_alone(tmp_path):
-    spec = spec_of(tmp_path, "CartPole-v1", entry={"normalize": True})
+@pytest.mark.parametrize("further", [{}, {"frame_stack": 2}])
+def test_observations_are_normalised_as_in_training_and_rewards_left_alone(tmp_path, further):
+    spec = spec_of(tmp_path, "CartPole-v1", entry={"normalize": {"clip_obs": 0.5}, **further})
     mean = saved_statistics(spec, tmp_path / "vecnormalize.pkl")
-    env = playing_env(chosen_of(spec, tmp_path / "vecnormalize.pkl"), None)
-    assert isinstance(env, VecNormalize)
+    # The file says how observations are normalised, whatever else is known of the run.
+    unsaid = spec_of(tmp_path, "CartPole-v1", entry=further)
+    env = playing_env(chosen_of(unsaid, tmp_path / "vecnormalize.pkl"), None)
     env.seed(0)
-    env.reset()
+    obs = env.reset()
+    assert obs.shape == (1, 4 * further.get("frame_stack", 1))
     for _ in range(20):
-        _, reward, _, _ = env.step([env.action_space.sample()])
+        obs, reward, _, _ = env.step([env.action_space.sample()])
         assert reward.tolist() == [1.0]
+        assert abs(obs).max() <= 0.5
     # Watching teaches nothing.
-    assert env.obs_rms.mean.tolist() == mean.tolist()
+    assert unwrap_vec_normalize(env).obs_rms.mean.tolist() == mean.tolist()
     env.close()
 
 
-def test_statistics_that_are_missing_or_broken(tmp_path):
+@pytest.mark.parametrize(
+    ("content", "complaint"),
+    [
+        (b"broken", r"vecnormalize\.pkl cannot be read"),
+        (pickle.dumps(["a list"]), "holds no statistics of VecNormalize, but an object of list"),
+    ],
+)
+def test_statistics_that_are_broken(tmp_path, content, complaint):
     spec = spec_of(tmp_path, "CartPole-v1", entry={"normalize": True})
     path = tmp_path / "vecnormalize.pkl"
-    playing_env(chosen_of(spec, path), None).close()
-    path.write_bytes(b"broken")
-    with pytest.raises(UserError, match=r"vecnormalize\.pkl cannot be read"):
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=complaint):
         playing_env(chosen_of(spec, path), None)
+
+
+def test_statistics_of_other_observations(tmp_path):
+    path = tmp_path / "vecnormalize.pkl"
+    saved_statistics(spec_of(tmp_path, "CartPole-v1", entry={"normalize": True}), path)
+    with pytest.raises(UserError, match=r"of shape \(4,\); the environment gives \(2,\)"):
+        playing_env(chosen_of(spec_of(tmp_path, "MountainCar-v0"), path), None)
 
 
 def test_frames_are_kept_over_the_ends_of_episodes(tmp_path):

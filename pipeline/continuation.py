@@ -1,0 +1,96 @@
+"""Going on with a trained agent: where it lies, and what it brings along from its training.
+
+A new run begins, in a folder of its own, with so many further steps. As in rl_zoo3, the agent's
+networks or tables, its statistics of VecNormalize and its replay buffer go on, and hyperparameters
+are those of the new run's entry. Other than there, the agent's steps are counted on, and schedules
+are where so many of all steps put them, rather than at their beginning.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.companions import replay_buffer_of, statistics_of
+from pipeline.model_finding import model_at
+from pipeline.model_loading import agent_class, (
+    REPLAY_BUFFER,
+    STATISTICS,
+    check_origin,
+    hand_written_algorithm,
+    load_model,
+    load_replay_buffer,
+)
+from pipeline.normalization import Statistics, normalising, read_statistics
+from pipeline.recorded_runs import run_around
+from pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
+
+
+def agent_to_continue(path: Path, log_folder: Path, is_trusted: bool) -> Path:
+    """The zip that a path means, with or without its suffix, or of a run folder.
+
+    Args:
+        path: of the zip or the run folder.
+        log_folder: the folder above all runs.
+        is_trusted: read what can run code from elsewhere too.
+
+    Raises:
+        UserError: if there is none, or it or what goes with it could run code and lies elsewhere.
+    """
+    model = model_at(path)
+    if not is_trusted:
+        if hand_written_algorithm(model) is None:
+            check_origin(model, log_folder)
+        for file, what in (
+            (_statistics_path(model), STATISTICS),
+            (replay_buffer_of(model), REPLAY_BUFFER),
+        ):
+            if file is not None:
+                check_origin(file, log_folder, what=what)
+    return model
+
+
+def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
+    """The statistics that go on with the agent, or None.
+
+    Raises:
+        UserError: if they cannot be read.
+    """
+    path = None if spec.trained_agent is None else _statistics_path(spec.trained_agent)
+    return None if path is None else read_statistics(path)
+
+
+def continuing(spec: TrainSpec, statistics: Statistics) -> TrainSpec:
+    """The spec with environments that normalise as before, but for what its entry says of that."""
+    return normalising(spec, {**statistics.settings, **(spec.hyperparams.normalize or {})})
+
+
+def load_to_continue(
+    spec: TrainSpec, trained_agent: Path, env: VecEnv, **kwargs: Any
+) -> BaseAlgorithm:
+    """The agent as it was, with its replay buffer, on ``env`` and with these hyperparameters.
+
+    Raises:
+        UserError: if it cannot be loaded so.
+    """
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    # The networks are those of the file: their shape cannot change.
+    kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
+    if "n_steps" in kwargs and issubclass(agent_class(spec.algo), OffPolicyAlgorithm):
+        # The library chooses a kind of buffer by it, and would leave that of the file.
+        kwargs = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **kwargs}
+    model = load_model(spec.algo, trained_agent, env, device=spec.device, **kwargs)
+    replay_buffer = replay_buffer_of(trained_agent)
+    if replay_buffer is not None:
+        load_replay_buffer(model, replay_buffer)
+    return model
+
+
+def _statistics_path(model: Path) -> Path | None:
+    run = run_around(model)
+    return statistics_of(model, None if run is None else run.params_path)

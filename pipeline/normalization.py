@@ -1,0 +1,110 @@
+"""Running statistics of VecNormalize: read from a file, and put to use."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import UserError, one_line
+from pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.running_mean_std import RunningMeanStd
+    from stable_baselines3.common.vec_env import VecEnv
+
+# What a VecNormalize is told when it is made, beside whether it goes on learning.
+_SETTINGS = (
+    "norm_obs",
+    "norm_reward",
+    "clip_obs",
+    "clip_reward",
+    "gamma",
+    "epsilon",
+    "norm_obs_keys",
+)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What a VecNormalize has seen, and how it normalises by it.
+
+    Attributes:
+        path: where they were read.
+        settings: arguments of VecNormalize.
+        observations: of each observation, or by key; None where observations are left alone.
+        returns: of discounted returns, by which rewards are divided.
+    """
+
+    path: Path
+    settings: Mapping[str, Any]
+    observations: RunningMeanStd | dict[str, RunningMeanStd] | None
+    returns: RunningMeanStd
+
+
+def read_statistics(path: Path) -> Statistics:
+    """Read what VecNormalize saved. It is unpickled, which can run code: read what you trust.
+
+    Raises:
+        UserError: if the file is no such thing.
+    """
+    from stable_baselines3.common.vec_env import VecNormalize
+
+    try:
+        with path.open("rb") as file:
+            saved = pickle.load(file)  # noqa: S301  # callers have looked where it comes from
+    except Exception as error:  # a pickle can fail in any way
+        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+    if not isinstance(saved, VecNormalize):
+        kind = type(saved).__name__
+        raise UserError(f"{path} holds no statistics of VecNormalize, but an object of {kind}")
+    settings = {key: vars(saved)[key] for key in _SETTINGS if vars(saved).get(key) is not None}
+    return Statistics(
+        path,
+        {key: _plain(value) for key, value in settings.items()},
+        saved.obs_rms if saved.norm_obs else None,
+        saved.ret_rms,
+    )
+
+
+def normalising(spec: TrainSpec, settings: Mapping[str, Any]) -> TrainSpec:
+    """The spec with environments under a VecNormalize that is made with ``settings``."""
+    return replace(
+        spec,
+        hyperparams=replace(spec.hyperparams, normalize=dict(settings)),
+        saved_hyperparams={**spec.saved_hyperparams, "normalize": dict(settings)},
+    )
+
+
+def take_over(env: VecEnv, statistics: Statistics) -> None:
+    """Let the VecNormalize in ``env`` go on from the statistics.
+
+    Raises:
+        UserError: if they are of other observations.
+    """
+    from stable_baselines3.common.vec_env import unwrap_vec_normalize
+
+    normalization = unwrap_vec_normalize(env)
+    assert normalization is not None, "see `normalising`"
+    if normalization.norm_obs and statistics.observations is not None:
+        wanted, found = _shapes(normalization.obs_rms), _shapes(statistics.observations)
+        if wanted != found:
+            raise UserError(
+                f"{statistics.path} holds statistics of observations of shape {found}; the "
+                f"environment gives {wanted}"
+            )
+        normalization.obs_rms = statistics.observations  # type: ignore[assignment]
+    normalization.ret_rms = statistics.returns
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers as Python's, which a settings file can hold."""
+    return value.item() if hasattr(value, "item") else value
+
+
+def _shapes(statistics: Any) -> Any:
+    if isinstance(statistics, dict):
+        return {key: value.mean.shape for key, value in statistics.items()}
+    return statistics.mean.shape

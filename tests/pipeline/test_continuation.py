@@ -1,0 +1,219 @@
+"""Going on with a trained agent: what is brought along, and what each model keeps for that."""
+
+import pickle
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pipeline.companions import replay_buffer_of, statistics_of
+from pipeline.continuation import agent_to_continue
+from pipeline.errors import UserError
+from pipeline.model_choice import ModelRequest, choose_model
+from pipeline.model_loading import load_to_play
+from pipeline.playing import playing_env
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+from pipeline.training import train
+
+A2C = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [4]}, "n_envs": 2, "n_steps": 10}
+DQN = {
+    "policy": "MlpPolicy",
+    "policy_kwargs": {"net_arch": [4]},
+    "learning_starts": 10,
+    "buffer_size": 500,
+    "batch_size": 4,
+}
+
+
+def train_to(folder, algo, entry, n_timesteps=200, **fields):
+    entry = {**entry, "n_timesteps": n_timesteps}
+    fields = {"pictures": False, "eval_episodes": 2, "n_eval_envs": 1, "verbose": 0, **fields}
+    spec = TrainSpec(
+        algo, "CartPole-v1", split(entry), entry, 0, log_folder=folder, device="cpu", **fields
+    )
+    return train(spec, Console(quiet=True), {}, "train.py").run
+
+
+def read(path):
+    return pickle.loads(path.read_bytes())
+
+
+def seen(path):
+    """How many observations the statistics are of, the start of 1e-4 left out."""
+    return round(read(path).obs_rms.count)
+
+
+@pytest.fixture(scope="module")
+def normalised(tmp_path_factory):
+    """A run of 200 steps with checkpoints after 60, 120 and 180."""
+    entry = {**A2C, "normalize": {"clip_obs": 3.0}}
+    logs = tmp_path_factory.mktemp("logs")
+    return train_to(logs, "a2c", entry, save_freq=60, eval_freq=40)
+
+
+def test_each_model_has_the_statistics_of_its_moment(normalised):
+    # Two observations at the beginning, and two for each step of both environments.
+    assert seen(normalised.vecnormalize_path) == 202
+    for n_steps in (60, 120, 180):
+        path = normalised.path / f"rl_model_vecnormalize_{n_steps}_steps.pkl"
+        assert seen(path) == n_steps + 2
+    assert seen(normalised.path / "best_model_vecnormalize.pkl") in range(42, 203, 40)
+
+
+@pytest.mark.parametrize(
+    ("which", "name"),
+    [
+        ("final", "CartPole-v1/vecnormalize.pkl"),
+        ("best", "best_model_vecnormalize.pkl"),
+        ("last checkpoint", "rl_model_vecnormalize_180_steps.pkl"),
+        (60, "rl_model_vecnormalize_60_steps.pkl"),
+    ],
+)
+def test_a_model_is_played_on_its_own_statistics(normalised, which, name):
+    logs = normalised.path.parent.parent
+    request = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=logs, which=which)
+    assert choose_model(request).statistics == normalised.path / name
+    # And likewise by its path.
+    path = choose_model(request).path
+    assert choose_model(ModelRequest(path, log_folder=logs)).statistics.samefile(
+        normalised.path / name
+    )
+
+
+def test_old_folders_have_those_of_the_end_alone(tmp_path):
+    for name in ("best_model.zip", "rl_model_60_steps.zip", "other_60_steps.zip", "X-v0.zip"):
+        assert statistics_of(tmp_path / name, tmp_path / "X-v0") is None
+    (tmp_path / "X-v0").mkdir()
+    end = tmp_path / "X-v0" / "vecnormalize.pkl"
+    end.touch()
+    for name in ("best_model.zip", "rl_model_60_steps.zip", "X-v0.zip"):
+        assert statistics_of(tmp_path / name, tmp_path / "X-v0") == end
+    own = tmp_path / "other_vecnormalize_60_steps.pkl"
+    own.touch()
+    assert statistics_of(tmp_path / "other_60_steps.zip", tmp_path / "X-v0") == own
+
+
+@pytest.mark.parametrize(("model", "before"), [("", 202), ("rl_model_60_steps", 62)])
+def test_statistics_go_on(normalised, tmp_path, model, before):
+    agent = agent_to_continue(normalised.path / model, normalised.path, is_trusted=False)
+    # The entry says nothing of normalisation: the agent has been trained on it all the same.
+    run = train_to(tmp_path, "a2c", A2C, 40, trained_agent=agent, eval_freq=-1)
+    # Two for the new beginning.
+    assert seen(run.vecnormalize_path) == before + 42
+    statistics = read(run.vecnormalize_path)
+    assert (statistics.clip_obs, statistics.norm_reward) == (3.0, True)
+    assert run.recorded_spec()["hyperparams"]["normalize"]["clip_obs"] == 3.0
+    request = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=tmp_path)
+    assert choose_model(request).spec.hyperparams.normalize["clip_obs"] == 3.0
+
+
+def test_what_the_new_entry_says_of_normalisation_wins(normalised, tmp_path):
+    entry = {**A2C, "normalize": {"clip_obs": 4.0}, "gamma": 0.5}
+    run = train_to(tmp_path, "a2c", entry, 40, trained_agent=normalised.model_path, eval_freq=-1)
+    statistics = read(run.vecnormalize_path)
+    assert (statistics.clip_obs, statistics.gamma, seen(run.vecnormalize_path)) == (4.0, 0.5, 244)
+
+
+def test_the_end_is_judged_on_the_statistics_of_the_end(tmp_path, monkeypatch):
+    judged = []
+
+    def note(model, env, n_episodes, seed, deterministic=True):
+        judged.append(round(env.obs_rms.count))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pipeline.training.evaluate", note)
+    with pytest.raises(KeyboardInterrupt):
+        train_to(tmp_path, "a2c", {**A2C, "normalize": True}, eval_freq=80)
+    assert judged == [202]
+
+
+# --- replay buffers ------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def replayed(tmp_path_factory):
+    logs = tmp_path_factory.mktemp("logs")
+    return train_to(logs, "dqn", DQN, save_freq=80, save_replay_buffer=True, eval_freq=-1)
+
+
+def test_replay_buffers_lie_where_the_library_and_rl_zoo3_have_them(replayed):
+    names = sorted(path.name for path in replayed.path.glob("*.pkl"))
+    assert names == [
+        "replay_buffer.pkl",
+        "rl_model_replay_buffer_160_steps.pkl",
+        "rl_model_replay_buffer_80_steps.pkl",
+    ]
+    assert read(replayed.path / "replay_buffer.pkl").pos == 200
+
+
+@pytest.mark.parametrize(
+    ("model", "name"),
+    [
+        ("CartPole-v1.zip", "replay_buffer.pkl"),
+        ("rl_model_80_steps.zip", "rl_model_replay_buffer_80_steps.pkl"),
+        ("best_model.zip", "replay_buffer.pkl"),
+    ],
+)
+def test_the_replay_buffer_of_a_model(replayed, model, name):
+    assert replay_buffer_of(replayed.path / model) == replayed.path / name
+
+
+def test_a_replay_buffer_goes_on(replayed, tmp_path):
+    run = train_to(
+        tmp_path, "dqn", DQN, 50, trained_agent=replayed.model_path, save_replay_buffer=True
+    )
+    before, after = (read(one.path / "replay_buffer.pkl") for one in (replayed, run))
+    # An update follows every fourth step, and training ends with one.
+    assert after.pos == 252
+    np.testing.assert_array_equal(after.observations[:200], before.observations[:200])
+
+
+def test_playing_needs_no_replay_buffer(replayed):
+    request = ModelRequest(replayed.model_path, log_folder=replayed.path, device="cpu")
+    chosen = choose_model(request)
+    env = playing_env(chosen, None)
+    assert load_to_play("dqn", chosen.path, env).replay_buffer.buffer_size == 1
+    env.close()
+
+
+def test_a_replay_buffer_of_other_environments(replayed, tmp_path):
+    logs, entry = tmp_path / "above" / "logs", {**DQN, "n_envs": 2}
+    with pytest.raises(UserError, match=r"filled by 1 environments at once.* n_envs:1"):
+        train_to(logs, "dqn", entry, 50, trained_agent=replayed.model_path)
+    assert not logs.exists()
+
+
+def test_the_kind_of_buffer_follows_the_new_entry(tmp_path):
+    """Returns of several steps take another kind, which the library writes into the zip."""
+    first = train_to(tmp_path, "dqn", {**DQN, "n_steps": 3}, 40, eval_freq=-1)
+    fields = {"trained_agent": first.model_path, "eval_freq": -1, "save_replay_buffer": True}
+    for n_steps, kind in ((1, "ReplayBuffer"), (2, "NStepReplayBuffer")):
+        run = train_to(tmp_path, "dqn", {**DQN, "n_steps": n_steps}, 20, **fields)
+        buffer = read(run.path / "replay_buffer.pkl")
+        assert (type(buffer).__name__, getattr(buffer, "n_steps", 1)) == (kind, n_steps)
+    fields["trained_agent"] = run.model_path
+    said = "holds a NStepReplayBuffer with n_steps 2; these hyperparameters need a ReplayBuffer"
+    with pytest.raises(UserError, match=said):
+        train_to(tmp_path, "dqn", {**DQN, "n_steps": 1}, 20, **fields)
+
+
+def test_none_is_kept_unless_asked_for_or_where_there_is_none(tmp_path):
+    for algo, entry, asked in (("dqn", DQN, False), ("a2c", A2C, True)):
+        run = train_to(
+            tmp_path, algo, entry, 40, save_freq=20, save_replay_buffer=asked, eval_freq=-1
+        )
+        assert not list(run.path.glob("*.pkl"))
+
+
+def test_what_lies_elsewhere_wants_trust(replayed, tmp_path):
+    with pytest.raises(UserError, match=r"loading a zip of a library agent .* --trust"):
+        agent_to_continue(replayed.model_path, tmp_path, is_trusted=False)
+    assert agent_to_continue(replayed.path, tmp_path, is_trusted=True) == replayed.model_path
+    entry = {"policy": "RandomPolicy"}
+    run = train_to(tmp_path / "logs", "random", entry, 20, eval_freq=-1)
+    assert agent_to_continue(run.model_path, tmp_path / "x", is_trusted=False) == run.model_path
+    buffer = run.path / "replay_buffer.pkl"
+    buffer.touch()
+    with pytest.raises(UserError, match="reading a replay buffer can run code"):
+        agent_to_continue(run.model_path, tmp_path / "x", is_trusted=False)
