@@ -12,9 +12,9 @@ import numpy as np
 import torch as th
 from rich.console import Console
 
-from commands.run_output import describe
+from commands.run_output import describe, print_refusal
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.exact import exact_evaluator, model_refusal
 from pipeline.filming import write_film
 from pipeline.model_choice import ChosenModel
 from pipeline.model_loading import load_model
@@ -135,6 +135,7 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
     """Say what the policy is worth, where that can be computed."""
     evaluator = exact_evaluator(spec)
     if evaluator is None:
+        print_refusal(console, model_refusal(spec))
         return
     try:
         evaluation = evaluator(model, deterministic)

@@ -78,9 +78,13 @@ def transition_model(env: Env) -> TransitionModel | None:
 def model_check(env: Env) -> ModelCheck | None:
     """What came of holding the environment's own model against its `step`.
 
-    Those whose word is enough pass without a look; None is for those that bring no model.
+    Those whose word is enough pass without a look.
+
+    Returns:
+        The check; None where there is no model, or wrappers hide it.
     """
-    return _judged(env.unwrapped)[1]
+    base, wrappers = _layers(env)
+    return _judged(base)[1] if all(_folds(wrapper) for wrapper in wrappers) else None
 
 
 def time_limit(env: Env) -> int | None:

@@ -24,6 +24,8 @@ N_STEPS = 60_000
 # Where the environment has no limit of its own.
 EPISODE_LIMIT = 1000
 
+DIFFERENT = "the environment's P is not what step does: "
+
 # What changes while an environment is played, and says nothing of its dynamics.
 PLAYED = frozenset({"s", "lastaction", "spec", "render_mode", "_np_random", "_np_random_seed"})
 PLAYED_KINDS = (np.random.Generator, np.random.RandomState, random.Random, gym.Space)
@@ -113,12 +115,14 @@ def _check(base: Env, claim: Claim, n_steps: int) -> ModelCheck:
             _require_same(claim, twin)
             watched = WatchedEnv(twin, claim)
             can_be_set = sample(watched, Budget(n_steps, _limit(base)))
-    except (DisagreementError, ValueError) as error:
-        return ModelCheck(str(error))
+    except DisagreementError as error:
+        return ModelCheck(DIFFERENT + str(error))
+    except ValueError as error:
+        return ModelCheck(f"the environment's P cannot be held against step: {error}")
     odd = next(odd_frequencies(watched), None)
     n_done = len(watched.steps)
     if odd is not None:
-        return ModelCheck(odd, n_steps=n_done)
+        return ModelCheck(DIFFERENT + odd, n_steps=n_done)
     return ModelCheck(None, watched.draws_as_toy_text(), can_be_set, n_done)
 
 

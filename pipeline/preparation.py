@@ -19,7 +19,7 @@ from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.exact import exact_evaluator, model_refusal
 from pipeline.evaluation.sampled import evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
@@ -46,6 +46,7 @@ class Training:
         evaluation: the evaluation callback, also part of ``callback``.
         callback: all callbacks.
         pulls: keeps every pull, on bandits; else None, and where a compiled loop was asked for.
+        refusal: why the model that the environment brings is not believed; None if it is.
     """
 
     spec: TrainSpec
@@ -56,6 +57,7 @@ class Training:
     display: ProgressDisplay
     callback: BaseCallback
     pulls: PullRecorder | None = None
+    refusal: str | None = None
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
@@ -92,7 +94,10 @@ def set_up(
         callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
     if spec.verbose > 0:
         callbacks.append(display)
-    return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls)
+    refusal = None if evaluation.value_maps is not None else model_refusal(spec)
+    return Training(
+        spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls, refusal
+    )
 
 
 def _evaluation(

@@ -112,7 +112,7 @@ def _finite_model(env: Env) -> FiniteModel:
     observations = observations_of_states(env)
     check = model_check(env)
     if check is not None and check.refusal is not None:
-        raise NotCompilable(f"the environment's P is not what step does ({check.refusal})")
+        raise NotCompilable(check.refusal)
     if check is None or model is None or observations is None:
         raise NotCompilable("the environment's transition model is not known")
     if not np.issubdtype(observations.dtype, np.integer) or observations.ndim != 1:
