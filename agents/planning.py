@@ -134,8 +134,8 @@ class PlanningAgent(OnlineAlgorithm):
         model, observations = transition_model(env), observations_of_states(env)
         if model is None or observations is None:
             check = model_check(env)
-            refusal = "" if check is None or check.refusal is None else f": {check.refusal}"
-            raise ValueError(f"{name} needs an environment whose transition model is known{refusal}")
+            why = "" if check is None or check.refusal is None else f": {check.refusal}"
+            raise ValueError(f"{name} needs an environment whose transition model is known{why}")
         if observations.ndim != 1 or len(np.unique(observations)) < len(observations):
             raise ValueError(f"{name} needs observations that are the numbers of the states")
         by_state, horizon = self._plan(model, time_limit(env))

@@ -32,7 +32,7 @@ def copy_of(base: Env) -> Env:
         raise ValueError(f"its {replaced[0]} was replaced by hand, and cannot be tried on a copy")
     try:
         twin = copy.deepcopy(base)
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001  # whatever it is that cannot be copied
         twin = _made_anew(base, error)
     if twin.render_mode is not None:
         vars(twin)["render_mode"] = None

@@ -120,7 +120,7 @@ def _check(base: Env, claim: Claim, n_steps: int) -> ModelCheck:
     except ValueError as error:
         return ModelCheck(f"the environment's P cannot be held against step: {error}")
     odd = next(odd_frequencies(watched), None)
-    n_done = len(watched.steps)
+    n_done = len(watched.steps.row)
     if odd is not None:
         return ModelCheck(DIFFERENT + odd, n_steps=n_done)
     return ModelCheck(None, watched.draws_as_toy_text(), can_be_set, n_done)

@@ -95,12 +95,12 @@ def _visit(watched: WatchedEnv, rows: Ints) -> None:
 
 def _most_doubtful(watched: WatchedEnv, number: int) -> Ints:
     """The rows whose counts speak most against the model."""
-    rows, outcomes = np.array([step[:2] for step in watched.steps]).T
-    places = watched.classes.place[outcomes]
-    found = frequencies(rows, places, watched.classes.row_prob, 1)
+    steps, classes = watched.steps, watched.classes
+    found = frequencies(steps.row, classes.place[steps.outcome], classes.row_prob, 1)
     evidence = found.evidence.max(axis=1)
     order = np.argsort(-evidence, kind="stable")[:number]
-    return found.groups[order][np.isfinite(evidence[order])]
+    doubtful: Ints = found.groups[order][np.isfinite(evidence[order])]
+    return doubtful
 
 
 def _obeys(watched: WatchedEnv, rng: Generator) -> bool:
@@ -111,7 +111,7 @@ def _obeys(watched: WatchedEnv, rng: Generator) -> bool:
     which it is known that they do nothing that the model rules out.
     """
     n_actions, evidence = watched.claim.model.n_actions, 0.0
-    rows = np.unique([step.row for step in watched.steps])
+    rows = np.unique(watched.steps.row)
     for i, row in enumerate(rng.choice(rows, N_ATTEMPTS).tolist()):
         if watched.over or i % STEPS_FROM_SET_STATES == 0:
             watched.reset()
@@ -144,9 +144,7 @@ def _plan_to_the_unseen(watched: WatchedEnv, horizon: int) -> Ints:
     from mdp.finite_horizon import finite_horizon_optimum
 
     model: TransitionModel = watched.claim.model
-    visits = np.bincount(
-        [step.row for step in watched.steps], minlength=model.n_states * model.n_actions
-    )
+    visits = np.bincount(watched.steps.row, minlength=model.n_states * model.n_actions)
     prize: Floats = 1 / (1.0 + visits.reshape(model.n_states, model.n_actions, 1))
     wanted = replace(model, reward=np.broadcast_to(prize, model.prob.shape))
     return finite_horizon_optimum(wanted, horizon).actions_left.astype(np.int64)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from envs.watched_env import Step, WatchedEnv, outcome_text, row_text
+from envs.watched_env import Steps, WatchedEnv, outcome_text, row_text
 from mdp.array_types import Floats, Ints
 from mdp.frequency_evidence import Frequencies, frequencies
 
@@ -44,7 +44,7 @@ class Odd(NamedTuple):
 
     group: int
     outcome: int
-    count: int
+    times: int
     trials: int
 
 
@@ -55,10 +55,8 @@ def odd_frequencies(watched: WatchedEnv) -> Iterator[str]:
     the steps were chosen: see `mdp.frequency_evidence`.
     """
     yield from _odd_starts(watched)
-    steps = Step(*np.array(watched.steps, dtype=np.float64).reshape(-1, len(Step._fields)).T)
-    rows, outcomes = steps.row.astype(np.int64), steps.outcome.astype(np.int64)  # type: ignore[attr-defined]
-    classes, n_actions = watched.classes, watched.claim.model.n_actions
-    places = classes.place[outcomes]
+    steps, classes = watched.steps, watched.classes
+    rows, places = steps.row, classes.place[steps.outcome]
     odd = _oddest(Family(rows, places, classes.row_prob, 1, len(classes.row)))
     if odd is not None:
         yield _line(watched, odd.group, odd, "")
@@ -73,18 +71,16 @@ def odd_frequencies(watched: WatchedEnv) -> Iterator[str]:
 
 
 def _contexts(
-    watched: WatchedEnv, steps: Any
+    watched: WatchedEnv, steps: Steps
 ) -> Iterator[tuple[Ints, int, Callable[[int], str]]]:
     """What nothing may depend on: its value at each step, how many there are, and in words."""
     n_places, n_actions = watched.classes.row_prob.shape[1], watched.claim.model.n_actions
-    yield np.zeros(len(steps.row), np.int64), 1, lambda _: ""
+    yield 0 * steps.row, 1, lambda _: ""
     yield _bucket(steps.time), N_BUCKETS, lambda b: f" in {_steps_text(b)} of episodes"
     all_steps = np.arange(len(steps.row))
     yield _bucket(all_steps), N_BUCKETS, lambda b: f" in {_steps_text(b)} of the check"
-    before = steps.before.astype(np.int64)
-    yield before, n_places + 1, lambda p: f" where the last outcome was P's number {p}"
-    action_before = steps.action_before.astype(np.int64)
-    yield action_before, n_actions + 1, lambda a: f" right after action {a - 1}"
+    yield steps.before, n_places + 1, lambda p: f" where the last outcome was P's number {p}"
+    yield steps.action_before, n_actions + 1, lambda a: f" right after action {a - 1}"
 
 
 def _odd_starts(watched: WatchedEnv) -> Iterator[str]:
@@ -102,7 +98,7 @@ def _odd_starts(watched: WatchedEnv) -> Iterator[str]:
             yield (
                 f"initial_state_distrib says state {possible[odd.outcome]} in "
                 f"{prob[0, odd.outcome]:.1%} of cases, reset gave it in "
-                f"{odd.count / odd.trials:.1%} of {odd.trials:,}"
+                f"{odd.times / odd.trials:.1%} of {odd.trials:,}"
                 f"{text.format(possible[odd.group])}"
             )
 
@@ -128,7 +124,7 @@ def _line(watched: WatchedEnv, row: int, odd: Odd, where: str) -> str:
     return (
         f"{row_text(row, watched.claim.model.n_actions)}: P says {outcome_text(outcome)} in "
         f"{classes.row_prob[row, odd.outcome]:.1%} of cases, step gave it in "
-        f"{odd.count / odd.trials:.1%} of {odd.trials:,}{where}"
+        f"{odd.times / odd.trials:.1%} of {odd.trials:,}{where}"
     )
 
 

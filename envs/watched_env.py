@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from array import array
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ import numpy as np
 from gymnasium.utils import seeding
 
 from envs.claimed_models import Claim
+from mdp.array_types import Ints
 from mdp.outcome_classes import Observed, OutcomeClasses
 
 Env = gym.Env[Any, Any]
@@ -21,8 +23,8 @@ class DisagreementError(Exception):
     """An environment did what its model rules out; the message is one line."""
 
 
-class Step(NamedTuple):
-    """A step as it is written down.
+class Steps(NamedTuple):
+    """Steps as they are written down; all arrays have shape (n,).
 
     Attributes:
         row: ``state * A + action``.
@@ -31,16 +33,14 @@ class Step(NamedTuple):
         before: the place of the last outcome, counted from 1; 0 at the beginning of an episode.
         action_before: the last action, counted likewise.
         draw: how many uniform numbers had been drawn, if one is for each step and each start.
-        reward: in full precision.
     """
 
-    row: int
-    outcome: int
-    time: int
-    before: int
-    action_before: int
-    draw: int
-    reward: float
+    row: Ints
+    outcome: Ints
+    time: Ints
+    before: Ints
+    action_before: Ints
+    draw: Ints
 
 
 class WatchedEnv:
@@ -54,7 +54,6 @@ class WatchedEnv:
         state: where it is.
         over: whether the episode has ended.
         time: steps since it began.
-        steps: all steps but those of `try_action`.
         starts: where episodes began, and the number of draws before that.
     """
 
@@ -62,7 +61,7 @@ class WatchedEnv:
         self.env: Any = env
         self.claim = claim
         self.classes = OutcomeClasses(claim.model)
-        self.steps: list[Step] = []
+        self._log, self._rewards = array("q"), array("d")
         self.starts: list[tuple[int, int]] = []
         self.state, self.time, self.over = 0, 0, True
         self._place = self.classes.place.tolist()
@@ -81,7 +80,7 @@ class WatchedEnv:
             obs, _ = self.env.reset(seed=None if self.starts else SEED)
         except Exception as error:
             raise DisagreementError(f"reset raised {_error_text(error)}") from error
-        self.state = self._state_of(obs, "reset")
+        self.state = self._state_of(obs, None)
         if self._initial[self.state] <= 0:
             raise DisagreementError(
                 f"reset gave state {self.state}, "
@@ -99,17 +98,21 @@ class WatchedEnv:
             DisagreementError: if the model rules out what comes of it.
         """
         row = self.state * self._n_actions + action
-        draw = self._draws
+        note = (self.time, self._before, self._action_before, self._draws)
         seen, reward = self._act(row)
         outcome = self.classes.ids.get(seen)
         if outcome is None:
             raise DisagreementError(f"{self._where(row)}: {self._difference(seen)}")
-        self.steps.append(
-            Step(row, outcome, self.time, self._before, self._action_before, draw, reward)
-        )
+        self._log.extend((row, outcome, *note))
+        self._rewards.append(reward)
         self.time += 1
         self._before = self._place[outcome] + 1
         self._action_before = action + 1
+
+    @property
+    def steps(self) -> Steps:
+        """All steps but those of `try_action`."""
+        return Steps(*np.array(self._log).reshape(-1, len(Steps._fields)).T)
 
     def put(self, state: int) -> bool:
         """Put the environment into a state, if it lets its attribute ``s`` be set."""
@@ -142,15 +145,14 @@ class WatchedEnv:
         """
         generator, _ = seeding.np_random(SEED)
         uniforms = generator.random(self._draws)
-        steps = Step(*np.array(self.steps, dtype=np.float64).reshape(-1, len(Step._fields)).T)
-        whole: Any = [np.asarray(column).astype(np.int64) for column in steps[:-1]]
-        predicted, rewards = self.classes.predicted(whole[0], uniforms[whole[5]])
+        steps = self.steps
+        predicted, rewards = self.classes.predicted(steps.row, uniforms[steps.draw])
         starts = np.array(self.starts)
         cumulative = np.cumsum(self.claim.model.initial)
         first = [np.argmax(cumulative > uniform) for uniform in uniforms[starts[:, 1]]]
         return (
-            np.array_equal(predicted, whole[1])
-            and np.array_equal(rewards, np.asarray(steps.reward))
+            np.array_equal(predicted, steps.outcome)
+            and np.array_equal(rewards, np.array(self._rewards))
             and np.array_equal(first, starts[:, 0])
         )
 
@@ -162,7 +164,7 @@ class WatchedEnv:
             text = f"{self._where(row)}: step raised {_error_text(error)}"
             raise DisagreementError(text) from error
         self._draws += 1
-        self.state = self._state_of(obs, self._where(row))
+        self.state = self._state_of(obs, row)
         if truncated:
             raise DisagreementError(
                 f"{self._where(row)}: step gave truncated, which no model holds: "
@@ -170,27 +172,27 @@ class WatchedEnv:
             )
         return (row, self.state, float(np.float32(reward)), self.over), reward
 
-    def _state_of(self, obs: Any, where: str) -> int:
-        """Where the environment is, by what is observed."""
+    def _state_of(self, obs: Any, row: int | None) -> int:
+        """Where the environment is after a row, or a start, by what is observed."""
         by_obs = self.claim.observes_states
-        found = obs if by_obs else getattr(self.env, "s", None)
+        found: Any = obs if by_obs else getattr(self.env, "s", None)
         try:
             state = operator.index(found)
         except TypeError:
             what = "observation" if by_obs else "attribute s"
-            text = f"{where}: the {what} is {found!r}, not the number of a state"
-            raise DisagreementError(text) from None
+            text = f"{self._where(row)}: the {what} is {found!r}, not the number of a state"
+            raise DisagreementError(" ".join(text.split())) from None
         if not 0 <= state < len(self._initial):
-            last = len(self._initial) - 1
-            raise DisagreementError(f"{where}: P has states 0 to {last}, this led to {state}")
+            text = f"P has states 0 to {len(self._initial) - 1}, this led to {state}"
+            raise DisagreementError(f"{self._where(row)}: {text}")
         expected = self.claim.observations
         if not (by_obs or expected is None or np.array_equal(expected[state], obs)):
-            text = f"{where}: state {state} was observed as {obs}, not {expected[state]}"
+            text = f"{self._where(row)}: state {state} was observed as {obs}, not {expected[state]}"
             raise DisagreementError(" ".join(text.split()))
         return state
 
-    def _where(self, row: int) -> str:
-        return row_text(row, self._n_actions)
+    def _where(self, row: int | None) -> str:
+        return "reset" if row is None else row_text(row, self._n_actions)
 
     def _difference(self, seen: Observed) -> str:
         classes = self.classes

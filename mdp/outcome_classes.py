@@ -6,6 +6,8 @@ agents are given them.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from mdp.array_types import Floats, Ints
@@ -43,7 +45,8 @@ class OutcomeClasses:
         rows, _ = np.nonzero(possible)
         with np.errstate(over="ignore"):
             reward = model.reward.astype(np.float32)
-        seen = (array.reshape(n_rows, -1)[possible].tolist() for array in self._arrays(reward))
+        arrays: tuple[Any, ...] = (model.next_state, reward, model.terminated)
+        seen = (array.reshape(n_rows, -1)[possible].tolist() for array in arrays)
         self.ids: dict[Observed, int] = {}
         classes = [
             self.ids.setdefault(key, len(self.ids))
@@ -85,6 +88,3 @@ class OutcomeClasses:
             chosen[part] = np.argmax(cumulative[rows[part]] > uniforms[part, None], axis=1)
         reward = self._model.reward.reshape(n_rows, -1)
         return self._of_outcome[rows, chosen], reward[rows, chosen]
-
-    def _arrays(self, reward: Floats) -> tuple[Ints, Floats, Ints]:
-        return self._model.next_state, reward, self._model.terminated  # type: ignore[return-value]
