@@ -3,9 +3,9 @@
     python benchmarks/model_check_errors.py
 
 False alarms: random models, each its environment's very own, of 1 to 30 states, 1 to 4 actions and
-up to 5 outcomes, with certain and very unlikely ones among them; in one of twenty the state cannot be
-set. The bound is one in a million over all tests of a check. A second row moves it to one in ten,
-where a check of 2,000 steps can come near it.
+up to 5 outcomes, with certain and very unlikely ones among them; in one of twenty the state cannot
+be set. The bound is one in a million over all tests of a check. A second row moves it to one in
+ten, where a check of 2,000 steps can come near it.
 
 Power: a probability that ``P`` has wrong by so much, either of a single state and action, or of
 all at once, as of a wind that blows everywhere; with the steps that a check takes by default.

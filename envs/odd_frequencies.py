@@ -15,7 +15,7 @@ from mdp.frequency_evidence import Frequencies, frequencies
 # The chance that counts of a right model are called odd: over all that is looked at.
 FALSE_ALARMS = 1e-6
 N_FAMILIES = 8
-# Steps 0, 1 to 2, 3 to 6, 7 to 14, ...
+# The first step, the next two, the next four, ...
 N_BUCKETS = 40
 # Starts by the start before them are counted for so many starting states at most.
 MAX_STARTS = 200
@@ -79,8 +79,17 @@ def _contexts(
     yield _bucket(steps.time), N_BUCKETS, lambda b: f" in {_steps_text(b)} of episodes"
     all_steps = np.arange(len(steps.row))
     yield _bucket(all_steps), N_BUCKETS, lambda b: f" in {_steps_text(b)} of the check"
-    yield steps.before, n_places + 1, lambda p: f" where the last outcome was P's number {p}"
-    yield steps.action_before, n_actions + 1, lambda a: f" right after action {a - 1}"
+    first = " at the beginning of episodes"
+    yield (
+        steps.before,
+        n_places + 1,
+        lambda p: f" where the last outcome was number {p} of P's" if p else first,
+    )
+    yield (
+        steps.action_before,
+        n_actions + 1,
+        lambda a: f" right after action {a - 1}" if a else first,
+    )
 
 
 def _odd_starts(watched: WatchedEnv) -> Iterator[str]:

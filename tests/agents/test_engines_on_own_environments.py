@@ -123,7 +123,7 @@ def test_one_whose_state_cannot_be_set_is_interpreted():
     model = train(Hidden, "auto")
     assert transition_model(Hidden()) is not None
     assert model.engine_in_use == (
-        "interpreted: the environment has no attribute s by which its state can be set"
+        "interpreted: the environment does not go on from where its attribute s is set"
     )
 
 

@@ -343,6 +343,22 @@ class Deaf(Corridor):
         return result
 
 
+class Torn(Corridor):
+    """Goes on from ``s``, and rewards by where it thinks that it is."""
+
+    place = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.place, info = super().reset(seed=seed)
+        return self.place, info
+
+    def step(self, action):
+        before, self.place = self.place, None
+        self.place, reward, *rest = super().step(action)
+        surprised = abs(self.place - before) > 2
+        return self.place, reward - surprised, *rest
+
+
 class Elsewhere(Unsettable):
     """``s`` is its size."""
 
@@ -353,7 +369,7 @@ class Elsewhere(Unsettable):
         self.place = 0
 
 
-@pytest.mark.parametrize("kind", [Unsettable, Deaf, Elsewhere])
+@pytest.mark.parametrize("kind", [Unsettable, Deaf, Torn, Elsewhere])
 def test_states_that_cannot_be_set(kind):
     check = check_transition_model(kind(), n_steps=FEW)
     assert check.refusal is None
@@ -413,6 +429,24 @@ def test_odd_environments_are_refused_in_one_line(how, reason):
     refusal = check_transition_model(Odd(how)).refusal
     assert reason in refusal
     assert "\n" not in refusal
+
+
+class Pictured(Corridor):
+    """What is observed is no number."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.observation_space = spaces.Box(0, 1, (5,))
+
+    def observe(self):
+        return np.eye(5, dtype=np.float32)[self.s]
+
+
+def test_states_are_read_where_observations_are_no_numbers():
+    assert check_transition_model(Pictured(), n_steps=FEW).refusal is None
+    assert transition_model(Pictured()) is not None
+    assert observations_of_states(Pictured()) is None
+    assert "state 3" in check_transition_model(Pictured(altered(reward=10.0))).refusal
 
 
 def test_spaces_must_fit():
