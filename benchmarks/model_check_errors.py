@@ -78,8 +78,8 @@ class SealedEnv(TableEnv):
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         """Draw an outcome."""
         self.s = self.place
-        self.place, *rest = super().step(action)
-        return self.place, *rest
+        self.place, reward, terminated, truncated, info = super().step(action)
+        return self.place, reward, terminated, truncated, info
 
 
 def random_table(rng: Generator) -> tuple[Table, list[float]]:

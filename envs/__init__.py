@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import importlib
-from typing import TYPE_CHECKING
+from typing import Any
 
 import gymnasium as gym
 from gymnasium.envs.registration import WrapperSpec
 
 from envs.grid_map import MAX_STATES
 
-if TYPE_CHECKING:
-    from envs.model_checks import ModelCheck, check_transition_model
-
-__all__ = ["ModelCheck", "check_transition_model"]
+__all__ = ["ModelCheck", "check_transition_model"]  # loaded when asked for
 
 PATH_MULTIPLE = 10
 BANDITS = {
@@ -65,7 +62,7 @@ for bandit_id, entry_point in BANDITS.items():
     )
 
 
-def __getattr__(name: str) -> object:
+def __getattr__(name: str) -> Any:
     # Loaded on first use: registering environments is all that most need.
     if name not in __all__:
         raise AttributeError(f"module 'envs' has no attribute {name!r}")
