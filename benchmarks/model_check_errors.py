@@ -5,7 +5,7 @@
 False alarms: random models, each its environment's very own, of 1 to 30 states, 1 to 4 actions and
 up to 5 outcomes, with certain and very unlikely ones among them; in one of twenty the state cannot
 be set. The bound is one in a million over all tests of a check. A second row moves it to one in
-ten, where a check of 2,000 steps can come near it.
+ten, which a check of 500 steps can come near.
 
 Power: a probability that ``P`` has wrong by so much, either of a single state and action, or of
 all at once, as of a wind that blows everywhere; with the steps that a check takes by default.
@@ -28,8 +28,8 @@ from numpy.random import Generator
 from envs import check_transition_model, odd_frequencies
 
 N_MODELS = 10_000
-STEPS = 2_000
-REPEATS = 20
+STEPS = 500
+REPEATS = 10
 ERRORS = (0.02, 0.05, 0.1, 0.2, 0.3)
 WIND = 0.3
 
@@ -148,7 +148,8 @@ def main() -> None:
         refused = false_alarms(n_models, bound)
         print(
             f"{refused} of {n_models:,} right models refused, at a bound of {bound:g} "
-            f"({time.process_time() - started:.0f} s of processor time)"
+            f"({time.process_time() - started:.0f} s of processor time)",
+            flush=True,
         )
     odd_frequencies.FALSE_ALARMS = 1e-6
     print(f"\nshare of {REPEATS} wrong models refused, by the error of a probability of {WIND}")

@@ -69,7 +69,8 @@ def check_transition_model(env: Env, n_steps: int = N_STEPS) -> ModelCheck:
     - Frequencies are held against the model's probabilities: for each state and action, for all
       that should be alike together, and these by the step of the episode, by the number of steps so
       far, by the last outcome and by the last action, so that much of what depends on more than the
-      state shows. A right model is refused with a chance of at most one in a million.
+      state shows. A right model is refused with a chance of at most one in a million, if ``s``,
+      where it can be set, is all of the state.
 
     Not found is what happens too seldom to be seen, what is hidden in states that neither episodes
     nor setting ``s`` lead to, and what changes after the check. The copy is a deep one, or another

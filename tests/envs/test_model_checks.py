@@ -469,6 +469,24 @@ def test_odd_environments_are_refused_in_one_line(how, reason):
     assert "\n" not in refusal
 
 
+def test_what_random_play_hardly_ever_reaches_is_found():
+    """Each wrong step leads back to the start: 1 in 30,000 random tries comes to the last state."""
+
+    def ladder(reward):
+        table = {
+            s: {0: [(1.0, 0, 0.0, False)], 1: [(1.0, min(s + 1, 15), 0.0, s == 15)]}
+            for s in range(16)
+        }
+        table[15][1] = [(1.0, 15, reward, True)]
+        return table
+
+    start = np.eye(16)[0]
+    for kind in (Corridor, Unsettable):
+        assert check_transition_model(kind(ladder(1.0), ladder(1.0), start), FEW).refusal is None
+        refusal = check_transition_model(kind(ladder(2.0), ladder(1.0), start), FEW).refusal
+        assert "state 15, action 1: P says state 15 with reward 2.0, terminated" in refusal
+
+
 class Pictured(Corridor):
     """What is observed is no number."""
 
