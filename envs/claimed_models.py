@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import gymnasium as gym
@@ -28,18 +29,51 @@ TRUSTED_CLASSES = (FrozenLakeEnv, CliffWalkingEnv, TaxiEnv)
 
 @dataclass(frozen=True, eq=False)
 class Claim:
-    """A model as an environment tells it.
+    """What an environment says of its dynamics, worked out when it is asked for.
 
-    Attributes:
-        model: the dynamics.
-        observations: what is observed in each state, states along the first axis; None where the
-            environment does not say.
-        observes_states: whether an observation is the number of the state.
+    Args:
+        base: an environment that `brings_model`, without wrappers.
     """
 
-    model: TransitionModel
-    observations: NDArray[Any] | None
-    observes_states: bool
+    base: Env
+
+    @cached_property
+    def model(self) -> TransitionModel:
+        """The dynamics."""
+        base = self.base
+        if isinstance(base, GridWorld | ClickBandit):
+            return base.transition_model()
+        P = base.get_wrapper_attr("P")  # noqa: N806 (Gymnasium's own name)
+        return TransitionModel.from_gymnasium(P, base.get_wrapper_attr("initial_state_distrib"))
+
+    @cached_property
+    def observations(self) -> NDArray[Any] | None:
+        """What is observed in each state, states along the first axis; None if it does not say."""
+        if isinstance(self.base, GridWorld):
+            return self.base.observation_of(np.arange(self.base.dynamics.n_states))
+        space = self.base.observation_space
+        return np.arange(space.n) if isinstance(space, gym.spaces.Discrete) else None
+
+    @property
+    def observes_states(self) -> bool:
+        """Whether an observation is the number of the state."""
+        return not isinstance(self.base, GridWorld) and self.observations is not None
+
+    def check_spaces(self) -> None:
+        """Make sure that the model has the environment's actions and as many states.
+
+        Raises:
+            ValueError: if not.
+        """
+        base, model = self.base, self.model
+        if not isinstance(base.action_space, gym.spaces.Discrete) or (
+            int(base.action_space.n) != model.n_actions
+        ):
+            text = f"it has {model.n_actions} actions, where the space is {base.action_space}"
+            raise ValueError(text)
+        if self.observations is not None and len(self.observations) != model.n_states:
+            text = f"it has {model.n_states} states, where the space is {base.observation_space}"
+            raise ValueError(text)
 
 
 def claim_of(base: Env) -> Claim | None:
@@ -52,22 +86,19 @@ def claim_of(base: Env) -> Claim | None:
         ValueError: where what it says is no model, in one line.
     """
     try:
-        return _claim_of(base) if _brings_model(base) else None
+        if not brings_model(base):
+            return None
+        claim = Claim(base)
+        if not is_ours(base):
+            claim.check_spaces()
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"the environment's P is no model: {reason}") from error
+    return claim
 
 
-def is_trusted(base: Env) -> bool:
-    """Whether an environment's own word on its dynamics is enough."""
-    kind = type(base)
-    if any(callable(getattr(kind, name, None)) for name in vars(base)):
-        return False  # a method was replaced by hand
-    ours = isinstance(base, GridWorld | ClickBandit) and kind.__module__.startswith("envs.")
-    return ours or kind in TRUSTED_CLASSES
-
-
-def _brings_model(base: Env) -> bool:
+def brings_model(base: Env) -> bool:
+    """Whether an environment says anything of its dynamics."""
     if isinstance(base, GridWorld | ClickBandit):
         return True
     # A fickle passenger of Taxi changes his mind outside of P.
@@ -76,23 +107,17 @@ def _brings_model(base: Env) -> bool:
     return brings and hasattr(base, "initial_state_distrib") and not fickle
 
 
-def _claim_of(base: Env) -> Claim:
-    if isinstance(base, GridWorld | ClickBandit):
-        model = base.transition_model()
-    else:
-        model = TransitionModel.from_gymnasium(
-            base.get_wrapper_attr("P"), base.get_wrapper_attr("initial_state_distrib")
-        )
-    _check_space("actions", base.action_space, model.n_actions)
-    states = np.arange(model.n_states)
-    if isinstance(base, GridWorld):
-        return Claim(model, base.observation_of(states), observes_states=False)
-    if not isinstance(base.observation_space, gym.spaces.Discrete):
-        return Claim(model, None, observes_states=False)
-    _check_space("states", base.observation_space, model.n_states)
-    return Claim(model, states, observes_states=True)
+def is_trusted(base: Env) -> bool:
+    """Whether an environment's own word on its dynamics is enough."""
+    return is_ours(base) or (type(base) in TRUSTED_CLASSES and not _is_changed(base))
 
 
-def _check_space(what: str, space: gym.Space[Any], number: int) -> None:
-    if not isinstance(space, gym.spaces.Discrete) or int(space.n) != number:
-        raise ValueError(f"it has {number} {what}, where the space is {space}")
+def is_ours(base: Env) -> bool:
+    """Whether it is one of this project's, as it was made."""
+    ours = isinstance(base, GridWorld | ClickBandit)
+    return ours and type(base).__module__.startswith("envs.") and not _is_changed(base)
+
+
+def _is_changed(base: Env) -> bool:
+    """Whether a method of this very object was replaced by hand."""
+    return any(callable(getattr(type(base), name, None)) for name in vars(base))
