@@ -5,6 +5,7 @@ import pickle
 import random
 import re
 import threading
+from collections import defaultdict
 
 import gymnasium as gym
 import numpy as np
@@ -683,6 +684,17 @@ def test_what_cannot_be_written_down_is_told_apart(monkeypatch):
         env.note = lambda: None
         assert (transition_model(env) is None) is (wind == 0.6)
     assert len(done) == 3
+
+
+def test_a_model_that_cannot_be_written_down_is_told_apart(monkeypatch):
+    done = count_checks(monkeypatch)
+    env = Corridor()
+    env.P = defaultdict(lambda: None, outcomes())
+    assert transition_model(env) is not None
+    assert transition_model(env) is not None
+    env.P[3][1] = altered(reward=10.0)[3][1]
+    assert transition_model(env) is None
+    assert len(done) == 2
 
 
 def test_a_check_comes_out_the_same_every_time():
