@@ -154,7 +154,7 @@ def main() -> None:
     odd_frequencies.FALSE_ALARMS = 1e-6
     print(f"\nshare of {REPEATS} wrong models refused, by the error of a probability of {WIND}")
     print(f"{'states x actions, wrong in':38}" + "".join(f"{error:>7}" for error in ERRORS))
-    for n_states, n_actions in ((5, 2), (100, 4), (500, 4)):
+    for n_states, n_actions in ((5, 2), (500, 4)):
         for everywhere in (False, True):
             started = time.process_time()
             shares = [share_found(n_states, n_actions, error, everywhere) for error in ERRORS]

@@ -656,7 +656,8 @@ def test_each_environment_is_checked_once(monkeypatch):
     done = count_checks(monkeypatch)
     for seed in range(3):
         env = gym.wrappers.TimeLimit(Corridor(), 50)
-        env.action_space.seed(seed)
+        env.unwrapped.observation_space.seed(seed)
+        env.unwrapped.rng = np.random.default_rng(seed)
         for _ in range(3):
             env.reset(seed=seed)
             env.step(1)
