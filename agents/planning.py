@@ -20,7 +20,12 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.common.online import OnlineAlgorithm
 from agents.common.signatures import CommonArguments
-from envs.known_models import observations_of_states, time_limit, transition_model
+from envs.known_models import (
+    model_check,
+    observations_of_states,
+    time_limit,
+    transition_model,
+)
 from mdp import TransitionModel, finite_horizon_optimum, value_iteration
 from mdp.array_types import Ints
 
@@ -128,7 +133,9 @@ class PlanningAgent(OnlineAlgorithm):
         env = vec_env.envs[0]
         model, observations = transition_model(env), observations_of_states(env)
         if model is None or observations is None:
-            raise ValueError(f"{name} needs an environment whose transition model is known")
+            check = model_check(env)
+            why = "" if check is None or check.refusal is None else f": {check.refusal}"
+            raise ValueError(f"{name} needs an environment whose transition model is known{why}")
         if observations.ndim != 1 or len(np.unique(observations)) < len(observations):
             raise ValueError(f"{name} needs observations that are the numbers of the states")
         by_state, horizon = self._plan(model, time_limit(env))

@@ -12,9 +12,9 @@ import numpy as np
 import torch as th
 from rich.console import Console
 
-from commands.run_output import describe
+from commands.run_output import describe, print_refusal
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator, why_not_exact
+from pipeline.evaluation.exact import exact_evaluator, model_refusal, why_not_exact
 from pipeline.filming import write_film
 from pipeline.model_choice import ChosenModel
 from pipeline.model_loading import load_to_play
@@ -140,7 +140,10 @@ def _print_returns(console: Console, returns: list[float], lengths: list[int]) -
 def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: bool) -> None:
     """Say what the policy is worth, where that can be computed."""
     evaluator = exact_evaluator(spec)
-    if evaluator is None or why_not_exact(model, evaluator.observations):
+    if evaluator is None:
+        print_refusal(console, model_refusal(spec))
+        return
+    if why_not_exact(model, evaluator.observations):
         return
     try:
         evaluation = evaluator(model, deterministic)

@@ -69,6 +69,14 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     console.print(f"[dim]{settings}[/]", highlight=False)
 
 
+def print_refusal(console: Console, refusal: str | None) -> None:
+    """Say why the environment's own model is not used, where that is so."""
+    if refusal is not None:
+        console.print(
+            f"{refusal}; figures are sampled", markup=False, highlight=False, soft_wrap=True
+        )
+
+
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
     speed = outcome.n_steps / max(outcome.seconds, 1e-9)

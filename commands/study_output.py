@@ -75,6 +75,8 @@ def _do_missing(
         highlight=False,
     )
     with StudyProgress(console, planned, done) as progress:
+        for run in done:
+            progress.note_refusal(run)
         return execute(missing, root, command, n_workers, progress.note)
 
 

@@ -35,6 +35,7 @@ class StudyProgress:
         self.total = Counter((run.agent, run.environment) for run in runs)
         self.done = Counter((run.agent, run.environment) for run in done)
         self.failed: Counter[tuple[str, str]] = Counter()
+        self._refused: set[str] = set()
         self.n_missing = len(runs) - len(done)
         self.n_ended = 0
         self.started = time.monotonic()
@@ -65,6 +66,7 @@ class StudyProgress:
         key = (run.agent, run.environment)
         if failure is None:
             self.done[key] += 1
+            self.note_refusal(run)
         else:
             self.failed[key] += 1
             self.console.print(
@@ -73,6 +75,18 @@ class StudyProgress:
                 highlight=False,
             )
         self._show()
+
+    def note_refusal(self, run: PlannedRun) -> None:
+        """Say once for each environment why its own model is not used, where that is so."""
+        refusal = run.run.read_info().get("model_refused")
+        if refusal is not None and run.environment not in self._refused:
+            self._refused.add(run.environment)
+            self.console.print(
+                f"{run.environment}: {refusal}; figures are sampled",
+                markup=False,
+                highlight=False,
+                soft_wrap=True,
+            )
 
     def _show(self) -> None:
         if self.live is not None:

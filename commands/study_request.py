@@ -87,10 +87,7 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
     agents, environments = ", ".join(args.algos), ", ".join(args.env)
     folders = "-".join(map(environment_name, args.env))
     return StudySpec(
-        name=file_name(
-            f"{'-'.join(map(environment_name, args.env))}_{'-'.join(args.algos)}",
-            LONGEST_STUDY_NAME,
-        ),
+        name=file_name(f"{folders}_{'-'.join(args.algos)}", LONGEST_STUDY_NAME),
         title=f"{agents} on {environments}",
         agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
         environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),

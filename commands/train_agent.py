@@ -113,13 +113,14 @@ def main() -> int:
     spec = train_spec(args)
     from rich.console import Console
 
-    from commands.run_output import print_header, print_outcome
+    from commands.run_output import print_header, print_outcome, print_refusal
     from pipeline.run_folder import INTERRUPTED
     from pipeline.training import carry_out, prepare
 
     console = Console(quiet=spec.verbose < 1)
     training = prepare(spec, console, vars(args), command_line())
     print_header(console, spec)
+    print_refusal(console, training.refusal)
     outcome = carry_out(training)
     print_outcome(console, spec, outcome)
     return INTERRUPT if outcome.state == INTERRUPTED else 0

@@ -1,9 +1,16 @@
 """Gymnasium environments whose optimum is known exactly; importing the package registers them."""
 
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
 import gymnasium as gym
 from gymnasium.envs.registration import WrapperSpec
 
 from envs.grid_map import MAX_STATES
+
+__all__ = ["ModelCheck", "check_transition_model"]  # loaded when asked for
 
 PATH_MULTIPLE = 10
 BANDITS = {
@@ -53,3 +60,10 @@ for bandit_id, entry_point in BANDITS.items():
             ),
         ),
     )
+
+
+def __getattr__(name: str) -> Any:
+    # Loaded on first use: registering environments is all that most need.
+    if name not in __all__:
+        raise AttributeError(f"module 'envs' has no attribute {name!r}")
+    return getattr(importlib.import_module("envs.model_checks"), name)

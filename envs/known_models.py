@@ -1,25 +1,24 @@
 """What is known exactly about a Gymnasium environment: its dynamics, with the wrappers folded in.
 
 The answer is None wherever something in the chain of wrappers is not known to leave the dynamics
-alone: a wrong model would make every figure computed from it wrong.
+alone: a wrong model would make every figure computed from it wrong. For the same reason an
+environment's word is not proof: a model that comes neither from Gymnasium's own classes nor from
+this project's is held against `step` before it is believed (`envs.model_checks`), once a process.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
-from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-from gymnasium.envs.toy_text.taxi import TaxiEnv
 from numpy.typing import NDArray
 
-from envs.bandits.clicks import ClickBandit
+from envs.claimed_models import Claim, claim_of, is_trusted
 from envs.grid import GridWorld
 from envs.grid_map import GOAL
+from envs.model_checks import ModelCheck, checked
 from envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
@@ -47,27 +46,26 @@ TRANSPARENT_WRAPPERS = frozenset(
         "stable_baselines3.common.monitor.Monitor",
     }
 )
-KNOWN_ENVIRONMENTS = (GridWorld, ClickBandit, FrozenLakeEnv, CliffWalkingEnv, TaxiEnv)
 OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
 
 
 def transition_model(env: Env) -> TransitionModel | None:
     """The exact dynamics of an environment, with the rewards that its outermost wrapper gives.
 
-    Known are this project's grid worlds, its bandits with click rates, and environments that hold
-    ``P`` and ``initial_state_distrib`` as Gymnasium's FrozenLake, CliffWalking and Taxi do, under
-    wrappers that leave the dynamics alone, `ScaleReward`, and `TerminationReward` where it gives
-    its reward at terminations only. A time limit is no part of the model: see `time_limit`.
+    Known are this project's grid worlds, its bandits with click rates, Gymnasium's FrozenLake,
+    CliffWalking and Taxi, and environments that hold ``P`` and ``initial_state_distrib`` as these
+    do and pass `envs.check_transition_model`, under wrappers that leave the dynamics alone,
+    `ScaleReward`, and `TerminationReward` where it gives its reward at terminations only. A time
+    limit is no part of the model: see `time_limit`.
 
     Returns:
         The model, or None where it is not known.
     """
     base, wrappers = _layers(env)
-    if not all(_folds(wrapper) for wrapper in wrappers):
+    claim = _believed(base) if all(_folds(wrapper) for wrapper in wrappers) else None
+    if claim is None:
         return None
-    model = _base_model(base)
-    if model is None:
-        return None
+    model = claim.model
     reward = model.reward
     for wrapper in wrappers:
         if isinstance(wrapper, ScaleReward):
@@ -75,6 +73,18 @@ def transition_model(env: Env) -> TransitionModel | None:
         elif isinstance(wrapper, TerminationReward):
             reward = np.where(model.terminated, wrapper.last_reward, reward)
     return model if reward is model.reward else replace(model, reward=reward)
+
+
+def model_check(env: Env) -> ModelCheck | None:
+    """What came of holding the environment's own model against its `step`.
+
+    Those whose word is enough pass without a look.
+
+    Returns:
+        The check; None where there is no model, or wrappers hide it.
+    """
+    base, wrappers = _layers(env)
+    return _judged(base)[1] if all(_folds(wrapper) for wrapper in wrappers) else None
 
 
 def time_limit(env: Env) -> int | None:
@@ -95,9 +105,10 @@ def success_outcomes(env: Env) -> Bools | None:
         The mask, or None where the model is not known or no episode terminates.
     """
     base, wrappers = _layers(env)
-    model = _base_model(base) if all(_folds(wrapper) for wrapper in wrappers) else None
-    if model is None:
+    claim = _believed(base) if all(_folds(wrapper) for wrapper in wrappers) else None
+    if claim is None:
         return None
+    model = claim.model
     ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
     if not ends.any():
         return None
@@ -117,14 +128,10 @@ def observations_of_states(env: Env) -> NDArray[Any] | None:
         The observations of states 0, 1, ..., S-1, or None where they are not known.
     """
     base, wrappers = _layers(env)
-    if isinstance(base, GridWorld):
-        observations = base.observation_of(np.arange(base.dynamics.n_states))
-    elif isinstance(base, ClickBandit):
-        observations = np.arange(base.n_contexts)
-    elif _holds_model(base) and isinstance(base.observation_space, gym.spaces.Discrete):
-        observations = np.arange(base.observation_space.n)
-    else:
+    claim = _believed(base)
+    if claim is None or claim.observations is None:
         return None
+    observations = claim.observations
     for wrapper in wrappers:
         if isinstance(wrapper, OBSERVATION_WRAPPERS):
             observations = wrapper.map_observations(observations)
@@ -151,29 +158,19 @@ def _folds(wrapper: Wrapper) -> bool:
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
 
 
-def _base_model(base: Env) -> TransitionModel | None:
-    if _steps_otherwise(base):
-        return None
-    if isinstance(base, GridWorld | ClickBandit):
-        return base.transition_model()
-    if not _holds_model(base):
-        return None
-    P = base.get_wrapper_attr("P")  # noqa: N806 (Gymnasium's own name)
+def _believed(base: Env) -> Claim | None:
+    """What an environment says of its dynamics, where that is to be believed."""
+    claim, check = _judged(base)
+    return claim if check is not None and check.refusal is None else None
+
+
+def _judged(base: Env) -> tuple[Claim | None, ModelCheck | None]:
     try:
-        return TransitionModel.from_gymnasium(P, base.get_wrapper_attr("initial_state_distrib"))
+        claim = claim_of(base)
     except ValueError as error:
-        gym.logger.warn(f"{base}: what its P says is no model and is not used: {error}")
-        return None
-
-
-def _steps_otherwise(base: Env) -> bool:
-    """Whether it is a subclass of an environment that is known, with a step or reset of its own."""
-    known = next((one for one in KNOWN_ENVIRONMENTS if isinstance(base, one)), type(base))
-    return type(base).step is not known.step or type(base).reset is not known.reset
-
-
-def _holds_model(base: Env) -> bool:
-    # A fickle passenger of Taxi changes his mind outside of P.
-    fickle = getattr(base, "fickle_passenger", False)
-    holds = isinstance(getattr(base, "P", None), Mapping) and hasattr(base, "initial_state_distrib")
-    return holds and not fickle
+        return None, ModelCheck(str(error))
+    if claim is None:
+        return None, None
+    if is_trusted(base):
+        return claim, ModelCheck(None, bit_for_bit=True, state_can_be_set=True)
+    return claim, checked(base, claim)

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.companions import replay_buffer_of, statistics_of
 from pipeline.model_finding import model_at
-from pipeline.model_loading import agent_class, (
+from pipeline.model_loading import (
     REPLAY_BUFFER,
     STATISTICS,
+    agent_class,
     check_origin,
     hand_written_algorithm,
     load_model,

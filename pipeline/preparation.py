@@ -22,7 +22,12 @@ from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCh
 from pipeline.continuation import continuing, load_to_continue, statistics_to_continue
 from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator, why_not_exact
+from pipeline.evaluation.exact import (
+    ExactEvaluator,
+    exact_evaluator,
+    model_refusal,
+    why_not_exact,
+)
 from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
@@ -55,6 +60,7 @@ class Training:
         evaluation: the evaluation callback, also part of ``callback``.
         callback: all callbacks.
         pulls: keeps every pull, on bandits; else None, and where a compiled loop was asked for.
+        refusal: why the model that the environment brings is not believed; None if it is.
     """
 
     spec: TrainSpec
@@ -65,6 +71,7 @@ class Training:
     display: ProgressDisplay
     callback: BaseCallback
     pulls: PullRecorder | None = None
+    refusal: str | None = None
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
@@ -106,7 +113,10 @@ def set_up(
         callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
     if spec.verbose > 0:
         callbacks.append(display)
-    return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls)
+    refusal = None if evaluation.value_maps is not None else model_refusal(spec)
+    return Training(
+        spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls, refusal
+    )
 
 
 def _exact_evaluator(

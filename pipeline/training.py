@@ -99,6 +99,7 @@ def prepare(
             env_name=run.env_name,
             spec=spec.as_data(),
             versions=recorded_versions(),
+            **({} if training.refusal is None else {"model_refused": training.refusal}),
         )
         undo.pop_all()
     return training

@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from agents.compiled.cart_pole import CartPole
 from agents.compiled.finite_model import OUTCOME, FiniteModel
 from envs.known_models import (
+    model_check,
     observations_of_states,
     success_outcomes,
     time_limit,
@@ -77,6 +78,12 @@ def compile_envs(vec_env: VecEnv) -> World:
     return world
 
 
+def draws_alike(vec_env: DummyVecEnv) -> bool:
+    """Whether compiled environments draw the very numbers that these draw, for the same things."""
+    checks = [model_check(env) for env in vec_env.envs]
+    return all(check is None or check.bit_for_bit for check in checks)
+
+
 def _world_of(env: Env) -> World:
     if isinstance(env.unwrapped, CartPoleEnv):
         return _cart_pole(env)
@@ -103,7 +110,10 @@ def _check_monitor(env: Env) -> None:
 def _finite_model(env: Env) -> FiniteModel:
     model = transition_model(env)
     observations = observations_of_states(env)
-    if model is None or observations is None:
+    check = model_check(env)
+    if check is not None and check.refusal is not None:
+        raise NotCompilable(check.refusal)
+    if check is None or model is None or observations is None:
         raise NotCompilable("the environment's transition model is not known")
     if not np.issubdtype(observations.dtype, np.integer) or observations.ndim != 1:
         raise NotCompilable("the observations are not single numbers")
@@ -112,6 +122,8 @@ def _finite_model(env: Env) -> FiniteModel:
     if watching:
         names = ", ".join(sorted(wrapper.__name__ for wrapper in watching))
         raise NotCompilable(f"{names} must see every step")
+    if not check.state_can_be_set:
+        raise NotCompilable("the environment does not go on from where its attribute s is set")
     monitor = monitor_of(env)
     seen_by_monitor = model if monitor is None else transition_model(monitor.env)
     assert seen_by_monitor is not None

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.common.callback_horizons import unknown_callbacks
-from agents.compiled.compile_envs import NotCompilable, World, compile_envs
+from agents.compiled.compile_envs import NotCompilable, World, compile_envs, draws_alike
 from agents.compiled.engine import CompiledEngine
 from agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 
@@ -33,7 +33,9 @@ def choose_engine(
 ) -> CompiledEngine | None:
     """The compiled engine where the agent wants it and it can be had; None for interpreting.
 
-    The choice and its reason are left in ``agent.engine_in_use``.
+    An environment that draws in its own way is equal to its compiled copy in distribution alone:
+    such a copy has to be asked for, so that results do not hang on what else kept an agent from
+    compiling. The choice and its reason are left in ``agent.engine_in_use``.
 
     Raises:
         ValueError: if the agent insists on compiled and it cannot be had.
@@ -49,6 +51,14 @@ def choose_engine(
         agent.engine_in_use = f"interpreted: {reason}"
         return None
     agent.engine_in_use = "compiled"
+    if not draws_alike(agent.env):
+        if agent.engine == "auto":
+            agent.engine_in_use = (
+                "interpreted: the environment draws in its own way, so that compiled training "
+                "is equal in distribution only (engine: compiled takes that)"
+            )
+            return None
+        agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"
     return CompiledEngine(agent, world, callback, log_interval)
 
 

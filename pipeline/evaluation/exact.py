@@ -19,7 +19,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.tabular_algorithm import TabularAlgorithm
-from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
+from envs.known_models import (
+    model_check,
+    observations_of_states,
+    success_outcomes,
+    time_limit,
+    transition_model,
+)
 from envs.layout import GridLayout, grid_layout
 from mdp import (
     TransitionModel,
@@ -85,8 +91,7 @@ class ExactEvaluator:
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     """The exact evaluator of a run, or None where episodes have to be sampled."""
-    special = spec.hyperparams
-    if special.normalize is not None or special.frame_stack or special.vec_env_wrapper:
+    if _is_wrapped_as_vector(spec):
         return None
     env = make_single_env(spec)
     try:
@@ -99,6 +104,8 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         success, layout = success_outcomes(env), grid_layout(env)
     finally:
         env.close()
+    if layout is not None and layout.n_states != model.n_states:
+        layout = None  # a grid world of somebody's own has states that are no cells
     yardstick = Yardstick(
         optimum=float(finite_horizon_optimum(model, horizon).start_value),
         blind=float(best_blind_return(model, horizon)),
@@ -128,6 +135,27 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
     if any(state is not None for _, state in asked):
         return "predict remembers what it saw before"
     return "" if np.array_equal(first, second) else "predict draws its actions at random"
+
+
+def model_refusal(spec: TrainSpec) -> str | None:
+    """Why the model that the environment brings is not believed, in one line; None if it is.
+
+    None too where it brings none, or where it would not serve the evaluation of such a run.
+    """
+    if _is_wrapped_as_vector(spec):
+        return None
+    env = make_single_env(spec)
+    try:
+        check = model_check(env)
+    finally:
+        env.close()
+    return None if check is None else check.refusal
+
+
+def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
+    """Whether the agent sees the environment through something around all of its copies."""
+    special = spec.hyperparams
+    return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)
 
 
 def policy_matrix(

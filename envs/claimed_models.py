@@ -1,0 +1,123 @@
+"""What environments, without their wrappers, say of their own dynamics, and whose word is enough.
+
+Gymnasium's FrozenLake, CliffWalking and Taxi and this project's own classes step as they say, which
+tests hold. Whatever else brings a model, a subclass of one of these too, only claims to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+from gymnasium.envs.toy_text.taxi import TaxiEnv
+from numpy.typing import NDArray
+
+from envs.bandits.clicks import ClickBandit
+from envs.grid import GridWorld
+from mdp.transition_model import TransitionModel
+
+Env = gym.Env[Any, Any]
+
+TRUSTED_CLASSES = (FrozenLakeEnv, CliffWalkingEnv, TaxiEnv)
+
+
+@dataclass(frozen=True, eq=False)
+class Claim:
+    """What an environment says of its dynamics, worked out when it is asked for.
+
+    Args:
+        base: an environment that `brings_model`, without wrappers.
+    """
+
+    base: Env
+
+    @cached_property
+    def model(self) -> TransitionModel:
+        """The dynamics."""
+        base = self.base
+        if isinstance(base, GridWorld | ClickBandit):
+            return base.transition_model()
+        P = base.get_wrapper_attr("P")  # noqa: N806 (Gymnasium's own name)
+        return TransitionModel.from_gymnasium(P, base.get_wrapper_attr("initial_state_distrib"))
+
+    @cached_property
+    def observations(self) -> NDArray[Any] | None:
+        """What is observed in each state, states along the first axis; None if it does not say."""
+        if isinstance(self.base, GridWorld):
+            return self.base.observation_of(np.arange(self.base.dynamics.n_states))
+        space = self.base.observation_space
+        return np.arange(space.n) if isinstance(space, gym.spaces.Discrete) else None
+
+    @property
+    def observes_states(self) -> bool:
+        """Whether an observation is the number of the state."""
+        return not isinstance(self.base, GridWorld) and self.observations is not None
+
+    def check_spaces(self) -> None:
+        """Make sure that the model has the environment's actions and as many states.
+
+        Raises:
+            ValueError: if not.
+        """
+        base, model = self.base, self.model
+        if not isinstance(base.action_space, gym.spaces.Discrete) or (
+            int(base.action_space.n) != model.n_actions
+        ):
+            text = f"it has {model.n_actions} actions, where the space is {base.action_space}"
+            raise ValueError(text)
+        if self.observations is not None and len(self.observations) != model.n_states:
+            text = f"it has {model.n_states} states, where the space is {base.observation_space}"
+            raise ValueError(text)
+
+
+def claim_of(base: Env) -> Claim | None:
+    """What an environment says of its dynamics, None where it says nothing.
+
+    Args:
+        base: the environment, without wrappers.
+
+    Raises:
+        ValueError: where what it says is no model, in one line.
+    """
+    try:
+        if not brings_model(base):
+            return None
+        claim = Claim(base)
+        if not is_ours(base):
+            claim.check_spaces()
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"the environment's P is no model: {reason}") from error
+    return claim
+
+
+def brings_model(base: Env) -> bool:
+    """Whether an environment says anything of its dynamics."""
+    if isinstance(base, GridWorld | ClickBandit):
+        return True
+    # A fickle passenger of Taxi changes his mind outside of P.
+    fickle = getattr(base, "fickle_passenger", False)
+    brings = isinstance(getattr(base, "P", None), Mapping)
+    return brings and hasattr(base, "initial_state_distrib") and not fickle
+
+
+def is_trusted(base: Env) -> bool:
+    """Whether an environment's own word on its dynamics is enough."""
+    return is_ours(base) or (type(base) in TRUSTED_CLASSES and not _is_changed(base))
+
+
+def is_ours(base: Env) -> bool:
+    """Whether it is one of this project's, as it was made."""
+    ours = isinstance(base, GridWorld | ClickBandit)
+    return ours and type(base).__module__.startswith("envs.") and not _is_changed(base)
+
+
+def _is_changed(base: Env) -> bool:
+    """Whether a method of this very object was replaced by hand."""
+    return any(callable(getattr(type(base), name, None)) for name in vars(base))
