@@ -168,6 +168,7 @@ def _learn(training: Training) -> None:
     training.model.learn(
         spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
         callback=training.callback,
+        tb_log_name=spec.algo,
         reset_num_timesteps=spec.trained_agent is None,
         **kwargs,
     )
