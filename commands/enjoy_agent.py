@@ -5,7 +5,10 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from commands.flag_values import COUNT, COUNT_OR_NONE, SEED, THREADS, filled, whole_number
 from commands.parsing import OneLineParser
+
+STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
 
 EPILOG = """\
 examples:
@@ -26,39 +29,61 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("model", nargs="?", help="path of a model zip, instead of looking for a run")
-    add("--algo", help="agent (default: ppo, or what the zip's run folder says)")
-    add("--env", help="environment id (default: CartPole-v1, or what the run folder says)")
-    add("-f", "--folder", default="logs", help="folder above all runs (default: logs)")
-    add("--exp-id", type=int, default=0, metavar="N", help="number of the run (default: newest)")
+    add("--algo", type=filled, help="agent (default: ppo, or what the zip's run folder says)")
+    add(
+        "--env",
+        type=filled,
+        help="environment id (default: CartPole-v1, or what the run folder says)",
+    )
+    add("-f", "--folder", type=filled, default="logs", help="folder above all runs (default: logs)")
+    add(
+        "--exp-id",
+        type=COUNT_OR_NONE,
+        default=0,
+        metavar="N",
+        help="number of the run (default: newest)",
+    )
     add("--load-best", action="store_true", help="the model that evaluated best in training")
-    add("--load-checkpoint", type=int, metavar="STEPS", help="the checkpoint after that many steps")
+    add(
+        "--load-checkpoint",
+        type=COUNT_OR_NONE,
+        metavar="STEPS",
+        help="the checkpoint after that many steps",
+    )
     add("--load-last-checkpoint", action="store_true", help="the last checkpoint")
     add("--trust", action="store_true", help="load a library zip from outside the log folder")
     add("--device", default="auto", help="torch device (default: auto)")
-    add("--num-threads", type=int, default=1, help="torch threads (default: 1)")
+    add("--num-threads", type=THREADS, default=1, help="torch threads (1); -1 leaves it to torch")
     _add_playing_flags(parser)
     return parser
 
 
 def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("playing").add_argument
-    add("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="stop after so many steps")
-    add("--n-episodes", type=int, default=10, metavar="N", help="episodes to play (default: 10)")
+    add("-n", "--n-timesteps", type=STEPS, default=-1, metavar="N", help="stop after so many steps")
+    add("--n-episodes", type=COUNT, default=10, metavar="N", help="episodes to play (default: 10)")
     policy = parser.add_mutually_exclusive_group()
     policy.add_argument(
         "--deterministic", action="store_true", help="the policy's best actions (default)"
     )
     policy.add_argument("--stochastic", action="store_true", help="sample actions, or explore")
-    add("--seed", type=int, default=0, help="seed of the episodes (default: 0)")
+    add("--seed", type=SEED, default=0, help="seed of the episodes (default: 0; -1: a random one)")
     add(
         "--render",
         choices=["human", "ansi", "none"],
         help="how to watch (default: human where there is a display, else none)",
     )
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
-    add("--record", metavar="FILE", help="write a film, .gif or .mp4")
+    add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules with environments")
+    add(
+        "--gym-packages",
+        nargs="+",
+        type=filled,
+        default=[],
+        metavar="MODULE",
+        help="modules with environments",
+    )
 
 
 def main() -> int:

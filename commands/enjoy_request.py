@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from secrets import randbelow
 from typing import Literal
 
+from commands.parsing import check_device
 from pipeline.model_choice import ModelRequest
 from pipeline.settings.literals import parse_assignments
 
@@ -14,8 +16,9 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
     """The model that the arguments ask for.
 
     Raises:
-        UserError: if the arguments of the environment cannot be read.
+        UserError: if the arguments of the environment cannot be read, or there is no such device.
     """
+    check_device(args.device)
     return ModelRequest(
         path=None if args.model is None else Path(args.model),
         algo=args.algo,
@@ -24,9 +27,9 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
         run_number=args.exp_id,
         which=_which(args),
         is_trusted=args.trust,
-        env_kwargs=parse_assignments(args.env_kwargs),
+        env_kwargs=parse_assignments(args.env_kwargs, "--env-kwargs"),
         gym_packages=tuple(args.gym_packages),
-        seed=args.seed,
+        seed=args.seed if args.seed >= 0 else randbelow(2**31),
         device=args.device,
     )
 

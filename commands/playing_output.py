@@ -33,7 +33,7 @@ class PlayingRequest:
         render: how to watch: ``"human"``, ``"ansi"``, ``"none"``, or None for a window where there
             is a display to show it on.
         film: a file to write a film to, instead, or None.
-        num_threads: torch threads.
+        num_threads: torch threads; below 1 for PyTorch's own choice.
     """
 
     n_episodes: int = 10
@@ -88,7 +88,8 @@ def play(chosen: ChosenModel, request: PlayingRequest) -> None:
     Raises:
         UserError: if the model cannot be loaded or the environment cannot be rendered so.
     """
-    th.set_num_threads(request.num_threads)
+    if request.num_threads > 0:
+        th.set_num_threads(request.num_threads)
     console = Console(highlight=False)
     env = playing_env(chosen, request.mode)
     spec = chosen.spec

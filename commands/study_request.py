@@ -22,15 +22,6 @@ from pipeline.environments import check_env_id, import_gym_packages
 from pipeline.errors import UserError, unknown
 from pipeline.settings.literals import parse_assignments
 
-_MINIMUM = {
-    "seeds": 1,
-    "n_timesteps": 1,
-    "n_episodes": 1,
-    "episodes_table": 1,
-    "render_every": 0,
-    "jobs": 0,
-}
-
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
     """The study that the arguments mean, with what they change in it.
@@ -50,12 +41,6 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
 
 
 def _check_output(args: argparse.Namespace) -> None:
-    for key, least in _MINIMUM.items():
-        value = getattr(args, key)
-        if value is not None and value < least:
-            raise UserError(f"--{key.replace('_', '-')} must be at least {least}, not {value}")
-    if args.margin is not None and not args.margin >= 0:
-        raise UserError(f"--margin must be at least 0, not {args.margin}")
     if args.metric is not None and args.metric not in METRICS:
         raise unknown("--metric: unknown metric", args.metric, METRICS)
     check_tensorboard(args.tensorboard)

@@ -82,7 +82,8 @@ def prepare(
     Raises:
         UserError: if the spec does not work out; no folder is left behind then.
     """
-    th.set_num_threads(spec.num_threads)
+    if spec.num_threads > 0:
+        th.set_num_threads(spec.num_threads)
     kwargs = algorithm_kwargs(spec)
     suffix = f"_{uuid4()}" if spec.unique_id else ""
     if run is None:

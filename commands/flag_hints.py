@@ -1,0 +1,130 @@
+"""Flags that are not here: what is here instead, and what was probably meant."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Mapping, Sequence
+
+from agents import ALGORITHMS, load_algorithm
+from pipeline.errors import OTHER_NAMES, did_you_mean
+from pipeline.settings.hyperparams import SPECIAL_KEYS
+
+_NO_SEARCH = "hyperparameters are not searched for here; a study compares settings: compare.py"
+_NO_WANDB = "Weights & Biases is not supported; -tb DIR writes TensorBoard logs"
+_NO_HER = "it is for hindsight experience replay, which is not among the agents here"
+
+# Flags of rl_zoo3's train and enjoy that are not here, and why.
+INSTEAD: Mapping[str, str] = {
+    **dict.fromkeys(
+        (
+            "-optimize",
+            "--optimize-hyperparameters",
+            "--n-trials",
+            "--max-total-trials",
+            "--no-optim-plots",
+            "--n-jobs",
+            "--sampler",
+            "--pruner",
+            "--n-startup-trials",
+            "--n-evaluations",
+            "--optimization-log-path",
+            "--storage",
+            "--study-name",
+            "--trial-id",
+        ),
+        _NO_SEARCH,
+    ),
+    **dict.fromkeys(
+        (
+            "--track",
+            "--wandb-project-name",
+            "--wandb-entity",
+            "--wandb-group",
+            "-tags",
+            "--wandb-tags",
+        ),
+        _NO_WANDB,
+    ),
+    "--truncate-last-trajectory": _NO_HER,
+    "--reward-log": "the returns of the episodes are printed, and those of training are in the run "
+    "folder's 0.monitor.csv",
+    "--custom-objects": "no zip needs it: schedules are not unpickled by name from this project",
+}
+
+# Arguments of constructors that are flags.
+_SET_BY_FLAGS = {"env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+
+# What people type for flags of ours; the first of the flags that the command has is named.
+_OTHER_FLAGS: Mapping[str, Sequence[str]] = {
+    **dict.fromkeys(("algorithm", "agent", "model"), ("--algo", "--algos")),
+    **dict.fromkeys(("agents", "algorithms"), ("--algos", "--algo")),
+    **dict.fromkeys(("environment", "env-id", "env-name", "game", "envs"), ("--env",)),
+    **dict.fromkeys(
+        ("timesteps", "total-timesteps", "steps", "num-timesteps", "max-steps", "n-steps"),
+        ("--n-timesteps",),
+    ),
+    **dict.fromkeys(("episodes", "num-episodes"), ("--n-episodes",)),
+    **dict.fromkeys(("render-mode", "mode"), ("--render",)),
+    **dict.fromkeys(("video", "gif", "film", "record-video", "save-video"), ("--record",)),
+    **dict.fromkeys(("gpu", "cuda", "cpu"), ("--device",)),
+    **dict.fromkeys(("quiet", "silent"), ("--verbose",)),
+    **dict.fromkeys(
+        ("logdir", "log-dir", "output", "out", "save-dir"), ("--log-folder", "--folder")
+    ),
+    "log-folder": ("--folder",),
+    "folder": ("--log-folder",),
+    **dict.fromkeys(("resume", "continue", "load", "pretrained"), ("--trained-agent",)),
+    **dict.fromkeys(("workers", "n-jobs", "num-workers", "parallel"), ("--jobs",)),
+    **dict.fromkeys(("seed", "n-seeds", "num-seeds"), ("--seeds",)),
+    **dict.fromkeys(("config", "conf", "yaml", "yaml-file"), ("--conf-file",)),
+    **dict.fromkeys(("params", "hyperparameters", "kwargs"), ("--hyperparams",)),
+    **dict.fromkeys(("best",), ("--load-best",)),
+    **dict.fromkeys(("checkpoint",), ("--load-checkpoint",)),
+}
+
+
+def hint(words: Sequence[str], flags: Iterable[str], algos: Sequence[str]) -> str:
+    """What to do about a flag that there is not.
+
+    Args:
+        words: what the parser could not place, the flag first.
+        flags: the flags that there are.
+        algos: the agents that the command line names.
+
+    Returns:
+        One sentence; where nothing is near, an empty one.
+    """
+    flags = list(flags)
+    flag, _, value = words[0].partition("=")
+    value = value or next(iter(words[1:2]), "")
+    name = flag.lstrip("-").replace("_", "-").lower()
+    ours = next((known for known in _OTHER_FLAGS.get(name, ()) if known in flags), None)
+    setting = name.replace("-", "_")
+    known = _hyperparameters(algos)
+    if ours is not None and setting not in known:
+        return f"did you mean {ours!r}?"
+    if flag in INSTEAD:
+        return INSTEAD[flag]
+    meant = next(
+        (other for other in (setting, *OTHER_NAMES.get(setting, ())) if other in known), ""
+    )
+    if meant:
+        return _as_setting(meant, value, is_here="--hyperparams" in flags)
+    return did_you_mean(flag, flags)
+
+
+def _as_setting(name: str, value: str, is_here: bool) -> str:
+    given = value if value and not value.startswith("-") else "VALUE"
+    if name == "policy_kwargs":
+        given = '"dict(net_arch=[64, 64])"'
+    where = "go behind -params" if is_here else "are a matter of training"
+    return f"hyperparameters {where}: {'' if is_here else 'train.py '}-params {name}:{given}"
+
+
+def _hyperparameters(algos: Sequence[str]) -> set[str]:
+    """What can be set with -params for one of the agents."""
+    known = set(SPECIAL_KEYS)
+    for algo in algos:
+        if algo in ALGORITHMS and ALGORITHMS[algo].is_installed:
+            known |= set(inspect.signature(load_algorithm(algo)).parameters)
+    return known - _SET_BY_FLAGS
