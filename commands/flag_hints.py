@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import OTHER_NAMES, did_you_mean
+from pipeline.settings.constructor_arguments import RANGES
 from pipeline.settings.hyperparams import SPECIAL_KEYS
 
 _NO_SEARCH = "hyperparameters are not searched for here; a study compares settings: compare.py"
@@ -46,13 +47,22 @@ INSTEAD: Mapping[str, str] = {
         _NO_WANDB,
     ),
     "--truncate-last-trajectory": _NO_HER,
-    "--reward-log": "the returns of the episodes are printed, and those of training are in the run "
-    "folder's 0.monitor.csv",
-    "--custom-objects": "no zip needs it: schedules are not unpickled by name from this project",
 }
 
 # Arguments of constructors that are flags.
-_SET_BY_FLAGS = {"env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+SET_BY_FLAGS = {"env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
+
+# Hyperparameters of some agent: for these alone is it worth seconds to import the one meant.
+HYPERPARAMETERS = {
+    *SPECIAL_KEYS,
+    *RANGES,
+    *(name for names in OTHER_NAMES.values() for name in names),
+    *("alpha", "c", "likelihood", "mixing", "policy", "prior_failures", "prior_mean", "prior_std"),
+    *("prior_successes", "baseline", "engine", "exploration", "ignore_context", "initial_q_std"),
+    *("skip_terminal_update", "tie_breaking", "variant", "reward_std", "ridge", "use_rms_prop"),
+    *("normalize_advantage", "optimize_memory_usage", "replay_buffer_class", "use_sde"),
+    *("replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"),
+}
 
 # What people type for flags of ours; the first of the flags that the command has is named.
 _OTHER_FLAGS: Mapping[str, Sequence[str]] = {
@@ -89,42 +99,42 @@ def hint(words: Sequence[str], flags: Iterable[str], algos: Sequence[str]) -> st
     Args:
         words: what the parser could not place, the flag first.
         flags: the flags that there are.
-        algos: the agents that the command line names.
+        algos: the agents that the command line names; empty where they are named elsewhere.
 
     Returns:
         One sentence; where nothing is near, an empty one.
     """
     flags = list(flags)
     flag, _, value = words[0].partition("=")
-    value = value or next(iter(words[1:2]), "")
     name = flag.lstrip("-").replace("_", "-").lower()
+    setting = _hyperparameter(name.replace("-", "_"), algos)
     ours = next((known for known in _OTHER_FLAGS.get(name, ()) if known in flags), None)
-    setting = name.replace("-", "_")
-    known = _hyperparameters(algos)
-    if ours is not None and setting not in known:
+    if ours is not None and setting != name.replace("-", "_"):
         return f"did you mean {ours!r}?"
     if flag in INSTEAD:
         return INSTEAD[flag]
-    meant = next(
-        (other for other in (setting, *OTHER_NAMES.get(setting, ())) if other in known), ""
-    )
-    if meant:
-        return _as_setting(meant, value, is_here="--hyperparams" in flags)
+    if setting:
+        value = value or next(iter(words[1:2]), "")
+        return _as_setting(setting, value, is_here="--hyperparams" in flags)
     return did_you_mean(flag, flags)
+
+
+def _hyperparameter(name: str, algos: Sequence[str]) -> str:
+    """The hyperparameter that ``name`` is, or is another name of; empty for none."""
+    meant = [other for other in (name, *OTHER_NAMES.get(name, ())) if other in HYPERPARAMETERS]
+    if not meant or not algos:
+        return "".join(meant[:1])
+    known = set(SPECIAL_KEYS)
+    for algo in algos:
+        if algo in ALGORITHMS and ALGORITHMS[algo].is_installed:
+            known |= set(inspect.signature(load_algorithm(algo)).parameters)
+    return next((other for other in meant if other in known), "")
 
 
 def _as_setting(name: str, value: str, is_here: bool) -> str:
     given = value if value and not value.startswith("-") else "VALUE"
     if name == "policy_kwargs":
         given = '"dict(net_arch=[64, 64])"'
-    where = "go behind -params" if is_here else "are a matter of training"
-    return f"hyperparameters {where}: {'' if is_here else 'train.py '}-params {name}:{given}"
-
-
-def _hyperparameters(algos: Sequence[str]) -> set[str]:
-    """What can be set with -params for one of the agents."""
-    known = set(SPECIAL_KEYS)
-    for algo in algos:
-        if algo in ALGORITHMS and ALGORITHMS[algo].is_installed:
-            known |= set(inspect.signature(load_algorithm(algo)).parameters)
-    return known - _SET_BY_FLAGS
+    if is_here:
+        return f"hyperparameters go behind -params: -params {name}:{given}"
+    return f"hyperparameters are a matter of training: train.py -params {name}:{given}"

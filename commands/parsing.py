@@ -42,8 +42,8 @@ class OneLineParser(argparse.ArgumentParser):
         from commands.flag_hints import hint
 
         flags = [flag for action in self._actions for flag in action.option_strings]
-        algos = getattr(self._placed, "algos", None) or [getattr(self._placed, "algo", "")]
-        text = hint(words, flags, algos)
+        named = getattr(self._placed, "algos", None) or [getattr(self._placed, "algo", None)]
+        text = hint(words, flags, [algo for algo in named if algo is not None])
         return f": {text}" if text else ""
 
 

@@ -27,9 +27,10 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
         return unknown(f"{env_id}: unknown argument", foreign, known)
     if isinstance(error, KeyError):
         return _missing_key(env_id, kwargs, error, parameters, module)
-    given = ", ".join(f"{name}={shown(value)}" for name, value in kwargs.items())
     what = one_line(error).partition(_ADDED)[0]
-    return UserError(f"{env_id}{f' with {given}' if given else ''}: {what}")
+    if kwargs and not any(name in what for name in kwargs):
+        what += f" (with {', '.join(f'{name}={shown(value)}' for name, value in kwargs.items())})"
+    return UserError(f"{env_id}: {what}")
 
 
 def _creator(env_id: str) -> tuple[Mapping[str, inspect.Parameter], str]:
