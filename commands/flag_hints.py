@@ -97,7 +97,7 @@ def hint(words: Sequence[str], flags: Iterable[str], algos: Sequence[str]) -> st
     """What to do about a flag that there is not.
 
     Args:
-        words: what the parser could not place, the flag first.
+        words: what the parser could not place, the flag first; no word for an empty one.
         flags: the flags that there are.
         algos: the agents that the command line names; empty where they are named elsewhere.
 
@@ -105,7 +105,7 @@ def hint(words: Sequence[str], flags: Iterable[str], algos: Sequence[str]) -> st
         One sentence; where nothing is near, an empty one.
     """
     flags = list(flags)
-    flag, _, value = words[0].partition("=")
+    flag, _, value = "".join(words[:1]).partition("=")
     name = flag.lstrip("-").replace("_", "-").lower()
     setting = _hyperparameter(name.replace("-", "_"), algos)
     ours = next((known for known in _OTHER_FLAGS.get(name, ()) if known in flags), None)

@@ -53,8 +53,10 @@ def _whole(text: str) -> int | None:
     if not number.is_finite():
         return None
     # Before it is made an int: 1e999999999 has a billion digits.
-    if abs(number) > LARGEST:
-        return LARGEST + 1 if number > 0 else -LARGEST - 1
+    if number > LARGEST:
+        return LARGEST + 1
+    if number < -LARGEST:
+        return -LARGEST - 1
     return int(number) if number == number.to_integral_value() else None
 
 

@@ -19,12 +19,12 @@ INTERRUPT = 130
 class OneLineParser(argparse.ArgumentParser):
     """An argument parser whose complaints are one line and name the nearest flag."""
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        # --seed for --seeds would mean something else, and be taken without a word.
-        super().__init__(*args, allow_abbrev=False, **kwargs)
-
     # What `parse_known_args` made of the rest, for the hints about what it could not place.
     _placed: argparse.Namespace | None = None
+
+    def __init__(self, **kwargs: Any) -> None:
+        # --seed for --seeds would mean something else, and be taken without a word.
+        super().__init__(allow_abbrev=False, **kwargs)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """Parse what is known, and keep it."""
@@ -35,8 +35,8 @@ class OneLineParser(argparse.ArgumentParser):
         """Print the mistake and exit with code 2."""
         unknown = message.removeprefix("unrecognized arguments: ")
         if unknown != message:
-            message = f"unknown argument {unknown}{self._hint(unknown.split())}"
-        self.exit(MISTAKE, f"{self.prog}: error: {message} (see --help)\n")
+            message = f"unknown argument {unknown or repr('')}{self._hint(unknown.split())}"
+        self.exit(MISTAKE, f"{self.prog}: error: {' '.join(message.split())} (see --help)\n")
 
     def _hint(self, words: list[str]) -> str:
         from commands.flag_hints import hint

@@ -92,7 +92,7 @@ def library_schedule(schedule: ExponentialSchedule) -> Schedule:
     assert schedule.end_fraction == 1
     log_end = th.tensor(math.log(schedule.end), dtype=th.float64)
     fall = AffineTransform(log_end, math.log(schedule.start / schedule.end))
-    transform: Schedule = ComposeTransform([fall, ExpTransform()])  # type: ignore[assignment]
+    transform: Schedule = ComposeTransform([fall, ExpTransform()])
     return transform
 
 
