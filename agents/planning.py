@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.common.online import OnlineAlgorithm
 from agents.common.signatures import CommonArguments
+from agents.common.table_policy import TablePolicy
 from envs.known_models import (
     model_check,
     observations_of_states,
@@ -30,7 +31,7 @@ from mdp import TransitionModel, finite_horizon_optimum, value_iteration
 from mdp.array_types import Ints
 
 
-class ActionTablePolicy(BasePolicy):
+class ActionTablePolicy(TablePolicy):
     """One action for each observation, or for each observation and number of steps left.
 
     Attributes:

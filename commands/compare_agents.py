@@ -5,7 +5,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from commands.flag_values import (
+    COUNT,
+    COUNT_OR_NONE,
+    JOBS,
+    filled,
+    folder_name,
+    number_at_least_zero,
+    whole_number,
+)
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
+
+SEEDS = whole_number(1, 1_000_000)
 
 EPILOG = """\
 examples:
@@ -31,9 +42,9 @@ def build_parser() -> argparse.ArgumentParser:
     add("study", nargs="?", metavar="STUDY.yml", help="a study file, or the name of one of ours")
     add("--env", nargs="+", default=[], metavar="ID", help="environments")
     add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (train --list has them)")
-    add("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: the study's, or 10)")
-    add("-n", "--n-timesteps", type=int, metavar="N", help="environment steps of each run")
-    add("--n-episodes", type=int, metavar="N", help="episodes instead of steps")
+    add("--seeds", type=SEEDS, metavar="N", help="seeds 0 to N-1 (default: the study's, or 10)")
+    add("-n", "--n-timesteps", type=COUNT, metavar="N", help="environment steps of each run")
+    add("--n-episodes", type=COUNT, metavar="N", help="episodes instead of steps")
     add(
         "-params",
         "--hyperparams",
@@ -51,7 +62,14 @@ def build_parser() -> argparse.ArgumentParser:
         help="hyperparameters from another file; of several agents, say whose: dqn:mine.yml",
     )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
+    add(
+        "--gym-packages",
+        nargs="+",
+        type=filled,
+        default=[],
+        metavar="MODULE",
+        help=MODULES_HELP,
+    )
     add(
         "--quick",
         action="store_true",
@@ -73,12 +91,22 @@ def _add_log_flags(parser: argparse.ArgumentParser) -> None:
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("judgement and output").add_argument
     add("--metric", help="what verdicts are about: final, best, area, regret, ...")
-    add("--margin", type=float, help="difference within which agents count as equivalent")
-    add("--episodes-table", type=int, metavar="N", help="average, min, max of every N episodes")
-    add("--render-every", type=int, default=0, metavar="N", help="film an episode every N of them")
-    add("-j", "--jobs", type=int, default=0, metavar="N", help="runs at once (default: all cores)")
-    add("--name", help="name of the study's folder (default: from the study)")
-    add("-f", "--log-folder", default="logs/studies", help="folder above all studies")
+    add(
+        "--margin",
+        type=number_at_least_zero,
+        help="difference within which agents count as equivalent",
+    )
+    add("--episodes-table", type=COUNT, metavar="N", help="average, min, max of every N episodes")
+    add(
+        "--render-every",
+        type=COUNT_OR_NONE,
+        default=0,
+        metavar="N",
+        help="film an episode every N of them",
+    )
+    add("-j", "--jobs", type=JOBS, default=0, metavar="N", help="runs at once (default: all cores)")
+    add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
+    add("-f", "--log-folder", type=filled, default="logs/studies", help="folder above all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
     add("--no-report", action="store_true", help="tables alone: no figures and no page")
 
@@ -105,5 +133,10 @@ def main() -> int:
     from commands.study_output import run_study
 
     return run_study(
-        study, planned, root, command_line(), n_workers=args.jobs, with_page=not args.no_report
+        study,
+        planned,
+        root,
+        command_line(),
+        n_workers=max(args.jobs, 0),
+        with_page=not args.no_report,
     )

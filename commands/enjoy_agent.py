@@ -5,7 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from commands.flag_values import COUNT, COUNT_OR_NONE, SEED, THREADS, filled, whole_number
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
+
+STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
+RUN_NUMBER = whole_number(0, besides={-1: "the run without a number"})
 
 EPILOG = """\
 examples:
@@ -27,18 +31,27 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add = parser.add_argument
     add("model", nargs="?", help="path of a model zip or run folder, instead of looking for a run")
-    add("--algo", help="agent (default: ppo, or what the zip's run folder says)")
-    add("--env", help="environment id (default: CartPole-v1, or what the run folder says)")
-    add("-f", "--folder", default="logs", help="folder above all runs (default: logs)")
+    add("--algo", type=filled, help="agent (default: ppo, or what the zip's run folder says)")
+    add(
+        "--env",
+        type=filled,
+        help="environment id (default: CartPole-v1, or what the run folder says)",
+    )
+    add("-f", "--folder", type=filled, default="logs", help="folder above all runs (default: logs)")
     add(
         "--exp-id",
-        type=int,
+        type=RUN_NUMBER,
         default=0,
         metavar="N",
         help="number of the run (default: 0, the newest; -1 for FOLDER/ALGO/ENV.zip itself)",
     )
     add("--load-best", action="store_true", help="the model that evaluated best in training")
-    add("--load-checkpoint", type=int, metavar="STEPS", help="the checkpoint after that many steps")
+    add(
+        "--load-checkpoint",
+        type=COUNT_OR_NONE,
+        metavar="STEPS",
+        help="the checkpoint after that many steps",
+    )
     add("--load-last-checkpoint", action="store_true", help="the last checkpoint")
     add(
         "--vec-normalize",
@@ -51,23 +64,23 @@ def build_parser() -> argparse.ArgumentParser:
         help="load a library zip, or statistics, from outside the log folder",
     )
     add("--device", default="auto", help="torch device (default: auto)")
-    add("--num-threads", type=int, default=1, help="torch threads (default: 1)")
+    add("--num-threads", type=THREADS, default=1, help="torch threads (1); -1 leaves it to torch")
     _add_playing_flags(parser)
     return parser
 
 
 def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("playing").add_argument
-    add("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="stop after so many steps")
+    add("-n", "--n-timesteps", type=STEPS, default=-1, metavar="N", help="stop after so many steps")
     add(
         "--n-episodes",
-        type=int,
+        type=COUNT,
         metavar="N",
         help="episodes to play (default: 10, or as many as end within the steps of -n)",
     )
     add(
         "--n-envs",
-        type=int,
+        type=COUNT,
         default=1,
         metavar="N",
         help="environments to play on at once, each an equal share of the episodes (default: 1)",
@@ -77,18 +90,25 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
         "--deterministic", action="store_true", help="the policy's best actions (default)"
     )
     policy.add_argument("--stochastic", action="store_true", help="sample actions, or explore")
-    add("--seed", type=int, default=0, help="seed of the episodes (default: 0)")
+    add("--seed", type=SEED, default=0, help="seed of the episodes (default: 0; -1: a random one)")
     add(
         "--render",
         choices=["human", "ansi", "none"],
         help="how to watch (default: human where there is a display, else none)",
     )
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
-    add("--record", metavar="FILE", help="write a film, .gif or .mp4")
+    add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
     add("--reward-log", metavar="DIR", help="write the returns there too, as Monitor's CSV files")
     add("--verbose", type=int, default=1, help="0 for no output (default: 1)")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
+    add(
+        "--gym-packages",
+        nargs="+",
+        type=filled,
+        default=[],
+        metavar="MODULE",
+        help=MODULES_HELP,
+    )
     _add_flags_of_rl_zoo3(parser)
 
 

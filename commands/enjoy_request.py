@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from secrets import randbelow
 
+from commands.parsing import check_device
 from pipeline.errors import UserError
 from pipeline.model_choice import ModelRequest
 from pipeline.model_finding import Which
@@ -16,9 +18,10 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
     """The model that the arguments ask for.
 
     Raises:
-        UserError: if a module of the user's cannot be imported, or the arguments of the environment
-            cannot be read.
+        UserError: if a module of the user's cannot be imported, the arguments of the environment
+            cannot be read, or there is no such device.
     """
+    check_device(args.device)
     return ModelRequest(
         path=None if args.model is None else Path(args.model),
         algo=args.algo,
@@ -28,9 +31,9 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
         which=_which(args),
         is_trusted=args.trust,
         statistics=None if args.vec_normalize is None else Path(args.vec_normalize),
-        env_kwargs=parse_assignments(args.env_kwargs),
+        env_kwargs=parse_assignments(args.env_kwargs, "--env-kwargs"),
         user_modules=import_typed(args.gym_packages, [args.env or ""]),
-        seed=args.seed,
+        seed=args.seed if args.seed >= 0 else randbelow(2**31),
         device=args.device,
     )
 

@@ -35,7 +35,7 @@ class PlayingRequest:
             is a display to show it on.
         film: a file to write a film to, instead, or None.
         monitor_folder: where to write the returns of the episodes, or None.
-        num_threads: torch threads.
+        num_threads: torch threads; below 1 for PyTorch's own choice.
         verbose: 0 for no output.
     """
 
@@ -94,7 +94,8 @@ def play(chosen: ChosenModel, request: PlayingRequest) -> None:
     Raises:
         UserError: if the model cannot be loaded or the environment cannot be rendered so.
     """
-    th.set_num_threads(request.num_threads)
+    if request.num_threads > 0:
+        th.set_num_threads(request.num_threads)
     console = Console(highlight=False, quiet=request.verbose < 1)
     env = playing_env(chosen, request.mode, request.n_envs, request.monitor_folder)
     spec = chosen.spec

@@ -27,15 +27,6 @@ from pipeline.user_modules import import_typed
 
 LONGEST_STUDY_NAME = 200  # bytes
 
-_MINIMUM = {
-    "seeds": 1,
-    "n_timesteps": 1,
-    "n_episodes": 1,
-    "episodes_table": 1,
-    "render_every": 0,
-    "jobs": 0,
-}
-
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
     """The study that the arguments mean, with what they change in it.
@@ -56,12 +47,6 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
 
 
 def _check_output(args: argparse.Namespace) -> None:
-    for key, least in _MINIMUM.items():
-        value = getattr(args, key)
-        if value is not None and value < least:
-            raise UserError(f"--{key.replace('_', '-')} must be at least {least}, not {value}")
-    if args.margin is not None and not args.margin >= 0:
-        raise UserError(f"--margin must be at least 0, not {args.margin}")
     if args.metric is not None and args.metric not in METRICS:
         raise unknown("--metric: unknown metric", args.metric, METRICS)
     check_tensorboard(args.tensorboard)

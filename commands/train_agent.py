@@ -4,6 +4,16 @@ from __future__ import annotations
 
 import argparse
 
+from commands.flag_values import (
+    BUDGET,
+    COUNT,
+    INTERVAL,
+    LOG_INTERVAL,
+    SEED,
+    THREADS,
+    VERBOSITY,
+    filled,
+)
 from commands.parsing import (
     INTERRUPT,
     MODULES_HELP,
@@ -42,9 +52,9 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _add_training_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("how long, and on what settings").add_argument
-    add("-n", "--n-timesteps", type=int, default=-1, metavar="N", help="environment steps")
-    add("--n-episodes", type=int, default=-1, metavar="N", help="episodes instead of steps")
-    add("--seed", type=int, default=-1, help="seed of everything (default: a random one)")
+    add("-n", "--n-timesteps", type=BUDGET, default=-1, metavar="N", help="environment steps")
+    add("--n-episodes", type=BUDGET, default=-1, metavar="N", help="episodes instead of steps")
+    add("--seed", type=SEED, default=-1, help="seed of everything (default: a random one)")
     add(
         "-params",
         "--hyperparams",
@@ -53,7 +63,13 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         metavar="KEY:VALUE",
         help="hyperparameters to change, e.g. learning_rate:0.01",
     )
-    add("-conf", "--conf-file", metavar="YAML", help="hyperparameters from another file")
+    add(
+        "-conf",
+        "--conf-file",
+        type=filled,
+        metavar="YAML",
+        help="hyperparameters from another file",
+    )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add(
         "--eval-env-kwargs",
@@ -62,7 +78,14 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         metavar="KEY:VALUE",
         help="environment arguments for evaluation alone",
     )
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help=MODULES_HELP)
+    add(
+        "--gym-packages",
+        nargs="+",
+        type=filled,
+        default=[],
+        metavar="MODULE",
+        help=MODULES_HELP,
+    )
     add(
         "-i",
         "--trained-agent",
@@ -75,23 +98,35 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
     add("--trust", action="store_true", help="let -i load what can run code from outside -f")
     add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
     add("--device", default="auto", help="torch device (default: auto)")
-    add("--num-threads", type=int, default=1, help="torch threads (default: 1)")
+    add("--num-threads", type=THREADS, default=1, help="torch threads (1); -1 leaves it to torch")
 
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("evaluation and output").add_argument
-    add("--eval-freq", type=int, metavar="N", help="steps between evaluations; -1 for none")
-    add("--eval-episodes", type=int, default=20, metavar="N", help="episodes of each (default: 20)")
-    add("--n-eval-envs", type=int, default=10, metavar="N", help="environments for it (10)")
-    add("--save-freq", type=int, default=-1, metavar="N", help="steps between checkpoints")
+    add("--eval-freq", type=INTERVAL, metavar="N", help="steps between evaluations; -1 for none")
+    add(
+        "--eval-episodes",
+        type=COUNT,
+        default=20,
+        metavar="N",
+        help="episodes of each (default: 20)",
+    )
+    add("--n-eval-envs", type=COUNT, default=10, metavar="N", help="environments for it (10)")
+    add("--save-freq", type=INTERVAL, default=-1, metavar="N", help="steps between checkpoints")
     add("--save-replay-buffer", action="store_true", help="save it too, where the agent has one")
-    add("-f", "--log-folder", default="logs", help="folder above all runs (default: logs)")
+    add("-f", "--log-folder", type=filled, default="logs", help="folder above all runs (logs)")
     add("-uuid", "--uuid", action="store_true", help="add a unique id to the run folder's name")
     add("-tb", "--tensorboard-log", default="", metavar="DIR", help="write TensorBoard logs there")
-    add("--log-interval", type=int, default=-1, metavar="N", help="episodes between log records")
+    add(
+        "--log-interval",
+        type=LOG_INTERVAL,
+        default=-1,
+        metavar="N",
+        help="episodes (PPO, A2C: rollouts) between log records; -2 for none",
+    )
     add(
         "--verbose",
-        type=int,
+        type=VERBOSITY,
         default=1,
         help="0 silent, 1 progress and summary (default), 2 the library's tables as well",
     )

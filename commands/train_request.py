@@ -8,7 +8,7 @@ from pathlib import Path
 from secrets import randbelow
 from typing import Any
 
-from commands.parsing import check_tensorboard
+from commands.parsing import check_device, check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
@@ -30,6 +30,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     check_algorithm(args.algo)
     check_env_id(args.env)
     check_tensorboard(args.tensorboard_log)
+    check_device(args.device)
     raw = with_maps_read(args.env, _raw_hyperparams(args))
     trained_agent = None
     if args.trained_agent:
@@ -70,7 +71,8 @@ def _raw_hyperparams(args: argparse.Namespace) -> dict[str, Any]:
         entry = {}
     for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
         if given:
-            changes[key] = {**(entry.get(key) or {}), **parse_assignments(given)}
+            flag = f"--{key.replace('_', '-')}"
+            changes[key] = {**(entry.get(key) or {}), **parse_assignments(given, flag)}
     for key, budget in (("n_timesteps", args.n_timesteps), ("n_episodes", args.n_episodes)):
         if budget > 0:
             changes[key] = budget

@@ -11,6 +11,7 @@ from typing import Any
 import gymnasium as gym
 
 import envs  # noqa: F401  # registers the project's environments
+from pipeline.environment_mistakes import environment_mistake
 from pipeline.errors import UserError, one_line, shown, unknown
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
@@ -24,6 +25,8 @@ MISTAKES = (
     TypeError,
     ValueError,
     LookupError,
+    AttributeError,
+    ArithmeticError,
     AssertionError,
     OSError,
     ImportError,
@@ -65,7 +68,7 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
     try:
         return gym.make(env_id.rpartition(":")[2], **kwargs)
     except MISTAKES as error:
-        raise UserError(f"{env_id}: {one_line(error)}") from error
+        raise environment_mistake(env_id, kwargs, error) from error
 
 
 def training_kwargs(spec: TrainSpec) -> dict[str, Any]:

@@ -4,9 +4,39 @@ from __future__ import annotations
 
 import difflib
 import reprlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 _SHORT_LIST = 12
+
+# What hyperparameters are called elsewhere, where no likeness of the letters tells.
+OTHER_NAMES: Mapping[str, tuple[str, ...]] = {
+    **dict.fromkeys(("lr", "alpha", "step_size", "eta"), ("learning_rate",)),
+    **dict.fromkeys(
+        ("epsilon", "eps", "final_epsilon", "final_eps", "epsilon_end", "eps_end", "min_epsilon"),
+        ("exploration_final_eps", "exploration_initial_eps"),
+    ),
+    **dict.fromkeys(
+        ("initial_epsilon", "initial_eps", "epsilon_start", "eps_start", "max_epsilon"),
+        ("exploration_initial_eps",),
+    ),
+    **dict.fromkeys(
+        ("epsilon_decay", "eps_decay", "decay"), ("exploration_decay", "exploration_fraction")
+    ),
+    **dict.fromkeys(("discount", "discount_factor", "discount_rate"), ("gamma",)),
+    **dict.fromkeys(("lam", "lambda", "gae"), ("gae_lambda",)),
+    **dict.fromkeys(("entropy", "entropy_coef", "entropy_coeff", "beta"), ("ent_coef",)),
+    **dict.fromkeys(("clip", "clip_eps", "clip_epsilon", "clip_param"), ("clip_range",)),
+    **dict.fromkeys(("minibatch_size", "mini_batch_size", "batch"), ("batch_size",)),
+    **dict.fromkeys(("replay_size", "memory_size", "replay_buffer_size"), ("buffer_size",)),
+    **dict.fromkeys(("target_update", "target_update_freq"), ("target_update_interval",)),
+    **dict.fromkeys(("warmup_steps", "start_steps"), ("learning_starts",)),
+    **dict.fromkeys(("epochs", "update_epochs"), ("n_epochs",)),
+    **dict.fromkeys(("net_arch", "hidden_sizes", "layers", "activation_fn"), ("policy_kwargs",)),
+    **dict.fromkeys(("timesteps", "total_timesteps", "steps"), ("n_timesteps",)),
+    **dict.fromkeys(("episodes", "num_episodes"), ("n_episodes",)),
+    **dict.fromkeys(("num_envs", "nenvs"), ("n_envs",)),
+    **dict.fromkeys(("q_init", "optimistic", "initial_value"), ("initial_q",)),
+}
 
 _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
@@ -33,12 +63,12 @@ def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
         n: how many of the nearest names to offer.
 
     Returns:
-        The nearest names as a question; all names where none is near and the list is short; else
-        nothing.
+        What the field calls it too, or the nearest names, as a question; all names where none is
+        near and the list is short; else nothing.
     """
     known = list(dict.fromkeys(known))
     by_lower_case = {option.lower(): option for option in known}
-    near = [
+    near = [other for other in OTHER_NAMES.get(name.lower(), ()) if other in known] or [
         by_lower_case[match] for match in difflib.get_close_matches(name.lower(), by_lower_case, n)
     ]
     if near:

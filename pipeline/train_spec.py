@@ -35,8 +35,10 @@ class TrainSpec:
             buffer that belong to it, or None.
         vec_env: ``"dummy"`` or ``"subproc"``.
         device: torch device of the networks.
-        num_threads: torch threads; results may differ between numbers of threads.
-        log_interval: episodes (or rollouts) between two log records; below 0 for the default.
+        num_threads: torch threads; below 1 for PyTorch's own choice. Results may differ between
+            numbers of threads.
+        log_interval: episodes (or rollouts) between two log records; -1 for the library's default,
+            -2 for none.
         verbose: 0 silent, 1 progress and summary, 2 the library's own log as well.
         progress: draw a live bar wherever the output goes.
         gym_packages: names of modules of the user's, whose classes settings may name.

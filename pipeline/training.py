@@ -83,7 +83,8 @@ def prepare(
     Raises:
         UserError: if the spec does not work out; no folder is left behind then.
     """
-    th.set_num_threads(spec.num_threads)
+    if spec.num_threads > 0:
+        th.set_num_threads(spec.num_threads)
     kwargs = algorithm_kwargs(spec)
     suffix = f"_{uuid4()}" if spec.unique_id else ""
     if run is None:
@@ -171,6 +172,7 @@ def _learn(training: Training) -> None:
     training.model.learn(
         spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
         callback=training.callback,
+        tb_log_name=spec.algo,
         reset_num_timesteps=spec.trained_agent is None,
         **kwargs,
     )

@@ -8,14 +8,14 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.bandits.linear_agent import Regressions
+from agents.common.table_policy import TablePolicy
 from mdp.array_types import Floats
 
 
-class LinearBanditPolicy(BasePolicy):
+class LinearBanditPolicy(TablePolicy):
     """Pulls the arm of the highest predicted reward.
 
     Args:

@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.bandits.score_agent import ScoreTables
+from agents.common.table_policy import TablePolicy
 from mdp.array_types import Floats, Ints
 
 
-class BanditPolicy(BasePolicy):
+class BanditPolicy(TablePolicy):
     """Pulls the arm of the highest score in the context.
 
     The tables are buffers, so that they travel in the ``policy.pth`` of a model file.
@@ -50,6 +50,9 @@ class BanditPolicy(BasePolicy):
         self.register_buffer("scores", th.full(shape, initial_score, dtype=th.float64))
         self.register_buffer("sums", th.zeros(shape, dtype=th.float64))
         self.register_buffer("counts", th.zeros(shape, dtype=th.int64))
+
+    def _sizes(self) -> dict[str, Any]:
+        return {"n_contexts": len(self.scores)}
 
     @property
     def tables(self) -> ScoreTables:

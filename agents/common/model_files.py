@@ -80,18 +80,20 @@ class JsonAlgorithm(BaseAlgorithm):
             path: where the zip lies.
             env: environment to go on with, or None to predict only.
             device: ignored, as tables live on the CPU.
-            custom_objects: values that replace those in the file.
+            custom_objects: values that replace those of the same name in the file, which are not
+                read then; other names are passed over, as the library does.
             print_system_info: print this system's and the file's library versions.
             force_reset: begin a new episode at the next `learn`.
             kwargs: attributes to change.
 
         Raises:
-            ValueError: if the zip is of another agent, or damaged, or does not fit ``env``.
+            ValueError: if the zip is of another agent, or damaged, or does not fit ``env``; or if
+                ``custom_objects`` is no dictionary.
         """
         _, parameters, _ = load_from_zip_file(
             path, load_data=False, device="cpu", print_system_info=print_system_info
         )
-        data = {**cls._read_data(path), **(custom_objects or {}), **kwargs}
+        data = {**cls._read_data(path, custom_objects), **kwargs}
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
             check_for_correct_spaces(env, data["observation_space"], data["action_space"])
@@ -110,8 +112,13 @@ class JsonAlgorithm(BaseAlgorithm):
         return model
 
     @classmethod
-    def _read_data(cls, path: str | pathlib.Path | io.BufferedIOBase) -> dict[str, Any]:
-        """The decoded attributes of a zip of this very class."""
+    def _read_data(
+        cls, path: str | pathlib.Path | io.BufferedIOBase, replaced: dict[str, Any] | None
+    ) -> dict[str, Any]:
+        """The decoded attributes of a zip of this very class, but for those that are replaced."""
+        if not (replaced is None or isinstance(replaced, dict)):
+            raise ValueError("custom_objects must be a dictionary or None")
+        known = replaced or {}
         with (
             open_path(path, "r", suffix="zip") as file,
             zipfile.ZipFile(file) as archive,
@@ -121,4 +128,6 @@ class JsonAlgorithm(BaseAlgorithm):
             raise ValueError(f"{path} does not hold a {cls.__name__} agent")
         if raw.pop("format", None) != FORMAT_VERSION:
             raise ValueError(f"{path} is written in another version of the file format")
-        return {name: decode(value) for name, value in raw.items()}
+        return {
+            name: known[name] if name in known else decode(value) for name, value in raw.items()
+        }

@@ -10,8 +10,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import torch as th
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from torch.distributions.transforms import AffineTransform, ComposeTransform, ExpTransform
 
 from mdp.machine_code import inlined
 
@@ -79,6 +81,19 @@ class ExponentialSchedule:
             f"ExponentialSchedule(start={self.start}, end={self.end}, "
             f"end_fraction={self.end_fraction})"
         )
+
+
+def library_schedule(schedule: ExponentialSchedule) -> Schedule:
+    """The same schedule out of PyTorch's parts: exp(log(end) + log(start / end) * remaining).
+
+    A library agent's zip pickles its schedules by the names of their classes. This one opens where
+    PyTorch is, which is wherever that agent is; ours would need this project.
+    """
+    assert schedule.end_fraction == 1
+    log_end = th.tensor(math.log(schedule.end), dtype=th.float64)
+    fall = AffineTransform(log_end, math.log(schedule.start / schedule.end))
+    transform: Schedule = ComposeTransform([fall, ExpTransform()])
+    return transform
 
 
 def epsilon_schedule(decay: str, start: float, end: float, end_fraction: float) -> Schedule:

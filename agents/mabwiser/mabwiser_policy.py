@@ -13,14 +13,14 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.bandits.linear_policy import features
+from agents.common.table_policy import TablePolicy
 from mdp.array_types import Floats
 
 
-class MABWiserPolicy(BasePolicy):
+class MABWiserPolicy(TablePolicy):
     """Holds a `mabwiser.mab.MAB` over arms numbered from 0.
 
     Args:
@@ -47,6 +47,9 @@ class MABWiserPolicy(BasePolicy):
         self.statistics = statistics
         self.mab: Any = MAB(list(range(int(action_space.n))), learning_policy)
         self.fitted = False
+
+    def _sizes(self) -> dict[str, Any]:
+        return {"learning_policy": self.mab.learning_policy, "statistics": self.statistics}
 
     @property
     def is_contextual(self) -> bool:

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import Schedule
 
+from agents.common.table_policy import TablePolicy
 from mdp.array_types import Floats
 
 
-class QTablePolicy(BasePolicy):
+class QTablePolicy(TablePolicy):
     """Greedy in the mean of one or two tables of action values.
 
     The tables are float64 buffers, so that they travel in the ``policy.pth`` of a model file and
@@ -45,6 +45,9 @@ class QTablePolicy(BasePolicy):
         shape = (n_tables, int(observation_space.n), int(action_space.n))
         self.register_buffer("q_tables", th.zeros(shape, dtype=th.float64))
         self.register_buffer("visit_counts", th.zeros(shape, dtype=th.int64))
+
+    def _sizes(self) -> dict[str, Any]:
+        return {"n_tables": len(self.q_tables)}
 
     @property
     def q_table(self) -> Floats:

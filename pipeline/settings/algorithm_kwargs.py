@@ -53,7 +53,24 @@ def build_algorithm_kwargs(
         checked["policy_kwargs"] = _build(policy_kwargs, accepted, where, extra_packages)
     if isinstance(checked.get("policy"), DottedName):
         checked["policy"] = policy
-    return _build(checked, parameters, where, extra_packages)
+    built = _build(checked, parameters, where, extra_packages)
+    return built if _is_hand_written(algorithm) else _as_library_schedules(built)
+
+
+def _is_hand_written(algorithm: type[BaseAlgorithm]) -> bool:
+    from agents.common.model_files import JsonAlgorithm
+
+    return issubclass(algorithm, JsonAlgorithm)
+
+
+def _as_library_schedules(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Schedules of classes that a library agent's zip finds wherever that agent is installed."""
+    from agents.common.schedules import ExponentialSchedule, library_schedule
+
+    return {
+        name: library_schedule(value) if isinstance(value, ExponentialSchedule) else value
+        for name, value in kwargs.items()
+    }
 
 
 def needs_policy(algorithm: type[BaseAlgorithm], kwargs: Mapping[str, Any]) -> bool:

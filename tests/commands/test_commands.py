@@ -198,7 +198,7 @@ MISTAKES = {
     "environment": (["--env", "Warehose-v0"], "unknown environment 'Warehose-v0': did you mean"),
     "agent": (["--algo", "qlerning"], "unknown agent 'qlerning': did you mean 'qlearning'?"),
     "flag": (["--evn", "X"], "unknown argument --evn"),
-    "value of a flag": (["-n", "many"], "invalid int value: 'many'"),
+    "value of a flag": (["-n", "many"], "must be a whole number of at least 1, or -1"),
     "hyperparameter": (["-params", "learning_rat:0.1"], "did you mean 'learning_rate'?"),
     "type": (["-params", "gamma:high"], "gamma"),
     "range": (["-params", "gamma:1.5"], "gamma"),
