@@ -72,7 +72,14 @@ def main() -> int:
     if film is not None:
         check_film_path(film)
     chosen = choose_model(model_request(args))
-    from commands.playing_output import PlayingRequest, play
+    from rich.console import Console
+
+    from pipeline.signs_of_life import doing
+
+    console = Console(highlight=False)
+    console.print(f"{chosen.spec.algo} on {chosen.spec.env_id}: {chosen.path}", markup=False)
+    with doing(console, "loading the libraries"):
+        from commands.playing_output import PlayingRequest, play
 
     request = PlayingRequest(
         n_episodes=args.n_episodes,
@@ -82,5 +89,5 @@ def main() -> int:
         film=film,
         num_threads=args.num_threads,
     )
-    play(chosen, request)
+    play(console, chosen, request)
     return 0

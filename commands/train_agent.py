@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from commands.parsing import INTERRUPT, OneLineParser, command_line
+from commands.streams import go_on_unread
 
 EPILOG = """\
 examples:
@@ -95,12 +96,17 @@ def main() -> int:
     from rich.console import Console
 
     from commands.run_output import print_header, print_outcome
-    from pipeline.run_folder import INTERRUPTED
-    from pipeline.training import carry_out, prepare
+    from pipeline.signs_of_life import doing
 
-    console = Console(quiet=spec.verbose < 1)
-    training = prepare(spec, console, vars(args), command_line())
+    go_on_unread()
+    console = Console(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
     print_header(console, spec)
+    with doing(console, "loading the libraries") as activity:
+        from pipeline.run_folder import INTERRUPTED
+        from pipeline.training import carry_out, prepare
+
+        activity.now("making the environments and the agent")
+        training = prepare(spec, console, vars(args), command_line())
     outcome = carry_out(training)
     print_outcome(console, spec, outcome)
     return INTERRUPT if outcome.state == INTERRUPTED else 0

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents import load_algorithm
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
-from pipeline.environments import make_evaluation_env, make_training_env
+from pipeline.environments import make_evaluation_env, make_training_env, trains_on_variant
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.sampled import evaluate, evaluation_seed
@@ -29,6 +29,7 @@ from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.run_folder import Run
 from pipeline.settings import components
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.signs_of_life import can_move
 from pipeline.train_spec import TrainSpec
 
 EVALUATIONS_PER_RUN = 20
@@ -81,8 +82,8 @@ def set_up(
     eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
     undo.callback(eval_env.close)
     is_bandit = are_bandits(env)
-    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit)
-    display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
+    display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
+    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, display)
     callbacks = _named_callbacks(spec, run, model)
     pulls = _pull_recorder(model, run, console) if is_bandit else None
     if pulls is not None:
@@ -96,7 +97,12 @@ def set_up(
 
 
 def _evaluation(
-    spec: TrainSpec, run: Run, eval_env: VecEnv, n_envs: int, is_bandit: bool
+    spec: TrainSpec,
+    run: Run,
+    eval_env: VecEnv,
+    n_envs: int,
+    is_bandit: bool,
+    display: ProgressDisplay,
 ) -> EvaluationCallback:
     """The evaluations during training: exact ones where the environment's model is known."""
     exact = exact_evaluator(spec)
@@ -108,6 +114,7 @@ def _evaluation(
         exact or sampled,
         *_evaluation_intervals(spec, n_envs, is_judged_by_regret=exact is None and is_bandit),
         value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
+        during=display.doing,
     )
 
 
