@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from commands.parsing import OneLineParser, command_line
+from commands.streams import go_on_unread
 
 EPILOG = """\
 examples:
@@ -85,16 +86,32 @@ def main() -> int:
     from commands.study_request import study_spec
 
     study = study_spec(args)
-    from experiments.study_plan import plan
+    from commands.terminal import table_console
+    from pipeline.signs_of_life import doing
 
+    go_on_unread()
+    console = table_console()
+    console.print(study.title, style="bold", markup=False, highlight=False)
     root = Path(args.log_folder) / study.name
-    planned = plan(study, root)
-    from experiments.child_processes import start_server
+    with doing(console, "planning the runs") as activity:
+        from experiments.study_plan import check_settings, plan
 
-    if not all(run.is_finished for run in planned):
-        start_server()  # it imports the libraries while this process does
-    from commands.study_output import run_study
+        planned = plan(study, root)
+        missing = [run for run in planned if not run.is_finished]
+        from experiments.child_processes import start_server
 
+        if missing:
+            start_server()  # it imports the libraries while this process does
+        activity.now("loading the libraries")
+        from commands.study_output import run_study
+
+        check_settings(study, planned)
     return run_study(
-        study, planned, root, command_line(), n_workers=args.jobs, with_page=not args.no_report
+        console,
+        study,
+        planned,
+        root,
+        command_line(),
+        n_workers=args.jobs,
+        with_page=not args.no_report,
     )

@@ -12,6 +12,7 @@ from experiments.seed_values import RESAMPLING_SEED, values_over_seeds
 from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
 from mdp.array_types import Floats
+from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import (
     Band,
     Estimate,
@@ -133,13 +134,14 @@ class StudyAnalysis:
         return self.results.study
 
 
-def analyse(results: StudyResults) -> StudyAnalysis:
+def analyse(results: StudyResults, tell: Tell = tell_nobody) -> StudyAnalysis:
     """Judge the runs of a study."""
-    environments = [
-        _analyse_environment(results, environment.label)
-        for environment in results.study.environments
-        if (results.summary["environment"] == environment.label).any()
-    ]
+    environments = []
+    for environment in results.study.environments:
+        tell(environment.label)
+        if (results.summary["environment"] == environment.label).any():
+            environments.append(_analyse_environment(results, environment.label))
+    tell("all environments")
     return StudyAnalysis(results, tuple(environments), _analyse_overall(results))
 
 

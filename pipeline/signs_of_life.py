@@ -21,12 +21,19 @@ SECONDS_BETWEEN_LOOKS = 1.0
 SECONDS_BETWEEN_FRAMES = 0.25
 SPINNER = "line"  # plain letters, which every terminal has
 
+# Told how far something is, in a few words.
+Tell = Callable[[str], object]
+
 COMPILING = "compiling (the first time, some seconds)"
 
 
 def can_move(console: Console) -> bool:
     """Whether what is shown on a console can be replaced: on no plain teletype, nor in a file."""
     return console.is_terminal and not console.is_dumb_terminal
+
+
+def tell_nobody(detail: str) -> None:
+    """A `Tell` where nobody watches."""
 
 
 class Silence:
