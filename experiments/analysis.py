@@ -12,6 +12,7 @@ from experiments.seed_values import RESAMPLING_SEED, values_over_seeds
 from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
 from mdp.array_types import Floats
+from pipeline.environments import trains_on_variant
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import (
     Band,
@@ -50,6 +51,8 @@ class AgentAnalysis:
         episodes_to_threshold: likewise.
         success_rate: of the final policy; None where the environment does not say.
         seconds: time that training took.
+        on_variant: whether it was trained on a variant of the environment, whose returns are not to
+            be held against those of evaluations or the optimum.
     """
 
     agent: str
@@ -66,6 +69,7 @@ class AgentAnalysis:
     episodes_to_threshold: ThresholdSummary | None
     success_rate: Estimate | None
     seconds: Estimate
+    on_variant: bool = False
 
 
 @dataclass(frozen=True)
@@ -218,6 +222,11 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         else None,
         success_rate=mean("success_rate") if table["success_rate"].notna().any() else None,
         seconds=mean("seconds"),
+        on_variant=any(
+            trains_on_variant(run.spec)
+            for run in results.planned
+            if (run.agent, run.environment, run.seed) == (agent, environment, 0)
+        ),
     )
 
 

@@ -173,8 +173,8 @@ class Activity:
                     *columns, console=self.console, transient=True, auto_refresh=False
                 )
                 stack.enter_context(self._bar)
-                self._bar.add_task("", total=None)
-                self.look()
+                self._bar.add_task(escape(self._words), total=None)
+                self._bar.refresh()
             seconds = SECONDS_BETWEEN_LOOKS if self._bar is None else SECONDS_BETWEEN_FRAMES
             heart = Heartbeat(self.look, seconds)
             stack.callback(heart.stop)

@@ -41,12 +41,20 @@ def draw_learning_curves(
         _set_scale(place, curves[kind].linear_up_to)
         for agent, curve in curves[kind].by_axis[by].items():
             _draw_curve(place, curve, marks[agent])
-        _draw_references(place, environment)
+        if not curves[kind].on_variant:
+            _draw_references(place, environment)
         place.set(xlabel=_AXES[by], ylabel="return")
         place.xaxis.set_major_formatter(EngFormatter(sep=""))
     places[0].set_title(f"{environment.environment}: evaluations", loc="left")
-    places[1].set_title("training episodes", loc="left")
+    places[1].set_title(_training_title(curves["training"].on_variant), loc="left")
     shared_legend(places[0])
+
+
+def _training_title(on_variant: Sequence[str]) -> str:
+    if not on_variant:
+        return "training episodes"
+    names = on_variant[0] if len(on_variant) == 1 else f"{len(on_variant)} agents"
+    return f"training episodes ({names}: on a variant of the environment)"
 
 
 def _set_scale(axes: Axes, linear_up_to: float | None) -> None:
