@@ -102,13 +102,12 @@ def _draw(
     analysis: StudyAnalysis, blocks: pd.DataFrame | None, command: str, activity: Activity
 ) -> list[Path]:
     """Figures and the page; the files."""
-    activity.now("drawing the figures")
+    activity.now("working out the curves")
     from report.figures.figure_files import write_figures
     from report.page import write_report
     from report.series.study_series import study_series
 
     page = analysis.results.root / "report.html"
-    activity.now("working out the curves")
     series = study_series(analysis, activity.at)
     activity.now("drawing the figures")
     files = write_figures(series, blocks, activity.at)
