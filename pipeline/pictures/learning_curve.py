@@ -159,7 +159,8 @@ def draw_learning_curve(
     figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
     steps, returns = read_monitors(run.path)
     evaluated_at, means = _evaluations(run)
-    apart = on_variant and len(steps) > 0 and len(means) > 0
+    has_judgement = len(means) > 0 or yardstick is not None
+    apart = on_variant and len(steps) > 0 and has_judgement
     judged, trained = _places(figure, apart=apart)
     what = "training on a variant" if on_variant and not apart else "training"
     _draw_training(trained, steps + first_step, returns, what)
