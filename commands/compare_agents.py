@@ -87,20 +87,18 @@ def main() -> int:
 
     study = study_spec(args)
     from commands.terminal import table_console
+    from experiments.study_plan import check_settings, plan
     from pipeline.signs_of_life import doing
 
     go_on_unread()
+    root = Path(args.log_folder) / study.name
+    planned = plan(study, root)
     console = table_console()
     console.print(study.title, style="bold", markup=False, highlight=False)
-    root = Path(args.log_folder) / study.name
-    with doing(console, "planning the runs") as activity:
-        from experiments.study_plan import check_settings, plan
-
-        planned = plan(study, root)
-        missing = [run for run in planned if not run.is_finished]
+    with doing(console, "looking for runs that are there") as activity:
         from experiments.child_processes import start_server
 
-        if missing:
+        if not all(run.is_finished for run in planned):
             start_server()  # it imports the libraries while this process does
         activity.now("loading the libraries")
         from commands.study_output import run_study

@@ -77,7 +77,8 @@ def main() -> int:
     from pipeline.signs_of_life import doing
 
     console = Console(highlight=False)
-    console.print(f"{chosen.spec.algo} on {chosen.spec.env_id}: {chosen.path}", markup=False)
+    about = f"{chosen.spec.algo} on {chosen.spec.env_id}: {chosen.path}"
+    console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries"):
         from commands.playing_output import PlayingRequest, play
 

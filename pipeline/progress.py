@@ -146,7 +146,7 @@ class ProgressDisplay(BlockCallback):
     def _print_line(self) -> None:
         self.silence.end()
         line = "  ".join([f"{self.share_done:4.0%}", *self._words()])
-        self.console.print(line, highlight=False)
+        self.console.print(line, highlight=False, soft_wrap=True)
 
     def _words(self) -> list[str]:
         """The figures and, where the training itself stands still, what goes on and how long."""

@@ -72,6 +72,7 @@ class Heartbeat:
 
     def start(self) -> None:
         """Begin to call the function."""
+        self.stop()
         self._stopping.clear()
         self._thread = threading.Thread(target=self._beat, daemon=True)
         self._thread.start()
@@ -146,7 +147,7 @@ class Activity:
     def say(self, line: str) -> None:
         """Print a line that stays."""
         self._silence.end()
-        self.console.print(line, markup=False, highlight=False)
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def look(self) -> None:
         """Show how far things are, or say it where only lines can be had and one is due."""

@@ -87,7 +87,7 @@ def test_training_and_playing_begin_with_what_they_are_about(announced, tmp_path
     ]
     model = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1" / "FrozenLake-v1.zip"
     said = said_before_libraries(tmp_path, "enjoy", model)
-    assert said.replace("\n", "") == f"qlearning on FrozenLake-v1: {model}".replace("\n", "")
+    assert said == f"qlearning on FrozenLake-v1: {model}\n"
     film = tmp_path / "film.gif"
     assert announced("enjoy", model, "--n-episodes", "1", "--record", film) == [
         "loading the libraries",
@@ -109,7 +109,7 @@ def test_a_study_begins_with_its_title_and_goes_on_unread(announced, left_by_its
     assert summary.read_text().count("\n") == 2
     # The runs are there; what is left is said in its order.
     assert announced("compare", *words) == [
-        "planning the runs",
+        "looking for runs that are there",
         "loading the libraries",
         "reading the results",
         "judging the agents",

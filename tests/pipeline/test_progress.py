@@ -133,7 +133,9 @@ class Slow(BaseCallback):
 def slow_training(clock, live=False, **options):
     """What is written of five steps, of which one takes 24 seconds."""
     file = io.StringIO()
-    console = Console(file=file, width=120, force_terminal=live, color_system=None)
+    # A line is one line, however narrow the console is that rich assumes in a pipe.
+    width = 120 if live else 20
+    console = Console(file=file, width=width, force_terminal=live, color_system=None)
     agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
     display = ProgressDisplay(console, live=live)
     agent.learn(1000, callback=[display, Slow(display, clock, seconds=24, **options)])
