@@ -25,6 +25,9 @@ def compare_on_log(args: argparse.Namespace) -> int:
     if args.study or args.env or args.algos:
         raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
     console = table_console(highlight=False)
+    n = len(args.policy)
+    about = f"{n} {'policy' if n == 1 else 'policies'} on {args.logged}"
+    console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries") as activity:
         compared = _compare(args, activity)
     from report.off_policy_table import print_comparison

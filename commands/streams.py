@@ -76,7 +76,7 @@ def standard_streams() -> Iterator[Output]:
     _open_closed_ones()
     before = sys.stdout, sys.stderr
     output = Output(sys.stdout, goes_on=False)
-    sys.stdout, sys.stderr = output, Output(sys.stderr, goes_on=True)  # type: ignore[assignment]
+    sys.stdout, sys.stderr = output, Output(sys.stderr, goes_on=True)
     try:
         yield output
     finally:

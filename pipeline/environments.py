@@ -107,11 +107,10 @@ def trains_on_variant(spec: TrainSpec) -> bool:
 def _usual_kwargs(env_id: str) -> dict[str, Any]:
     """The arguments that an environment has where none are given, as far as they are known."""
     registered = gym.spec(env_id.rpartition(":")[2])
-    make = registered.entry_point
-    if isinstance(make, str):
-        make = load_env_creator(make)
-    parameters = inspect.signature(make).parameters.values() if callable(make) else ()
-    defaults = {p.name: p.default for p in parameters if p.default is not p.empty}
+    entry = registered.entry_point
+    make = load_env_creator(entry) if isinstance(entry, str) else entry
+    parameters = {} if make is None else inspect.signature(make).parameters
+    defaults = {p.name: p.default for p in parameters.values() if p.default is not p.empty}
     return {**defaults, **registered.kwargs, "max_episode_steps": registered.max_episode_steps}
 
 
