@@ -15,6 +15,7 @@ from commands.flag_values import (
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
+from commands.streams import go_on_unread
 
 SEEDS = whole_number(1, 1_000_000)
 
@@ -121,18 +122,27 @@ def main() -> int:
     from commands.study_request import study_spec
 
     study = study_spec(args)
-    from experiments.study_plan import plan
+    from commands.terminal import table_console
+    from experiments.study_plan import check_settings, plan
+    from pipeline.signs_of_life import doing
 
+    go_on_unread()
     root = Path(args.log_folder) / study.name
     planned = plan(study, root)
-    from experiments.child_processes import start_server
-    from experiments.warm_ups import warm_ups
+    console = table_console()
+    console.print(study.title, style="bold", markup=False, highlight=False)
+    with doing(console, "looking for runs that are there") as activity:
+        from experiments.child_processes import start_server
+        from experiments.warm_ups import warm_ups
 
-    if not all(run.is_finished for run in planned):
-        start_server(warm_ups(planned))  # it imports the libraries while this process does
-    from commands.study_output import run_study
+        if not all(run.is_finished for run in planned):
+            start_server(warm_ups(planned))  # it imports the libraries while this process does
+        activity.now("loading the libraries")
+        from commands.study_output import run_study
 
+        check_settings(study, planned)
     return run_study(
+        console,
         study,
         planned,
         root,

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from commands.terminal import table_console
-from experiments.off_policy.logged_policies import compare_policies, read_logged, read_policy
 from pipeline.errors import UserError
+from pipeline.signs_of_life import Activity, doing
 from pipeline.user_modules import import_typed
-from report.off_policy_table import print_comparison
+
+if TYPE_CHECKING:
+    from experiments.off_policy.logged_policies import Comparison
 
 
 def compare_on_log(args: argparse.Namespace) -> int:
@@ -23,11 +26,28 @@ def compare_on_log(args: argparse.Namespace) -> int:
     if args.study or args.env or args.algos:
         raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
     import_typed(args.gym_packages)
+    console = table_console(highlight=False)
+    n = len(args.policy)
+    about = f"{n} {'policy' if n == 1 else 'policies'} on {args.logged}"
+    console.print(about, markup=False, soft_wrap=True)
+    with doing(console, "loading the libraries") as activity:
+        compared = _compare(args, activity)
+    from report.off_policy_table import print_comparison
+
+    print_comparison(console, compared)
+    return 0
+
+
+def _compare(args: argparse.Namespace, activity: Activity) -> Comparison:
+    from experiments.off_policy.logged_policies import compare_policies, read_logged, read_policy
+
+    activity.now("reading the log")
     data = read_logged(args.logged)
+    activity.now("loading the policies")
     policies = [read_policy(Path(path), args.trust) for path in args.policy]
     names = [policy.name for policy in policies]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UserError(f"--policy names {twice} twice")
-    print_comparison(table_console(highlight=False), compare_policies(data, policies))
-    return 0
+    activity.now("judging the policies")
+    return compare_policies(data, policies)

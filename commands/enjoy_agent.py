@@ -138,7 +138,15 @@ def main() -> int:
     except NoRunError as error:
         flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
         raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error
-    from commands.playing_output import PlayingRequest, play
+    from rich.console import Console
+
+    from pipeline.signs_of_life import doing
+
+    console = Console(highlight=False, quiet=args.verbose < 1)
+    about = f"{chosen.spec.algo} on {chosen.spec.env_id}: {chosen.path}"
+    console.print(about, markup=False, soft_wrap=True)
+    with doing(console, "loading the libraries"):
+        from commands.playing_output import PlayingRequest, play
 
     n_steps = args.n_timesteps if args.n_timesteps >= 0 else None
     request = PlayingRequest(
@@ -152,5 +160,5 @@ def main() -> int:
         num_threads=args.num_threads,
         verbose=args.verbose,
     )
-    play(chosen, request)
+    play(console, chosen, request)
     return 0

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line
 
 MISTAKE = 2
@@ -90,12 +91,20 @@ def run_command(main: Callable[[], int]) -> NoReturn:
     """Run a command's ``main`` and exit with its code.
 
     A mistake of the user's, or a file system that refuses, ends in one line on stderr and exit
-    code 2.
+    code 2. A reader of the output who goes away is no mistake: see `commands.streams`.
     """
-    program = program_name()
     print_on_any_terminal()
+    with standard_streams() as output:
+        code = _exit_code(main)
+        if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
+            code = code or MISTAKE
+    sys.exit(code)
+
+
+def _exit_code(main: Callable[[], int]) -> int:
+    program = program_name()
     try:
-        sys.exit(main())
+        return _run_to_the_last_word(main)
     except UserError as error:
         message = str(error)
     except OSError as error:
@@ -103,9 +112,19 @@ def run_command(main: Callable[[], int]) -> NoReturn:
         message = f"{error.strerror or one_line(error)}{place}"
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
-        sys.exit(INTERRUPT)
+        return INTERRUPT
     print(f"{program}: error: {message}", file=sys.stderr)
-    sys.exit(MISTAKE)
+    return MISTAKE
+
+
+def _run_to_the_last_word(main: Callable[[], int]) -> int:
+    """Run ``main``, and write what is still to be written while mistakes are listened for."""
+    try:
+        code = main()
+    except SystemExit as stop:  # argparse's, after --help
+        code = stop.code if isinstance(stop.code, int) else 0
+    sys.stdout.flush()
+    return code
 
 
 def check_tensorboard(wanted: object) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from pipeline.filming import write_film
 from pipeline.model_choice import ChosenModel
 from pipeline.model_loading import load_to_play
 from pipeline.playing import KEPT_MODES, FrameTaker, RenderMode, play_episodes, playing_env
+from pipeline.signs_of_life import Activity, doing
 from pipeline.train_spec import TrainSpec
 
 
@@ -70,14 +72,19 @@ def has_display() -> bool:
 
 @dataclass
 class _Show:
-    """Prints or keeps what is drawn, as it comes."""
+    """Prints or keeps what is drawn, as it comes, and tells how far the playing is."""
 
-    console: Console
+    activity: Activity
     mode: RenderMode | None
     taker: FrameTaker
     frames: list[Any] = field(default_factory=list)
+    steps: int = 0
+    returns: list[float] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
 
     def after_step(self, done: bool) -> None:
+        self.steps += 1
+        self.activity.at(f"{self.steps:,} steps, {len(self.returns):,} episodes")
         if self.mode not in KEPT_MODES:
             return
         drawn = self.taker.take(done)
@@ -85,46 +92,56 @@ class _Show:
             self.frames += drawn
             return
         for text in drawn:
-            self.console.file.write(f"{text}\n")
+            self.activity.console.file.write(f"{text}\n")
+
+    def after_episode(self, total_return: float, length: int) -> None:
+        self.returns.append(total_return)
+        self.lengths.append(length)
+        self.activity.say(f"episode {len(self.returns)}: return {total_return:.2f}, {length} steps")
 
 
-def play(chosen: ChosenModel, request: PlayingRequest) -> None:
+def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None:
     """Play episodes, show or film them, and print their returns.
+
+    Args:
+        console: where to.
+        chosen: the model to play.
+        request: how.
 
     Raises:
         UserError: if the model cannot be loaded or the environment cannot be rendered so.
     """
     if request.num_threads > 0:
         th.set_num_threads(request.num_threads)
-    console = Console(highlight=False, quiet=request.verbose < 1)
-    env = playing_env(chosen, request.mode, request.n_envs, request.monitor_folder)
     spec = chosen.spec
-    model = load_to_play(spec.algo, chosen.path, env, spec.device)
-    env.seed(spec.seed)
-    show = _Show(console, request.mode, FrameTaker(env))
-    returns, lengths = [], []
-    for total_return, length in play_episodes(
-        model,
-        env,
-        request.n_episodes,
-        request.n_steps,
-        deterministic=request.deterministic,
-        after_step=show.after_step,
-    ):
-        returns.append(total_return)
-        lengths.append(length)
-        console.print(f"episode {len(returns)}: return {total_return:.2f}, {length} steps")
+    with doing(console, "loading the agent"):
+        env = playing_env(chosen, request.mode, request.n_envs, request.monitor_folder)
+        model = load_to_play(spec.algo, chosen.path, env, spec.device)
+        env.seed(spec.seed)
+    show = _Show(Activity(console, "playing"), request.mode, FrameTaker(env))
+    # Pictures of letters show by themselves that something goes on.
+    with nullcontext() if request.mode == "ansi" else show.activity.shown():
+        for total_return, length in play_episodes(
+            model,
+            env,
+            request.n_episodes,
+            request.n_steps,
+            deterministic=request.deterministic,
+            after_step=show.after_step,
+        ):
+            show.after_episode(total_return, length)
     env.close()
     if request.film is not None:
         _write_film(console, request.film, show.frames)
-    _print_returns(console, returns, lengths)
+    _print_returns(console, show.returns, show.lengths)
     _print_exact(console, spec, model, request.deterministic)
 
 
 def _write_film(console: Console, path: Path, frames: list[Any]) -> None:
     if not frames:
         raise UserError("--record: nothing was played, so there is nothing to film")
-    write_film(path, frames)
+    with doing(console, "writing the film"):
+        write_film(path, frames)
     console.print(f"film: {path}")
 
 
@@ -140,15 +157,16 @@ def _print_returns(console: Console, returns: list[float], lengths: list[int]) -
 
 def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: bool) -> None:
     """Say what the policy is worth, where that can be computed."""
-    evaluator = exact_evaluator(spec)
-    if evaluator is None:
-        print_refusal(console, model_refusal(spec))
-        return
-    if why_not_exact(model, evaluator.observations):
-        return
-    try:
-        evaluation = evaluator(model, deterministic)
-    except (TypeError, ValueError):
-        # The probabilities that the agent samples its actions from are not known.
-        return
+    with doing(console, "working out what the policy is worth"):
+        evaluator = exact_evaluator(spec)
+        if evaluator is None:
+            print_refusal(console, model_refusal(spec))
+            return
+        if why_not_exact(model, evaluator.observations):
+            return
+        try:
+            evaluation = evaluator(model, deterministic)
+        except (TypeError, ValueError):
+            # The probabilities that the agent samples its actions from are not known.
+            return
     console.print(describe(evaluation))

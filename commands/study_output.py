@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from commands.study_progress import StudyProgress
-from commands.terminal import table_console
 from experiments.execution import RunFailure, available_cores, execute
-from experiments.study_plan import PlannedRun, check_settings
+from experiments.study_plan import PlannedRun
 from experiments.study_results import StudyResults, read_results
 from experiments.study_spec import StudySpec
+from pipeline.signs_of_life import Activity, doing
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 def run_study(
+    console: Console,
     study: StudySpec,
     planned: Sequence[PlannedRun],
     root: Path,
@@ -33,8 +34,9 @@ def run_study(
     """Do a study as planned, print the judgement, and write tables, figures and page.
 
     Args:
+        console: where to.
         study: the study.
-        planned: its runs.
+        planned: its runs, whose settings have been checked.
         root: its folder.
         command: the command that asked for it.
         n_workers: runs at once; 0 for as many as there are cores.
@@ -42,15 +44,10 @@ def run_study(
 
     Returns:
         The exit code: 1 where a run failed, else 0.
-
-    Raises:
-        UserError: if an agent cannot be made with its settings.
     """
-    check_settings(study, planned)
-    console = table_console()
-    console.print(study.title, style="bold", markup=False, highlight=False)
     failures = _do_missing(console, planned, root, command, n_workers or available_cores())
-    results = read_results(study, planned, root)
+    with doing(console, "reading the results") as activity:
+        results = read_results(study, planned, root, activity.at)
     if len(results.summary):
         _judge(console, results, command, with_page=with_page)
     for failure in failures:
@@ -80,46 +77,55 @@ def _do_missing(
         return execute(missing, root, command, n_workers, progress.note)
 
 
-def _draw(analysis: StudyAnalysis, blocks: pd.DataFrame | None, command: str) -> list[Path]:
+def _judge(console: Console, results: StudyResults, command: str, *, with_page: bool) -> None:
+    with doing(console, "judging the agents") as activity:
+        from experiments.analysis import analyse
+        from report.terminal_tables import print_analysis, print_episodes_table
+
+        analysis = analyse(results, activity.at)
+    print_analysis(console, analysis)
+    width = results.study.episodes_table
+    with doing(console, "writing the tables") as activity:
+        from report.result_files import write_tables
+        from report.series.episode_blocks import episodes_table
+
+        files = write_tables(results)
+        blocks = episodes_table(results, width) if width else None
+        if blocks is not None:
+            print_episodes_table(console, blocks, width)
+        if results.study.render_every:
+            files += _films(results, activity)
+        if with_page:
+            files += _draw(analysis, blocks, command, activity)
+    _print_files(console, results.root, files)
+
+
+def _draw(
+    analysis: StudyAnalysis, blocks: pd.DataFrame | None, command: str, activity: Activity
+) -> list[Path]:
     """Figures and the page; the files."""
+    activity.now("working out the curves")
     from report.figures.figure_files import write_figures
     from report.page import write_report
     from report.series.study_series import study_series
 
     page = analysis.results.root / "report.html"
-    series = study_series(analysis)
-    files = write_figures(series, blocks)
-    write_report(series, page, command)
+    series = study_series(analysis, activity.at)
+    activity.now("drawing the figures")
+    files = write_figures(series, blocks, activity.at)
+    activity.now("writing the page")
+    write_report(series, page, command, activity.at)
     return [*files, page]
 
 
-def _judge(console: Console, results: StudyResults, command: str, *, with_page: bool) -> None:
-    from experiments.analysis import analyse
-    from report.result_files import write_tables
-    from report.series.episode_blocks import episodes_table
-    from report.terminal_tables import print_analysis, print_episodes_table
-
-    analysis = analyse(results)
-    print_analysis(console, analysis)
-    width = results.study.episodes_table
-    blocks = episodes_table(results, width) if width else None
-    if blocks is not None:
-        print_episodes_table(console, blocks, width)
-    files = write_tables(results)
-    if results.study.render_every:
-        files += _films(console, results)
-    if with_page:
-        files += _draw(analysis, blocks, command)
-    _print_files(console, results.root, files)
-
-
-def _films(console: Console, results: StudyResults) -> list[Path]:
+def _films(results: StudyResults, activity: Activity) -> list[Path]:
     """Write the films of training, and say which there cannot be."""
+    activity.now("filming")
     from report.training_films import write_films
 
-    films, refused = write_films(results)
+    films, refused = write_films(results, activity.at)
     for reason in refused:
-        console.print(f"no film: {reason}", markup=False, highlight=False)
+        activity.say(f"no film: {reason}")
     return films
 
 

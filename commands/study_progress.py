@@ -15,8 +15,13 @@ from rich.table import Table
 
 from experiments.execution import RunFailure
 from experiments.study_plan import PlannedRun
-
-SECONDS_BETWEEN_LINES = 10.0
+from pipeline.signs_of_life import (
+    SECONDS_BETWEEN_LINES,
+    SECONDS_BETWEEN_LOOKS,
+    Heartbeat,
+    Silence,
+    can_move,
+)
 
 
 class StudyProgress:
@@ -39,13 +44,15 @@ class StudyProgress:
         self.n_missing = len(runs) - len(done)
         self.n_ended = 0
         self.started = time.monotonic()
-        self.last_line = self.started
-        self.live = Live(console=console, auto_refresh=False) if console.is_terminal else None
+        self.silence = Silence(SECONDS_BETWEEN_LINES)
+        self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
+        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
 
     def __enter__(self) -> StudyProgress:
         if self.live is not None:
             self.live.start()
-            self._show()
+            self._draw()
+        self.heart.start()
         return self
 
     def __exit__(
@@ -54,8 +61,9 @@ class StudyProgress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self.heart.stop()
         if self.live is not None:
-            self._show()
+            self._draw()
             self.live.stop()
         if isinstance(error, KeyboardInterrupt):
             self.console.print(f"{self._figures()}; the same command goes on", highlight=False)
@@ -74,7 +82,10 @@ class StudyProgress:
                 markup=False,
                 highlight=False,
             )
-        self._show()
+        if self.live is None and self.n_ended == self.n_missing:
+            self._print_line()
+        else:
+            self.look()
 
     def note_refusal(self, run: PlannedRun) -> None:
         """Say once for each environment why its own model is not used, where that is so."""
@@ -88,16 +99,20 @@ class StudyProgress:
                 soft_wrap=True,
             )
 
-    def _show(self) -> None:
+    def look(self) -> None:
+        """Show how far the study is, also while no run ends."""
+        if self.live is not None:
+            self._draw()
+        elif self.n_ended < self.n_missing and self.silence.is_too_long:
+            self._print_line()
+
+    def _draw(self) -> None:
         if self.live is not None:
             self.live.update(self._table(), refresh=True)
-        elif self._is_time_for_a_line():
-            self.last_line = time.monotonic()
-            self.console.print(self._figures(), highlight=False)
 
-    def _is_time_for_a_line(self) -> bool:
-        is_last = self.n_ended == self.n_missing
-        return is_last or time.monotonic() - self.last_line > SECONDS_BETWEEN_LINES
+    def _print_line(self) -> None:
+        self.silence.end()
+        self.console.print(self._figures(), highlight=False)
 
     def _figures(self) -> str:
         seconds = time.monotonic() - self.started

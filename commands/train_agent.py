@@ -22,6 +22,7 @@ from commands.parsing import (
     command_line,
     program_name,
 )
+from commands.streams import go_on_unread
 
 EPILOG = """\
 examples:
@@ -149,12 +150,17 @@ def main() -> int:
     from rich.console import Console
 
     from commands.run_output import print_header, print_outcome, print_refusal
-    from pipeline.run_folder import INTERRUPTED
-    from pipeline.training import carry_out, prepare
+    from pipeline.signs_of_life import doing
 
-    console = Console(quiet=spec.verbose < 1)
-    training = prepare(spec, console, vars(args), command_line())
+    go_on_unread()
+    console = Console(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
     print_header(console, spec)
+    with doing(console, "loading the libraries") as activity:
+        from pipeline.run_folder import INTERRUPTED
+        from pipeline.training import carry_out, prepare
+
+        activity.now("making the environments and the agent")
+        training = prepare(spec, console, vars(args), command_line())
     print_refusal(console, training.refusal)
     outcome = carry_out(training)
     print_outcome(console, spec, outcome)

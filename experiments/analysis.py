@@ -12,6 +12,8 @@ from experiments.seed_values import RESAMPLING_SEED, values_over_seeds
 from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
 from mdp.array_types import Floats
+from pipeline.environments import trains_on_variant
+from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import (
     Band,
     Estimate,
@@ -49,6 +51,8 @@ class AgentAnalysis:
         episodes_to_threshold: likewise.
         success_rate: of the final policy; None where the environment does not say.
         seconds: time that training took.
+        on_variant: whether it was trained on a variant of the environment, whose returns are not to
+            be held against those of evaluations or the optimum.
     """
 
     agent: str
@@ -65,6 +69,7 @@ class AgentAnalysis:
     episodes_to_threshold: ThresholdSummary | None
     success_rate: Estimate | None
     seconds: Estimate
+    on_variant: bool = False
 
 
 @dataclass(frozen=True)
@@ -133,13 +138,14 @@ class StudyAnalysis:
         return self.results.study
 
 
-def analyse(results: StudyResults) -> StudyAnalysis:
+def analyse(results: StudyResults, tell: Tell = tell_nobody) -> StudyAnalysis:
     """Judge the runs of a study."""
-    environments = [
-        _analyse_environment(results, environment.label)
-        for environment in results.study.environments
-        if (results.summary["environment"] == environment.label).any()
-    ]
+    environments = []
+    for environment in results.study.environments:
+        tell(environment.label)
+        if (results.summary["environment"] == environment.label).any():
+            environments.append(_analyse_environment(results, environment.label))
+    tell("all environments")
     return StudyAnalysis(results, tuple(environments), _analyse_overall(results))
 
 
@@ -216,6 +222,11 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         else None,
         success_rate=mean("success_rate") if table["success_rate"].notna().any() else None,
         seconds=mean("seconds"),
+        on_variant=any(
+            trains_on_variant(run.spec)
+            for run in results.planned
+            if (run.agent, run.environment, run.seed) == (agent, environment, 0)
+        ),
     )
 
 

@@ -16,6 +16,7 @@ from experiments.study_plan import PlannedRun
 from experiments.study_spec import StudySpec
 from mdp.array_types import Floats
 from pipeline.run_folder import Run
+from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import area_under_curve, steps_to_threshold
 
 LAST_EPISODES = 100
@@ -121,11 +122,14 @@ def read_episodes(run: Run) -> Episodes:
     return Episodes(*(rows[name].to_numpy(dtype=np.float64) for name in ("step", "r", "t")))
 
 
-def read_results(study: StudySpec, planned: Sequence[PlannedRun], root: Path) -> StudyResults:
+def read_results(
+    study: StudySpec, planned: Sequence[PlannedRun], root: Path, tell: Tell = tell_nobody
+) -> StudyResults:
     """Read all runs that have finished."""
     rows, curves = [], []
     pulls = read_pulls([run for run in planned if run.is_finished])
-    for run in planned:
+    for place, run in enumerate(planned, start=1):
+        tell(f"run {place:,} of {len(planned):,}")
         if run.is_finished and run.is_batch:
             rows += batch_rows(run, pulls[run.agent, run.environment])
         elif run.is_finished:

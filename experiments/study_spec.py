@@ -28,6 +28,10 @@ METRIC_WORDS: dict[str, str] = {
 COSTS = ("regret",)
 
 
+# These are of training episodes, the others of evaluations.
+OF_TRAINING = ("training", "last_episodes")
+
+
 # Settings that map names to values: such mappings are merged name by name.
 MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import shlex
 import sys
 from collections.abc import Callable, Mapping
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+from gymnasium.envs.registration import load_env_creator
 
 import envs  # noqa: F401  # registers the project's environments
 from pipeline.environment_mistakes import environment_mistake
@@ -84,6 +86,32 @@ def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
     if kwargs.get("max_episode_steps", registered) in (None, -1):
         kwargs["max_episode_steps"] = EVALUATION_TIME_LIMIT
     return kwargs
+
+
+def trains_on_variant(spec: TrainSpec) -> bool:
+    """Whether the returns of training are of another environment than those of evaluation.
+
+    They are where its arguments differ. Wrappers make no difference: Monitor lies below them, so
+    that what they do to rewards is not in its returns, and what they do to actions is a matter of
+    behaviour. A time limit that evaluation has for want of any does not count either.
+    """
+    special = spec.hyperparams
+    changes = special.train_env_kwargs, special.eval_env_kwargs
+    if not any(changes):
+        return False
+    usual = {**_usual_kwargs(spec.env_id), **special.env_kwargs}
+    training, evaluation = ({**usual, **changed} for changed in changes)
+    return training != evaluation
+
+
+def _usual_kwargs(env_id: str) -> dict[str, Any]:
+    """The arguments that an environment has where none are given, as far as they are known."""
+    registered = gym.spec(env_id.rpartition(":")[2])
+    entry = registered.entry_point
+    make = load_env_creator(entry) if isinstance(entry, str) else entry
+    parameters = {} if make is None else inspect.signature(make).parameters
+    defaults = {p.name: p.default for p in parameters.values() if p.default is not p.empty}
+    return {**defaults, **registered.kwargs, "max_episode_steps": registered.max_episode_steps}
 
 
 def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:

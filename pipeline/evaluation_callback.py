@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ class EvaluationCallback(EvalCallback):
         eval_episode_freq: episodes between two evaluations, instead; 0 for none.
         callback_after_eval: told after every evaluation.
         value_maps: keeps the agent's policy at every evaluation, where that can be drawn.
+        during: shows what goes on while an evaluation runs.
     """
 
     def __init__(
@@ -45,6 +47,7 @@ class EvaluationCallback(EvalCallback):
         eval_episode_freq: int = 0,
         callback_after_eval: BaseCallback | None = None,
         value_maps: ValueMapRecorder | None = None,
+        during: Callable[[str], AbstractContextManager[object]] = nullcontext,
     ) -> None:
         super().__init__(
             eval_env, callback_after_eval=callback_after_eval, eval_freq=eval_freq, verbose=0
@@ -53,6 +56,7 @@ class EvaluationCallback(EvalCallback):
         self.evaluator = evaluator
         self.eval_episode_freq = eval_episode_freq
         self.value_maps = value_maps
+        self.during = during
         self.episodes_seen = 0
         self.last_evaluation: Evaluation | None = None
         self.best_timesteps = 0
@@ -90,7 +94,8 @@ class EvaluationCallback(EvalCallback):
     def evaluate_now(self) -> bool:
         """Evaluate the agent as it is; False where a callback asks to stop the training."""
         self.take_statistics()
-        evaluation = self.evaluator(self.model)
+        with self.during("evaluating"):
+            evaluation = self.evaluator(self.model)
         self.last_evaluation = evaluation
         self.last_mean_reward = evaluation.mean_return
         self._append_to_file(evaluation)

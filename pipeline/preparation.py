@@ -20,7 +20,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
 from pipeline.continuation import continuing, load_to_continue, statistics_to_continue
-from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
+from pipeline.environments import (
+    make_evaluation_env,
+    make_single_env,
+    make_training_env,
+    trains_on_variant,
+)
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import (
     ExactEvaluator,
@@ -43,6 +48,7 @@ from pipeline.settings.algorithm_kwargs import (
     needs_policy,
 )
 from pipeline.settings.constructor_arguments import algorithm_parameters
+from pipeline.signs_of_life import can_move
 from pipeline.train_spec import TrainSpec
 
 EVALUATIONS_PER_RUN = 20
@@ -102,8 +108,8 @@ def set_up(
     undo.callback(eval_env.close)
     is_bandit = are_bandits(env)
     exact = _exact_evaluator(spec, model, console)
-    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, exact)
-    display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
+    display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
+    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
     callbacks = _named_callbacks(spec, run, model)
     pulls = _pull_recorder(model, run, console) if is_bandit else None
     if pulls is not None:
@@ -149,6 +155,7 @@ def _evaluation(
     n_envs: int,
     is_bandit: bool,
     exact: ExactEvaluator | None,
+    display: ProgressDisplay,
 ) -> EvaluationCallback:
     """The evaluations during training: exact ones where they can be."""
     seed = evaluation_seed(spec.seed, 1)
@@ -159,6 +166,7 @@ def _evaluation(
         exact or sampled,
         *_evaluation_intervals(spec, n_envs, is_judged_by_regret=exact is None and is_bandit),
         value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
+        during=display.doing,
     )
 
 

@@ -2,78 +2,74 @@
 
 from __future__ import annotations
 
-import logging
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     Progress,
+    SpinnerColumn,
     TaskProgressColumn,
     TextColumn,
     TimeRemainingColumn,
 )
 
 from agents.common.callback_horizons import BlockCallback
+from pipeline.signs_of_life import (
+    SECONDS_BETWEEN_FRAMES,
+    SECONDS_BETWEEN_LOOKS,
+    SPINNER,
+    CompilationNotice,
+    Heartbeat,
+    Silence,
+)
 
 SECONDS_BETWEEN_UPDATES = 0.1
+SECONDS_BEFORE_THE_FIRST_LINE = 2.0
 LINES_WITHOUT_TERMINAL = 10
 
-
-class CompilationNotice(logging.Handler):
-    """Says once that a loop is being compiled, which takes some seconds.
-
-    Args:
-        console: where to.
-    """
-
-    def __init__(self, console: Console) -> None:
-        super().__init__(logging.INFO)
-        self.console = console
-        self.log = logging.getLogger("mdp.machine_code")
-        self.level_before = self.log.level
-
-    def listen(self) -> None:
-        """Begin to wait for something to be compiled."""
-        self.log.addHandler(self)
-        self.log.setLevel(logging.INFO)
-
-    def stop(self) -> None:
-        """Say no more; harmless when called again."""
-        self.log.removeHandler(self)
-        self.log.setLevel(self.level_before)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        if record.levelno == logging.INFO:
-            self.stop()
-            self.console.print("compiling the training loop (the first time, some seconds)")
+LEARNING = "learning"
+COMPILING = "compiling the training loop"
 
 
 class ProgressDisplay(BlockCallback):
     """A live bar in a terminal, a few plain lines elsewhere: steps/s, mean return, time left.
 
+    A line is printed for every tenth of the training, two seconds after its beginning, and where
+    ten seconds have gone by since the last.
+
     Args:
         console: where to.
         live: whether to draw a bar that moves.
+        on_variant: whether returns of training are not to be held against those of evaluation.
     """
 
-    def __init__(self, console: Console, live: bool) -> None:
+    def __init__(self, console: Console, live: bool, on_variant: bool = False) -> None:
         super().__init__()
         self.console = console
         self.bar: Progress | None = None
         self.live = live
+        self.on_variant = on_variant
         self.started = 0.0
         self.updated = 0.0
         self.tenths_shown = 0
-        self.notice = CompilationNotice(console)
+        self.figures = ""
+        self.activity = ""
+        self.silence = Silence(SECONDS_BEFORE_THE_FIRST_LINE)
+        self.notice = CompilationNotice(self._on_compiling)
+        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_FRAMES if live else SECONDS_BETWEEN_LOOKS)
 
     def _on_training_start(self) -> None:
         self.started = self.updated = time.monotonic()
+        self.silence = Silence(SECONDS_BEFORE_THE_FIRST_LINE)
         self.notice.listen()
         self.first_step = self.num_timesteps
         if self.live:
             self.bar = Progress(
+                SpinnerColumn(SPINNER),
                 BarColumn(),
                 TaskProgressColumn(),
                 TextColumn("{task.fields[figures]}"),
@@ -83,6 +79,13 @@ class ProgressDisplay(BlockCallback):
             )
             self.bar.start()
             self.task = self.bar.add_task("training", total=1.0, figures="")
+        self.heart.start()
+
+    def _on_rollout_start(self) -> None:
+        self.activity = ""
+
+    def _on_rollout_end(self) -> None:
+        self.activity = LEARNING
 
     def _on_step(self) -> bool:
         now = time.monotonic()
@@ -92,31 +95,71 @@ class ProgressDisplay(BlockCallback):
         return True
 
     def _on_training_end(self) -> None:
+        self.activity = ""
         self._show()
         self.close()
 
     def close(self) -> None:
         """Give the terminal back; may be called again."""
         self.notice.stop()
+        self.heart.stop()
         if self.bar is not None:
             self.bar.stop()
             self.bar = None
+
+    @contextmanager
+    def doing(self, activity: str) -> Iterator[None]:
+        """Say so where it takes long what goes on besides training."""
+        before, self.activity = self.activity, activity
+        try:
+            yield
+        finally:
+            self.activity = before
 
     @property
     def share_done(self) -> float:
         """How much of the training is behind."""
         return min(self.num_timesteps / max(self.model._total_timesteps, 1), 1.0)
 
-    def _show(self) -> None:
+    def look(self) -> None:
+        """Show that the training is alive, also while it does not say how far it is."""
         if self.bar is not None:
-            self.bar.update(
-                self.task, completed=self.share_done, figures=self._figures(), refresh=True
-            )
+            self._draw()
+        elif not self.live and self.silence.is_too_long:
+            self._print_line()
+
+    def _show(self) -> None:
+        self.figures = self._figures()
+        if self.bar is not None:
+            self._draw()
         elif not self.live:
             tenths = int(self.share_done * LINES_WITHOUT_TERMINAL)
             if tenths > self.tenths_shown:
                 self.tenths_shown = tenths
-                self.console.print(f"{self.share_done:4.0%}  {self._figures()}", highlight=False)
+                self._print_line()
+
+    def _draw(self) -> None:
+        if self.bar is not None:
+            words = "  ".join(self._words())
+            self.bar.update(self.task, completed=self.share_done, figures=words, refresh=True)
+
+    def _print_line(self) -> None:
+        self.silence.end()
+        line = "  ".join([f"{self.share_done:4.0%}", *self._words()])
+        self.console.print(line, highlight=False, soft_wrap=True)
+
+    def _words(self) -> list[str]:
+        """The figures and, where the training itself stands still, what goes on and how long."""
+        words = [self.figures] if self.figures else []
+        if self.activity and (seconds := time.monotonic() - self.updated) >= 1:
+            words.append(f"{self.activity}, {seconds:.0f} s")
+        return words
+
+    def _on_compiling(self) -> None:
+        self.activity = COMPILING
+        if self.bar is None:
+            self.silence.end()
+            self.console.print(f"{COMPILING} (the first time, some seconds)", highlight=False)
 
     def _figures(self) -> str:
         seconds = max(time.monotonic() - self.started, 1e-9)
@@ -126,4 +169,5 @@ class ProgressDisplay(BlockCallback):
         if episodes:
             mean_return = np.mean([episode["r"] for episode in episodes])
             figures += f"  mean return {mean_return:.2f}"
+            figures += " (training variant)" if self.on_variant else ""
         return figures

@@ -26,6 +26,7 @@ from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.pull_recording import PullSummary, summarise_pulls
 from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.run_record import recorded_versions, write_arguments, write_settings
+from pipeline.signs_of_life import Activity, doing
 from pipeline.train_spec import TrainSpec
 
 FINAL_EVALUATION_EPISODES = 100
@@ -136,7 +137,8 @@ def carry_out(training: Training) -> Outcome:
             finally:
                 training.display.close()
             seconds = time.monotonic() - started - seconds_compiling()
-        return _finish(training, state, seconds)
+        with doing(training.display.console, "saving what was learnt") as activity:
+            return _finish(training, state, seconds, activity)
     except BaseException as error:
         _give_up(training, error)
         raise
@@ -178,23 +180,26 @@ def _learn(training: Training) -> None:
     )
 
 
-def _finish(training: Training, state: str, seconds: float) -> Outcome:
+def _finish(training: Training, state: str, seconds: float, activity: Activity) -> Outcome:
     """Save what was learnt, judge it, draw it; ``run.json`` says so when all else is there."""
     run, model, evaluation = training.run, training.model, training.evaluation
     save_model(model, run.model_path)
     save_normalization(model, run.vecnormalize_path)
     if training.spec.save_replay_buffer:
         save_replay_buffer(model, final_replay_buffer_path(run.path))
+    activity.now("evaluating the final policy")
     if evaluation.is_asked_for and not evaluation.evaluations_timesteps:
         # The run was shorter than the time to its first evaluation, or called no callback.
         evaluation.init_callback(model)
         evaluation.evaluate_now()
     final = _final_evaluation(training) if state == FINISHED else None
     title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
+    activity.now("drawing the pictures")
     pulls = _keep_pulls(training, state, title)
     if training.spec.pictures and (pulls is None or evaluation.evaluations_timesteps):
         yardstick = None if final is None else final.yardstick
-        draw_learning_curve(run, title, model._num_timesteps_at_start, yardstick)
+        first_step, on_variant = model._num_timesteps_at_start, training.display.on_variant
+        draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
     _keep_value_map(training, title)
     outcome = Outcome(
         run,

@@ -48,7 +48,8 @@ class Column(Generic[AnyRow]):
         page: its heading on the page.
         help: what stands below that heading; ``{threshold}`` is the environment's.
         terminal: its heading in the terminal.
-        caption: what the terminal explains below the table, likewise.
+        caption: what the terminal explains below the table, likewise; ``{variants}`` explains the
+            mark of agents that were trained on a variant of the environment.
         best_first: the order that puts the best first; None for that of the study's metric.
     """
 
@@ -114,6 +115,11 @@ def _seconds(row: Row) -> Cell:
     return replace(estimate_cell(seconds), in_line=f"{number(seconds.point)} s")
 
 
+def _training(row: Row) -> Cell:
+    cell = estimate_cell(row.agent.last_episodes)
+    return replace(cell, in_line=f"{cell.in_line} *") if row.agent.on_variant else cell
+
+
 def _runs(row: Row) -> Cell:
     missing = f"{row.agent.n_missing} missing" if row.agent.n_missing else ""
     return Cell(f"{row.agent.n_runs}", row.agent.n_runs, missing)
@@ -146,8 +152,8 @@ COLUMNS: tuple[Column[Row], ...] = (
     Column(page="Gap", help="to the optimum", best_first="ascending", cell=_gap),
     Column(
         terminal="training",
-        caption="return of the last 100 training episodes",
-        cell=lambda row: estimate_cell(row.agent.last_episodes),
+        caption="return of the last 100 training episodes{variants}",
+        cell=_training,
     ),
     Column(page="Success", help="in the end", best_first="descending", cell=_success),
     Column(

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
+from experiments.study_spec import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
 from report.wording import enumeration, interval, number
 from verdicts import PairComparison
 
@@ -27,6 +27,7 @@ def environment_sentences(study: StudySpec, environment: EnvironmentAnalysis) ->
         _on_the_best(study, environment),
         *_on_the_pairs(study, environment),
         *_on_the_speed(environment),
+        *_on_variants(study, environment),
         *_on_failures(study.n_seeds, environment),
     ]
 
@@ -146,6 +147,16 @@ def _goal(environment: EnvironmentAnalysis) -> str:
         if math.isclose(share, 0.95):
             return "a score of 0.95"
     return f"a return of {number(threshold)}"
+
+
+def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
+    """That returns of training cannot be compared, where the verdicts are about them."""
+    names = [agent.agent for agent in environment.agents if agent.on_variant]
+    if not names or study.metric not in OF_TRAINING:
+        return []
+    verb = "was" if len(names) == 1 else "were"
+    place = f"On {environment.environment}, {enumeration(names)}"
+    return [f"{place} {verb} trained on a variant of the environment, with returns of its own."]
 
 
 def _on_failures(n_seeds: int, environment: EnvironmentAnalysis) -> Iterable[str]:

@@ -75,12 +75,16 @@ def _caption(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals over {study.n_seeds} seeds"
     rows = [Row(agent, environment) for agent in environment.agents]
     explained = [column for column in COLUMNS if column.terminal and column.caption]
-    threshold = number(environment.threshold)
+    on_variant = any(agent.on_variant for agent in environment.agents)
+    words = {
+        "threshold": number(environment.threshold),
+        "variants": " (*: on a variant of the environment)" if on_variant else "",
+    }
     return "; ".join(
         [
             f"mean, IQM: {metric}",
             *(
-                f"{column.terminal}: {column.caption.format(threshold=threshold)}"
+                f"{column.terminal}: {column.caption.format(**words)}"
                 for column, _ in filled(explained, rows)
             ),
         ]

@@ -17,11 +17,12 @@ from pipeline.filming import film_episode, write_film
 from pipeline.model_choice import ChosenModel
 from pipeline.model_loading import load_model
 from pipeline.playing import playing_env
+from pipeline.signs_of_life import Tell, tell_nobody
 
 MAX_STEPS = 500  # fifty seconds
 
 
-def write_films(results: StudyResults) -> tuple[list[Path], list[str]]:
+def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[Path], list[str]]:
     """Film an episode at each checkpoint of the first run of every agent, into ``films``.
 
     The agent acts as it did in training, exploration included. A film that is younger than its
@@ -35,6 +36,7 @@ def write_films(results: StudyResults) -> tuple[list[Path], list[str]]:
     for planned in results.planned:
         is_asked_for = planned.spec.save_every_n_episodes > 0 and not planned.is_batch
         if is_asked_for and planned.is_finished:
+            tell(f"{planned.agent} on {planned.environment}")
             try:
                 paths += _films_of(planned, results.root / "films")
             except (UserError, *MISTAKES) as error:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from pipeline.run_folder import Run
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 BLUE = "#0072B2"
@@ -23,6 +25,7 @@ GREY = "#9A9A9A"
 
 MOVING_AVERAGE_EPISODES = 100
 MAX_POINTS = 5000
+MOST_POWERS = 12  # of ten, that an axis goes over
 
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
@@ -59,27 +62,58 @@ def moving_average(values: Floats, width: int) -> Floats:
     return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
 
 
+def symlog_ticks(linear_up_to: float) -> list[float]:
+    """Where a symmetric logarithmic axis has its ticks.
+
+    At 0, at one place within the linear part, and at two for each power of ten beyond, on both
+    sides.
+    """
+    power = math.floor(math.log10(linear_up_to))
+    within = max(m for m in (1, 2, 5) if m * 10.0**power <= linear_up_to) * 10.0**power
+    beyond = [m * 10.0**k for k in range(power, power + MOST_POWERS) for m in (1, 3)]
+    sizes = [within, *(size for size in beyond if size > linear_up_to)]
+    return [-size for size in reversed(sizes)] + [0.0, *sizes]
+
+
 def _compress_outliers(axes: Axes, returns: Floats) -> None:
     """Use a symmetric logarithmic axis where early returns dwarf those at the end."""
+    from matplotlib.ticker import FixedLocator, StrMethodFormatter
+
     if not len(returns):
         return
-    settled = np.abs(returns[-len(returns) // 4 :]).max()
-    if np.abs(returns).max() > 10 * max(settled, 1.0):
-        axes.set_yscale("symlog", linthresh=max(settled, 1.0))
+    settled = max(float(np.abs(returns[-len(returns) // 4 :]).max()), 1.0)
+    if np.abs(returns).max() > 10 * settled:
+        axes.set_yscale("symlog", linthresh=settled)
+        axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(settled)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
 
 
-def _draw_evaluations(axes: Axes, run: Run) -> None:
-    if not run.evaluations_path.exists():
+def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> None:
+    if not len(steps):
         return
+    smooth = moving_average(returns, MOVING_AVERAGE_EPISODES)
+    stride = max(len(steps) // MAX_POINTS, 1)
+    axes.plot(steps[::stride], returns[::stride], ".", color=GREY, markersize=2, alpha=0.4)
+    axes.plot(
+        steps[::stride],
+        smooth[::stride],
+        color=ORANGE,
+        label=f"{what}, mean of {MOVING_AVERAGE_EPISODES} episodes",
+    )
+
+
+def _evaluations(run: Run) -> tuple[Floats, Floats]:
+    """Steps and mean returns of the evaluations, each of shape (n_evaluations,)."""
+    if not run.evaluations_path.exists():
+        return np.empty(0), np.empty(0)
     with np.load(run.evaluations_path) as evaluations:
-        axes.plot(
-            evaluations["timesteps"],
-            evaluations["results"].mean(axis=1),
-            "o-",
-            color=BLUE,
-            markersize=4,
-            label="evaluation, mean return",
-        )
+        return evaluations["timesteps"], evaluations["results"].mean(axis=1)
+
+
+def _draw_evaluations(axes: Axes, steps: Floats, means: Floats) -> None:
+    if len(steps):
+        label = "evaluation, mean return"
+        axes.plot(steps, means, "o-", color=BLUE, markersize=4, label=label)
 
 
 def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
@@ -88,8 +122,26 @@ def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
         axes.axhline(height, color=GREEN, linestyle=style, linewidth=1.2, label=label, zorder=1)
 
 
+def _places(figure: Figure, *, apart: bool) -> tuple[Axes, Axes]:
+    """Axes for evaluations and for training: the same ones, or one above the other."""
+    if not apart:
+        axes = figure.subplots()
+        axes.set(xlabel="environment steps", ylabel="return of an episode")
+        return axes, axes
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    upper.set_ylabel("return of an episode")
+    lower.set(xlabel="environment steps", ylabel="return there")
+    lower.set_title("training, on a variant of the environment", loc="left", fontsize=10)
+    return upper, lower
+
+
 def draw_learning_curve(
-    run: Run, title: str, first_step: int = 0, yardstick: Yardstick | None = None
+    run: Run,
+    title: str,
+    first_step: int = 0,
+    yardstick: Yardstick | None = None,
+    *,
+    on_variant: bool = False,
 ) -> None:
     """Draw training and evaluation returns by environment steps into the run folder.
 
@@ -98,34 +150,32 @@ def draw_learning_curve(
         title: what stands above the picture.
         first_step: environment steps that the agent had behind it when the run began.
         yardstick: the returns to measure against, where they are known.
+        on_variant: whether training was on a variant of the environment, so that its returns are
+            not drawn on the scale of evaluations and yardstick.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import EngFormatter
 
     figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
-    axes = figure.subplots()
     steps, returns = read_monitors(run.path)
-    steps = steps + first_step
-    if len(steps):
-        smooth = moving_average(returns, MOVING_AVERAGE_EPISODES)
-        stride = max(len(steps) // MAX_POINTS, 1)
-        axes.plot(steps[::stride], returns[::stride], ".", color=GREY, markersize=2, alpha=0.4)
-        axes.plot(
-            steps[::stride],
-            smooth[::stride],
-            color=ORANGE,
-            label=f"training, mean of {MOVING_AVERAGE_EPISODES} episodes",
-        )
-    _draw_evaluations(axes, run)
+    evaluated_at, means = _evaluations(run)
+    has_judgement = len(means) > 0 or yardstick is not None
+    apart = on_variant and len(steps) > 0 and has_judgement
+    judged, trained = _places(figure, apart=apart)
+    what = "training on a variant" if on_variant and not apart else "training"
+    _draw_training(trained, steps + first_step, returns, what)
+    _draw_evaluations(judged, evaluated_at, means)
     if yardstick is not None:
-        _draw_yardstick(axes, yardstick)
-    _compress_outliers(axes, returns)
-    axes.set(xlabel="environment steps", ylabel="return of an episode")
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-    axes.set_title(title, loc="left")
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-    if axes.get_legend_handles_labels()[0]:
+        _draw_yardstick(judged, yardstick)
+    _compress_outliers(trained, returns)
+    if apart:
+        _compress_outliers(judged, means)
+    judged.set_title(title, loc="left")
+    for axes in dict.fromkeys((judged, trained)):
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
         # Outside, where it covers no episode.
         figure.legend(loc="outside lower left", ncols=4, frameon=False, fontsize=9)
     with replacing(run.curve_path) as draft:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 
 from experiments.study_spec import file_name
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.figures.bandit_figures import (
     draw_arms,
     draw_belief,
@@ -34,12 +35,15 @@ MOST_LINES = 14
 Marks = Mapping[str, Mark]
 
 
-def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> list[Path]:
+def write_figures(
+    series: StudySeries, episodes_table: pd.DataFrame | None, tell: Tell = tell_nobody
+) -> list[Path]:
     """Draw all figures that the study has the runs for, into its folder ``figures``.
 
     Args:
         series: what they show.
         episodes_table: from `report.series.episode_blocks`, or None for no such figure.
+        tell: told how far the drawing is.
 
     Returns:
         The files.
@@ -50,10 +54,13 @@ def write_figures(series: StudySeries, episodes_table: pd.DataFrame | None) -> l
     for one in series.environments:
         if one.pulls is not None:
             name = one.environment.environment
+            tell(name)
             paths += _bandit_figures(one.pulls, name, folder, series.marks)
     for one in series.environments:
+        tell(one.environment.environment)
         paths += _study_figures(series, one, episodes_table, folder)
     if series.analysis.overall is not None:
+        tell("all environments")
         with figure(folder / "performance_profiles", paths) as (axes,):
             draw_profiles(axes, series.analysis.overall, series.marks)
     return paths

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from matplotlib.ticker import EngFormatter, FixedLocator, FuncFormatter, Percent
 
 from experiments.analysis import EnvironmentAnalysis, OverallAnalysis
 from experiments.study_spec import METRIC_WORDS
+from pipeline.pictures.learning_curve import symlog_ticks
 from report.figures.figure_style import REFERENCE, colour_of, line_style, shared_legend
 from report.series.agent_marks import COLOURS, Mark
 from report.series.curve_series import Curve, LearningCurves
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 _AXES = {"step": "environment steps", "episode": "episodes"}
-
-MOST_POWERS = 12  # of ten, that an axis goes over
 
 Marks = Mapping[str, Mark]
 
@@ -43,29 +41,28 @@ def draw_learning_curves(
         _set_scale(place, curves[kind].linear_up_to)
         for agent, curve in curves[kind].by_axis[by].items():
             _draw_curve(place, curve, marks[agent])
-        _draw_references(place, environment)
+        if not curves[kind].on_variant:
+            _draw_references(place, environment)
         place.set(xlabel=_AXES[by], ylabel="return")
         place.xaxis.set_major_formatter(EngFormatter(sep=""))
     places[0].set_title(f"{environment.environment}: evaluations", loc="left")
-    places[1].set_title("training episodes", loc="left")
+    places[1].set_title(_training_title(curves["training"].on_variant), loc="left")
     shared_legend(places[0])
+
+
+def _training_title(on_variant: Sequence[str]) -> str:
+    if not on_variant:
+        return "training episodes"
+    names = on_variant[0] if len(on_variant) == 1 else f"{len(on_variant)} agents"
+    return f"training episodes ({names}: on a variant of the environment)"
 
 
 def _set_scale(axes: Axes, linear_up_to: float | None) -> None:
     """Make the upright axis logarithmic where early returns dwarf those that matter."""
     if linear_up_to is not None:
         axes.set_yscale("symlog", linthresh=linear_up_to)
-        axes.yaxis.set_major_locator(FixedLocator(_ticks(linear_up_to)))
+        axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
-
-
-def _ticks(linear_up_to: float) -> list[float]:
-    """0, one within the linear part, and two for each power of ten beyond, on both sides."""
-    power = math.floor(math.log10(linear_up_to))
-    within = max(m for m in (1, 2, 5) if m * 10.0**power <= linear_up_to) * 10.0**power
-    beyond = [m * 10.0**k for k in range(power, power + MOST_POWERS) for m in (1, 3)]
-    sizes = [within, *(size for size in beyond if size > linear_up_to)]
-    return [-size for size in reversed(sizes)] + [0.0, *sizes]
 
 
 def _draw_curve(axes: Axes, curve: Curve, mark: Mark, alpha: float = 0.2) -> None:

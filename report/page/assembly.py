@@ -9,6 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from pipeline.files import write_text
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.page import (
     bandit_section,
     comparison_section,
@@ -38,16 +39,23 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
 )
 
 
-def write_report(series: StudySeries, path: Path, command: str) -> None:
+def write_report(series: StudySeries, path: Path, command: str, tell: Tell = tell_nobody) -> None:
     """Write the page of a study, one file that needs nothing else and no network.
 
     Args:
         series: the numbers that its figures show.
         path: the file, which is replaced.
         command: the command that reproduces the study.
+        tell: told how far the writing is.
     """
     report = Report(series, command)
-    sections = [section for make in SECTIONS if (section := make(report)) is not None]
+    sections = []
+    for place, make in enumerate(SECTIONS, start=1):
+        tell(f"section {place} of {len(SECTIONS)}")
+        section = make(report)
+        if section is not None:
+            sections.append(section)
+    tell("all sections as one file")
     write_text(path, render(report, sections))
 
 

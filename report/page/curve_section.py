@@ -34,6 +34,7 @@ def _environment_data(curves: Mapping[str, LearningCurves]) -> dict[str, Any]:
     return {
         kind: {
             "linearUpTo": of_kind.linear_up_to,
+            "onVariant": of_kind.on_variant,
             **{
                 by: {agent: vars(curve) for agent, curve in of_agents.items()}
                 for by, of_agents in of_kind.by_axis.items()

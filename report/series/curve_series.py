@@ -33,10 +33,13 @@ class LearningCurves:
         by_axis: by axis, and then by agent, the best first; an agent without a curve is left out.
         linear_up_to: where a symmetric logarithmic axis of returns ceases to be linear; None for a
             linear axis.
+        on_variant: agents whose returns are of a variant of the environment, so that they are not
+            to be held against the optimum.
     """
 
     by_axis: Mapping[str, Mapping[str, Curve]]
     linear_up_to: float | None
+    on_variant: tuple[str, ...] = ()
 
 
 def learning_curves(
@@ -47,7 +50,12 @@ def learning_curves(
     for kind in KINDS:
         by_axis = {by: _curves(results, environment, kind, by) for by in AXES}
         by_step = [curve.y for curve in by_axis["step"].values()]
-        found[kind] = LearningCurves(by_axis, linear_up_to(by_step, environment.optimum))
+        variants = [agent.agent for agent in environment.agents if agent.on_variant]
+        found[kind] = LearningCurves(
+            by_axis,
+            linear_up_to(by_step, environment.optimum),
+            tuple(variants) if kind == "training" else (),
+        )
     return found
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.series.agent_marks import Mark, agent_marks
 from report.series.curve_series import Curve, LearningCurves, learning_curves
 from report.series.pull_series import PullSeries, pull_series
@@ -46,9 +47,12 @@ class StudySeries:
     environments: tuple[EnvironmentSeries, ...]
 
 
-def study_series(analysis: StudyAnalysis) -> StudySeries:
+def study_series(analysis: StudyAnalysis, tell: Tell = tell_nobody) -> StudySeries:
     """Compute all that is drawn; most of the time goes into the intervals of the curves."""
-    environments = [_environment_series(analysis, one) for one in analysis.environments]
+    environments = []
+    for one in analysis.environments:
+        tell(one.environment)
+        environments.append(_environment_series(analysis, one))
     return StudySeries(analysis, agent_marks(analysis.study), tuple(environments))
 
 

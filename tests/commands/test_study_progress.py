@@ -13,14 +13,22 @@ from commands.study_progress import StudyProgress
 from experiments.execution import RunFailure
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline import signs_of_life
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """A clock that stands until it is told to go on."""
     fake = SimpleNamespace(now=1000.0)
-    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    for place in (module, signs_of_life):
+        monkeypatch.setattr(place, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    # Nothing beats by itself.
+    monkeypatch.setattr(module, "Heartbeat", lambda *_: SimpleNamespace(start=skip, stop=skip))
     return fake
+
+
+def skip():
+    pass
 
 
 def planned_runs(n_seeds=4):
@@ -64,6 +72,24 @@ def test_where_there_is_no_terminal_a_line_now_and_then(clock):
         "3 of 6 runs in 10 s, about 10 s left",
         "5 of 6 runs in 1 min 30 s, about 18 s left",
         "6 of 6 runs in 1 min 30 s",
+    ]
+
+
+def test_a_line_is_printed_also_while_no_run_ends(clock):
+    runs = planned_runs(1)
+    file, console = console_of(force_terminal=False)
+    with StudyProgress(console, runs, []) as progress:
+        for _ in range(25):
+            clock.now += 1
+            progress.look()
+        progress.note(runs[0], None)
+        progress.note(runs[1], None)
+        clock.now += 100
+        progress.look()
+    assert file.getvalue().splitlines() == [
+        "0 of 2 runs in 11 s",
+        "0 of 2 runs in 22 s",
+        "2 of 2 runs in 25 s",
     ]
 
 
@@ -115,6 +141,10 @@ def test_in_a_terminal_one_table_moves(clock):
         # The table is there before the first run has ended, and names are taken to the letter.
         assert re.search(r"\[b\]one\[/b\] +lake +1/4", first)
         assert "0 of 6 runs in 0 s" in first
+        clock.now += 7
+        progress.look()
+        assert "0 of 6 runs in 7 s" in plain(file.getvalue())
+        clock.now -= 7
         clock.now += 60
         progress.note(runs[2], None)
         progress.note(runs[3], failure_of(runs[3]))

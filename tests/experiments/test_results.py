@@ -493,3 +493,22 @@ def test_enumerations_and_intervals():
     assert interval(Estimate(1.0, 0.5, 1.5, 3)) == "1 [0.5, 1.5]"
     assert interval(Estimate(1.0, 1.0, 1.0, 3)) == "1"
     assert interval(Estimate(1.0, math.nan, math.nan, 1)) == "1"
+
+
+def test_agents_that_were_trained_on_a_variant_are_known_and_told_of(tmp_path):
+    shaped = {"n_timesteps": 100, "train_env_kwargs": {"shelf_reward": -10}}
+    agents = (AgentSpec("plain", "qlearning"), AgentSpec("shaped", "sarsa", shaped))
+    study = StudySpec("study", "A study", agents, (ENVIRONMENT,), 2, metric="last_episodes")
+    results = results_of(study, tmp_path, {"plain": [90.0, 91.0], "shaped": [80.0, 81.0]})
+    told = []
+    analysis = analyse(results, told.append)
+    assert {a.agent: a.on_variant for a in analysis.environments[0].agents} == {
+        "plain": False,
+        "shaped": True,
+    }
+    told_of = "On Warehouse-v0, shaped was trained on a variant of the environment"
+    assert told_of in " ".join(sentences(analysis))
+    curves = study_series(analysis, told.append).environments[0].curves
+    assert curves["training"].on_variant == ("shaped",)
+    assert curves["evaluation"].on_variant == ()
+    assert told == ["Warehouse-v0", "all environments", "Warehouse-v0"]

@@ -17,6 +17,7 @@ from pipeline.environments import (
     make_single_env,
     make_training_env,
     training_kwargs,
+    trains_on_variant,
 )
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
@@ -87,6 +88,43 @@ def test_the_environments_get_their_arguments(tmp_path):
     training.close()
     assert make_single_env(spec, training=True).unwrapped.spec.kwargs["goal_reward"] == 60
     assert make_single_env(spec).unwrapped.spec.kwargs["goal_reward"] == 50
+
+
+SHAPED = {"shelf_reward": -10}
+SCALED = {"envs.wrappers.ScaleReward": {"scale": 0.01}}
+
+
+@pytest.mark.parametrize(
+    ("entry", "is_variant"),
+    [
+        ({}, False),
+        ({"env_kwargs": SHAPED}, False),
+        ({"train_env_kwargs": SHAPED}, True),
+        ({"eval_env_kwargs": SHAPED}, True),
+        ({"train_env_kwargs": {"max_episode_steps": 100}}, True),
+        # Wrappers lie above Monitor, and normalisation above them.
+        ({"train_env_wrapper": SCALED}, False),
+        ({"env_wrapper": SCALED, "normalize": {"norm_reward": True}}, False),
+        # The same for both, in two ways of saying it.
+        ({"train_env_kwargs": SHAPED, "eval_env_kwargs": SHAPED}, False),
+        ({"env_kwargs": SHAPED, "train_env_kwargs": SHAPED}, False),
+        ({"env_kwargs": SHAPED, "train_env_kwargs": {"shelf_reward": -1}}, True),
+        # What is usual may be said or left out.
+        ({"train_env_kwargs": {"slip": 0.0, "max_episode_steps": 1000}}, False),
+        ({"env_kwargs": {"slip": 0.1}, "train_env_kwargs": {"slip": 0.0}}, True),
+    ],
+)
+def test_what_makes_training_returns_those_of_a_variant(entry, is_variant):
+    assert trains_on_variant(spec_of("Warehouse-v0", entry)) is is_variant
+
+
+def test_arguments_of_a_registration_are_usual_too():
+    # FrozenLake8x8-v1 is registered with this map and this limit.
+    usual = {"map_name": "8x8", "max_episode_steps": 200, "is_slippery": True}
+    assert not trains_on_variant(spec_of("FrozenLake8x8-v1", {"train_env_kwargs": usual}))
+    other = {"train_env_kwargs": {"map_name": "4x4"}}
+    assert trains_on_variant(spec_of("FrozenLake8x8-v1", other))
+    assert not trains_on_variant(spec_of("FrozenLake-v1", other))
 
 
 def test_only_training_is_recorded(tmp_path):

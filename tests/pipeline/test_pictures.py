@@ -198,6 +198,52 @@ def test_the_legend_covers_nothing(run, monkeypatch):
     assert figure.bbox.y0 <= box.y0
 
 
+def axes_drawn(run, monkeypatch, judged=True, **options):
+    """The axes of the picture, of a run with returns above its optimum, by their titles."""
+    from matplotlib.figure import Figure
+
+    drawn = []
+    monkeypatch.setattr(
+        Figure, "savefig", lambda figure, draft, **_: (draft.touch(), drawn.append(figure))
+    )
+    write_monitor(run.path, 0, [(89.0, 10, i) for i in range(50)])
+    if judged:
+        write_evaluations(run, [[70.0], [79.0]])
+    yardstick = Yardstick(optimum=79, blind=0) if judged else None
+    draw_learning_curve(run, "title", yardstick=yardstick, **options)
+    return drawn[0].axes
+
+
+def names_in(axes):
+    return [line.get_label() for line in axes.get_lines() if line.get_label()[0] != "_"]
+
+
+def test_training_on_a_variant_is_drawn_apart(run, monkeypatch):
+    upper, lower = axes_drawn(run, monkeypatch, on_variant=True)
+    assert names_in(upper) == ["evaluation, mean return", "optimum", "best blind policy"]
+    assert names_in(lower) == ["training, mean of 100 episodes"]
+    assert lower.get_title(loc="left") == "training, on a variant of the environment"
+    assert upper.get_title(loc="left") == "title"
+    # Steps go together, returns do not.
+    assert upper.get_xlim() == lower.get_xlim()
+    assert upper.get_ylim()[1] < 89 < lower.get_ylim()[1]
+
+
+def test_training_on_the_environment_itself_is_drawn_with_the_evaluations(run, monkeypatch):
+    (axes,) = axes_drawn(run, monkeypatch)
+    assert names_in(axes) == [
+        "training, mean of 100 episodes",
+        "evaluation, mean return",
+        "optimum",
+        "best blind policy",
+    ]
+
+
+def test_a_variant_without_evaluations_is_called_so(run, monkeypatch):
+    (axes,) = axes_drawn(run, monkeypatch, judged=False, on_variant=True)
+    assert names_in(axes) == ["training on a variant, mean of 100 episodes"]
+
+
 def scale_of(returns):
     from matplotlib.figure import Figure
 

@@ -3,6 +3,7 @@
 import io
 import logging
 import re
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -11,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import pipeline.progress as module
 from agents import load_algorithm
+from pipeline import signs_of_life
 from pipeline.progress import ProgressDisplay
 
 
@@ -30,7 +32,14 @@ def clock(monkeypatch):
         return fake.now
 
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=monotonic))
+    # What is due by the clock looks at it without letting it go on, and not by itself.
+    monkeypatch.setattr(signs_of_life, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    monkeypatch.setattr(module, "Heartbeat", lambda *_: SimpleNamespace(start=skip, stop=skip))
     return fake
+
+
+def skip():
+    pass
 
 
 def watched(n_steps, *, live, terminal, **arguments):
@@ -104,11 +113,91 @@ def test_a_bar_moves_ten_times_a_second_at_most(clock):
     assert len(re.findall(r"\d+% ", plain)) <= 110
 
 
-def test_a_bar_may_be_asked_for_without_a_terminal(clock):
-    _, text = watched(200, live=True, terminal=False)
-    assert len(text.splitlines()) == 1
-    assert "100%" in text
-    assert "200 steps" in text
+class Slow(BaseCallback):
+    """Lets time go by in one step, and the display look at it every second."""
+
+    def __init__(self, display, clock, at, seconds, activity=None):
+        super().__init__()
+        self.display, self.clock, self.at, self.seconds = display, clock, at, seconds
+        self.activity = activity
+
+    def _on_step(self):
+        if self.num_timesteps == self.at:
+            with self.display.doing(self.activity) if self.activity else nullcontext():
+                for _ in range(self.seconds):
+                    self.clock.now += 1
+                    self.display.look()
+        return True
+
+
+def slow_training(clock, live=False, **options):
+    """What is written of five steps, of which one takes 24 seconds."""
+    file = io.StringIO()
+    # A line is one line, however narrow the console is that rich assumes in a pipe.
+    width = 120 if live else 20
+    console = Console(file=file, width=width, force_terminal=live, color_system=None)
+    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
+    display = ProgressDisplay(console, live=live)
+    agent.learn(1000, callback=[display, Slow(display, clock, seconds=24, **options)])
+    return re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", file.getvalue())
+
+
+def test_a_line_comes_early_and_then_every_ten_seconds_also_while_no_step_ends(clock):
+    lines = slow_training(clock, at=30, activity="evaluating").splitlines()
+    # Two seconds after the beginning, and then ten after each line.
+    assert re.fullmatch(
+        r"  \d%  2\d steps  \d+ steps/s  mean return 0.00  evaluating, 2 s", lines[0]
+    )
+    assert [re.search(r"evaluating, (\d+) s", line)[1] for line in lines[:3]] == ["2", "12", "22"]
+    # Thereafter nothing of it is left.
+    assert not any("evaluating" in line for line in lines[3:])
+    assert re.match(r" 10%  10\d steps", lines[3])
+    assert len(lines) == 13
+
+
+def test_before_the_first_step_there_is_a_line_too(clock):
+    file = io.StringIO()
+    display = ProgressDisplay(Console(file=file, force_terminal=False), live=False)
+    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
+    agent._setup_learn(10, display)
+    display.init_callback(agent)
+    display.on_training_start({}, {})
+    clock.now += 3
+    display.look()
+    display.close()
+    assert file.getvalue() == "  0%\n"
+
+
+def test_what_goes_on_besides_training_stands_beside_the_bar(clock):
+    text = slow_training(clock, live=True, at=30, activity="evaluating")
+    assert "evaluating, 12 s" in text
+    assert "evaluating" not in text[text.index("50%") :]
+
+
+def test_learning_between_two_rollouts_is_said(clock):
+    console = Console(file=io.StringIO(), width=120, force_terminal=False)
+    display = ProgressDisplay(console, live=False)
+
+    class LooksWhileItLearns(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            for _ in range(3):
+                clock.now += 1
+                display.look()
+
+    agent = load_algorithm("ppo")("MlpPolicy", "CartPole-v1", n_steps=8, batch_size=8, seed=0)
+    agent.learn(8, callback=[display, LooksWhileItLearns()])
+    assert "  learning, 2 s\n" in console.file.getvalue()
+
+
+def test_returns_of_a_variant_are_called_so(clock):
+    file = io.StringIO()
+    agent = load_algorithm("qlearning")(env="FrozenLake-v1", seed=0, engine="interpreted")
+    display = ProgressDisplay(Console(file=file, width=120), live=False, on_variant=True)
+    agent.learn(100, callback=display)
+    assert re.search(r"mean return 0\.\d\d \(training variant\)$", file.getvalue().rstrip())
 
 
 class Compiling(BaseCallback):

@@ -2,6 +2,7 @@
 
 import io
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -73,8 +74,9 @@ def test_a_bar_lets_go_of_the_terminal_whatever_happens(tmp_path, monkeypatch, e
     except RuntimeError:
         state = "failed"
     assert state == ("interrupted" if isinstance(error, KeyboardInterrupt) else "failed")
-    # The cursor that the bar has hidden is shown again.
-    assert file.getvalue().count("\x1b[?25h") == file.getvalue().count("\x1b[?25l") == 1
+    # The cursor that was hidden, by the bar and by what came after it, is shown again.
+    codes = re.findall(r"\x1b\[\?25[hl]", file.getvalue())
+    assert codes == ["\x1b[?25l", "\x1b[?25h"] * (2 if state == "interrupted" else 1)
 
 
 # --- playing --------------------------------------------------------------------------------------

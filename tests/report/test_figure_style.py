@@ -2,8 +2,8 @@
 
 import pytest
 
+from pipeline.pictures.learning_curve import symlog_ticks
 from report.figures.figure_style import figure
-from report.figures.study_figures import _ticks
 from report.off_policy_table import shown
 from verdicts import Estimate
 
@@ -30,7 +30,7 @@ def test_a_figure_has_a_grid_and_two_spines_and_is_written_twice(tmp_path):
     ],
 )
 def test_ticks_within_the_linear_part_and_beyond(linear_up_to, within, beyond):
-    ticks = _ticks(linear_up_to)
+    ticks = symlog_ticks(linear_up_to)
     middle = len(ticks) // 2
     assert ticks[middle] == 0
     assert ticks[middle + 1] == pytest.approx(within)

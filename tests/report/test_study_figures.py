@@ -35,7 +35,7 @@ def curve(x, y, below=1.0, above=2.0):
     return Curve(x, y, y - below, y + above)
 
 
-def learning_curves(linear_up_to=None):
+def learning_curves(linear_up_to=None, on_variant=()):
     return {
         "evaluation": LearningCurves(
             {
@@ -58,6 +58,7 @@ def learning_curves(linear_up_to=None):
                 "seconds": {},
             },
             None,
+            on_variant,
         ),
     }
 
@@ -67,10 +68,11 @@ def learning_curves(linear_up_to=None):
 
 @pytest.fixture
 def curves_drawn(axes, drawn, made_up):
-    def draw(linear_up_to=None, **changes):
+    def draw(linear_up_to=None, on_variant=(), **changes):
         places = axes(2)
         environment = made_up.environment(**changes)
-        draw_learning_curves(places, learning_curves(linear_up_to), environment, MARKS)
+        curves = learning_curves(linear_up_to, on_variant)
+        draw_learning_curves(places, curves, environment, MARKS)
         return [drawn(place) for place in places]
 
     return draw
@@ -83,6 +85,17 @@ def test_evaluations_by_step_on_the_left_and_training_by_episode_on_the_right(cu
     assert (left.line("second")["x"], left.line("second")["y"]) == ([10, 20], [4, 40])
     assert (right.line("first")["x"], right.line("first")["y"]) == ([1, 2, 3], [7, 8, 9])
     assert (right.line("second")["x"], right.line("second")["y"]) == ([3], [6])
+
+
+@pytest.mark.parametrize(
+    ("on_variant", "words"), [(("second",), "second"), (("first", "second"), "2 agents")]
+)
+def test_no_optimum_stands_beside_training_on_a_variant(curves_drawn, on_variant, words):
+    left, right = curves_drawn(on_variant=on_variant)
+    assert right.names == ["first", "second"]
+    assert right.title == f"training episodes ({words}: on a variant of the environment)"
+    assert left.names == ["first", "second", "optimum", "best blind policy"]
+    assert left.title == "lake: evaluations"
 
 
 def test_every_curve_has_its_colour_its_dashes_and_its_interval(curves_drawn):

@@ -150,6 +150,38 @@ def test_a_sentence_for_each_verdict_begins_a_line(analysis):
         assert sentence.startswith(start)
 
 
+def test_returns_of_a_training_variant_are_marked(made_up):
+    agents = made_up.agent("first", 90.0), made_up.agent("second", 40.0, on_variant=True)
+    found = made_up.analysis([made_up.environment(agents)], ["first", "second"])
+    _, lines = lines_of(lambda console: print_analysis(console, found), width=200)
+    _, *rows = cells(lines)
+    assert [row[HEADINGS.index("training")] for row in rows] == [
+        "95 [94.9, 95.2]",
+        "45 [44.9, 45.2] *",
+    ]
+    mark = "return of the last 100 training episodes (*: on a variant of the environment);"
+    assert mark in " ".join(line.strip() for line in lines)
+
+
+@pytest.mark.parametrize("metric", ["final", "training", "last_episodes"])
+def test_verdicts_on_training_say_which_agents_had_a_variant(made_up, metric):
+    names = ["first", "second", "third"]
+    agents = [made_up.agent(name, 90.0, on_variant=name != "first") for name in names]
+    place = made_up.environment(agents)
+    said = environment_sentences(made_up.study(names, metric=metric), place)
+    sentence = (
+        "On lake, second and third were trained on a variant of the environment, with returns of "
+        "its own."
+    )
+    assert (sentence in said) is (metric != "final")
+    # Once more with all on the environment itself.
+    place = made_up.environment([made_up.agent(name, 90.0) for name in names])
+    assert not any(
+        "variant" in text
+        for text in environment_sentences(made_up.study(names, metric=metric), place)
+    )
+
+
 def test_an_agent_without_a_figure_has_a_dash(made_up):
     nothing = ThresholdSummary(made_up.nothing, made_up.nothing)
     without = made_up.agent(

@@ -8,8 +8,7 @@ report.section("curves", (root, data) => {
   let redraw = () => {};
   const isShown = report.legend(legend, () => redraw());
 
-  const extent = (curves) => {
-    const environment = report.page.environments[report.environment];
+  const extent = (curves, environment) => {
     const values = curves.flatMap((curve) => [...curve.y, ...curve.low, ...curve.high]);
     const known = [...values, environment.optimum, environment.blind].filter((v) => v !== null);
     return known.length ? [Math.min(...known), Math.max(...known)] : [0, 1];
@@ -22,24 +21,27 @@ report.section("curves", (root, data) => {
     });
     if (isBandit) return { traces: [], layout: {} };
     const [kind, by, across] = ["kind", "by", "across"].map(chosen);
-    const linear = data[report.environment][kind].linearUpTo;
+    const { linearUpTo: linear, onVariant } = data[report.environment][kind];
+    // Nobody is to read returns of a variant against the optimum of the environment itself.
+    const judged = report.page.environments[report.environment];
+    const environment = onVariant.length ? { ...judged, optimum: null, blind: null } : judged;
     scale.hidden = linear === null;
     const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
     const height = symlog?.height ?? ((value) => value);
     const curves = Object.entries(data[report.environment][kind][by]).filter(([label]) => isShown(label));
-    detail.textContent = symlog
-      ? `The vertical axis is linear up to ±${report.number(linear)} and logarithmic beyond.`
-      : "";
+    const words = symlog ? [`The vertical axis is linear up to ±${report.number(linear)} and logarithmic beyond.`] : [];
+    if (onVariant.length) words.push(`Trained on a variant of the environment: ${onVariant.join(", ")}.`);
+    detail.textContent = words.join(" ");
     return {
       traces: curves.flatMap(([label, curve]) => report.band(label, curve, height)),
       layout: {
         hovermode: "x unified",
         uirevision: [report.environment, kind, by, across, chosen("scale")].join(),
-        shapes: report.references(report.page.environments[report.environment], height),
+        shapes: report.references(environment, height),
         xaxis: { title: { text: TITLES[by] }, type: across, hoverformat: ",.4~r", exponentformat: "SI", rangemode: "tozero" },
         yaxis: {
           title: { text: kind === "evaluation" ? "return of evaluations" : "return of training episodes" },
-          ...symlog?.ticks(...extent(curves.map(([, curve]) => curve))),
+          ...symlog?.ticks(...extent(curves.map(([, curve]) => curve), environment)),
         },
       },
     };

@@ -1,0 +1,31 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import train
+
+ROOT = Path(train.__file__).parent
+
+
+@pytest.fixture
+def left_by_its_reader():
+    """Start a command and read its first line alone; the line, all errors and the exit code."""
+
+    def start(folder, program, *words):
+        process = subprocess.Popen(
+            [sys.executable, str(ROOT / program), *map(str, words)],
+            cwd=folder,
+            text=True,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+        )
+        with process, process.stdout as out, process.stderr as err:
+            line = out.readline()
+            out.close()
+            return line, err.read(), process.wait(timeout=120)
+
+    return start
