@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from commands.flag_values import COUNT, COUNT_OR_NONE, SEED, THREADS, filled, whole_number
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
+
+if TYPE_CHECKING:
+    from pipeline.model_choice import ChosenModel
 
 STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
 RUN_NUMBER = whole_number(0, besides={-1: "the run without a number"})
@@ -123,21 +127,14 @@ def _add_flags_of_rl_zoo3(parser: argparse.ArgumentParser) -> None:
 def main() -> int:
     """Parse the arguments and play; the exit code."""
     args = build_parser().parse_args()
-    from commands.enjoy_request import check_playing, model_request
-    from pipeline.errors import UserError
+    from commands.enjoy_request import check_playing
     from pipeline.filming import check_film_path
-    from pipeline.model_choice import choose_model
-    from pipeline.run_folder import NoRunError
 
     check_playing(args)
     film = None if args.record is None else Path(args.record)
     if film is not None:
         check_film_path(film)
-    try:
-        chosen = choose_model(model_request(args))
-    except NoRunError as error:
-        flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
-        raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error
+    chosen = _chosen_model(args)
     from rich.console import Console
 
     from pipeline.signs_of_life import doing
@@ -158,7 +155,19 @@ def main() -> int:
         film=film,
         monitor_folder=Path(args.reward_log) if args.reward_log else None,
         num_threads=args.num_threads,
-        verbose=args.verbose,
     )
     play(console, chosen, request)
     return 0
+
+
+def _chosen_model(args: argparse.Namespace) -> ChosenModel:
+    from commands.enjoy_request import model_request
+    from pipeline.errors import UserError
+    from pipeline.model_choice import choose_model
+    from pipeline.run_folder import NoRunError
+
+    try:
+        return choose_model(model_request(args))
+    except NoRunError as error:
+        flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
+        raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error

@@ -38,7 +38,6 @@ class PlayingRequest:
         film: a file to write a film to, instead, or None.
         monitor_folder: where to write the returns of the episodes, or None.
         num_threads: torch threads; below 1 for PyTorch's own choice.
-        verbose: 0 for no output.
     """
 
     n_episodes: int | None = 10
@@ -49,7 +48,6 @@ class PlayingRequest:
     film: Path | None = None
     monitor_folder: Path | None = None
     num_threads: int = 1
-    verbose: int = 1
 
     @property
     def mode(self) -> RenderMode | None:
