@@ -46,6 +46,11 @@ def wait(folder):
     (Path(folder) / f"waiting_{os.getpid()}").touch()
     time.sleep(600)
 
+def interrupt_itself():
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(0.05)
+    return "still here"
+
 def threads():
     return os.environ["OMP_NUM_THREADS"]
 
@@ -178,6 +183,10 @@ def test_ctrl_c_does_not_reach_the_children(chores, tmp_path):
         assert not waiting.done()
         stop_all()
         assert isinstance(waiting.exception(), StoppedError)
+
+
+def test_a_child_works_through_ctrl_c(chores):
+    assert supervise(chores.interrupt_itself, clean_up=nothing, tries=1) == "still here"
 
 
 # A supervisor of its own, which is to be killed.
