@@ -24,6 +24,7 @@ from pipeline.model_loading import load_to_play
 from pipeline.playing import play_episodes, playing_env
 from pipeline.recorded_runs import recorded_run, run_around
 from pipeline.run_folder import Run
+from pipeline.settings.hyperparam_entries import NoEntryError
 from pipeline.settings.strict_yaml import read_saved_settings
 
 CONFIG = OrderedDict(
@@ -368,3 +369,18 @@ def test_settings_that_make_no_sense(zoo, tmp_path, settings):
     (folder / "run.json").write_text('{"env_name": "X", "spec": {"algo": 1, "hyperparams": 7}}')
     with pytest.raises(UserError, match="say what it is with --algo"):
         choose_model(ModelRequest(folder / "a2c-CartPole-v1.zip", is_trusted=True))
+
+
+def test_where_a_folder_says_nothing_the_default_entry_counts(zoo, tmp_path, monkeypatch):
+    """But whether a stranger's model saw normalised observations is not ours to say."""
+    request = ModelRequest(hub(zoo, tmp_path), "a2c", "CartPole-v1", is_trusted=True)
+    entry = {"normalize": True, "frame_stack": 2}
+    monkeypatch.setattr("pipeline.model_choice.read_hyperparams", lambda *_: entry)
+    hyperparams = choose_model(request).spec.hyperparams
+    assert (hyperparams.normalize, hyperparams.frame_stack) == (None, 2)
+
+    def no_entry(*_):
+        raise NoEntryError("none")
+
+    monkeypatch.setattr("pipeline.model_choice.read_hyperparams", no_entry)
+    assert choose_model(request).spec.hyperparams.frame_stack is None
