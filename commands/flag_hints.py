@@ -10,9 +10,8 @@ from pipeline.errors import OTHER_NAMES, did_you_mean
 from pipeline.settings.constructor_arguments import RANGES
 from pipeline.settings.hyperparams import SPECIAL_KEYS
 
-_NO_SEARCH = "hyperparameters are not searched for here; a study compares settings: compare.py"
+_NO_SEARCH = "hyperparameters are not searched for here; a study compares settings: see compare"
 _NO_WANDB = "Weights & Biases is not supported; -tb DIR writes TensorBoard logs"
-_NO_HER = "it is for hindsight experience replay, which is not among the agents here"
 
 # Flags of rl_zoo3's train and enjoy that are not here, and why.
 INSTEAD: Mapping[str, str] = {
@@ -46,7 +45,7 @@ INSTEAD: Mapping[str, str] = {
         ),
         _NO_WANDB,
     ),
-    "--truncate-last-trajectory": _NO_HER,
+    "--truncate-last-trajectory": "it is not a choice here: the library's default, true, holds",
 }
 
 # Arguments of constructors that are flags.
@@ -61,7 +60,11 @@ HYPERPARAMETERS = {
     *("prior_successes", "baseline", "engine", "exploration", "ignore_context", "initial_q_std"),
     *("skip_terminal_update", "tie_breaking", "variant", "reward_std", "ridge", "use_rms_prop"),
     *("normalize_advantage", "optimize_memory_usage", "replay_buffer_class", "use_sde"),
-    *("replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs"),
+    *("replay_buffer_kwargs", "rollout_buffer_class", "rollout_buffer_kwargs", "target_entropy"),
+    *("action_noise", "policy_delay", "target_policy_noise", "target_noise_clip", "zero_policy"),
+    *("use_sde_at_warmup", "top_quantiles_to_drop_per_net", "n_critic_updates", "cg_max_steps"),
+    *("cg_damping", "line_search_shrinking_factor", "line_search_max_iter", "sub_sampling_factor"),
+    *("n_delta", "n_top", "delta_std", "alive_bonus_offset", "n_eval_episodes"),
 }
 
 # What people type for flags of ours; the first of the flags that the command has is named.
@@ -137,4 +140,4 @@ def _as_setting(name: str, value: str, is_here: bool) -> str:
         given = '"dict(net_arch=[64, 64])"'
     if is_here:
         return f"hyperparameters go behind -params: -params {name}:{given}"
-    return f"hyperparameters are a matter of training: train.py -params {name}:{given}"
+    return f"hyperparameters are a matter of training: train with -params {name}:{given}"

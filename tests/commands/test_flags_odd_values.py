@@ -35,7 +35,7 @@ def parsers():
 
 # But for --gym-packages, whose modules are imported for good.
 FLAGS = [
-    pytest.param(module, action.option_strings[-1], id=f"{parser.prog}{action.option_strings[-1]}")
+    (module, action.option_strings[-1])
     for module, parser in parsers().items()
     for action in parser._actions
     if action.option_strings and action.nargs != 0 and action.dest != "gym_packages"

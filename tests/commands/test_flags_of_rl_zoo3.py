@@ -61,4 +61,4 @@ def test_what_is_said_not_to_be_here_is_answered(capsys):
             train_agent.build_parser().parse_args([flag, "1"])
         err = capsys.readouterr().err
         assert err.count("\n") == 1
-        assert re.search(rf"unknown argument {flag} 1: .*(not|hindsight)", err)
+        assert re.search(rf"unknown argument {flag} 1: .*not", err)
