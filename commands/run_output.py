@@ -8,9 +8,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pipeline.module_records import as_flag
 from pipeline.run_folder import FINISHED
 from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import as_flag
 
 if TYPE_CHECKING:
     from pipeline.evaluation.sampled import Evaluation

@@ -16,11 +16,12 @@ from pipeline.model_loading import (
     hand_written_algorithm,
     run_of,
 )
+from pipeline.module_records import check_recorded
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import UserModule, check_recorded
+from pipeline.user_modules import UserModule
 
 
 @dataclass(frozen=True)
