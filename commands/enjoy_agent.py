@@ -6,7 +6,15 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from commands.flag_values import COUNT, COUNT_OR_NONE, SEED, THREADS, filled, whole_number
+from commands.flag_values import (
+    COUNT,
+    COUNT_OR_NONE,
+    SEED,
+    THREADS,
+    VERBOSITY,
+    filled,
+    whole_number,
+)
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
 
 if TYPE_CHECKING:
@@ -103,7 +111,7 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
     add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
     add("--reward-log", metavar="DIR", help="write the returns there too, as Monitor's CSV files")
-    add("--verbose", type=int, default=1, help="0 for no output (default: 1)")
+    add("--verbose", type=VERBOSITY, default=1, help="0 for no output (default: 1)")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add(
         "--gym-packages",

@@ -10,9 +10,9 @@ from rich.markup import escape
 from rich.table import Table
 
 from commands.parsing import called_as
+from pipeline.module_records import as_flag
 from pipeline.run_folder import FINISHED, Run, numbered_runs
 from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import as_flag
 
 if TYPE_CHECKING:
     from pipeline.evaluation.sampled import Evaluation

@@ -24,13 +24,14 @@ from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.model_finding import Which, model_at, model_of
 from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm
+from pipeline.module_records import check_recorded
 from pipeline.normalization import normalising, read_statistics
 from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import UserModule, check_recorded
+from pipeline.user_modules import UserModule
 
 
 @dataclass(frozen=True)

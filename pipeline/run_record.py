@@ -11,9 +11,9 @@ from typing import Any
 import yaml
 
 from pipeline.files import write_text
+from pipeline.module_records import keep_copies
 from pipeline.run_folder import Run
 from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import keep_copies
 
 RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
 

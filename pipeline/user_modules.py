@@ -14,18 +14,14 @@ import os
 import shlex
 import sys
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 from pipeline.errors import UserError, one_line, shown
 
 _PROJECT = Path(__file__).resolve().parents[1]
-# The folder of a run that keeps copies of single files.
-COPIES = "modules"
-MAX_COPY_BYTES = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -207,62 +203,3 @@ def _is_users(filename: str, module: UserModule) -> bool:
 
 def _refused(typed: str, reason: str) -> UserError:
     return UserError(f"--gym-packages {shlex.quote(typed)}: {reason}")
-
-
-def as_flag(modules: Iterable[UserModule], env_id: str = "") -> str:
-    """The flag that imports the modules again, to be typed; empty where none is needed.
-
-    Args:
-        modules: as `import_typed` returned them.
-        env_id: typed beside it; the module before its colon needs no flag.
-    """
-    words = [m.typed for m in modules if m.typed != env_id.rpartition(":")[0]]
-    return f" --gym-packages {shlex.join(words)}" if words else ""
-
-
-def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
-    """Put copies of the modules that are single small files into a run folder."""
-    for module in modules:
-        path = Path(module.path or "")
-        if "." in module.name or not path.is_file() or path.stat().st_size > MAX_COPY_BYTES:
-            continue
-        (folder / COPIES).mkdir(exist_ok=True)
-        (folder / COPIES / path.name).write_bytes(path.read_bytes())
-
-
-def check_recorded(recorded: Mapping[str, Any], folder: Path) -> None:
-    """Make sure that the modules that a run was trained with have been imported.
-
-    Args:
-        recorded: what the run folder says was asked for.
-        folder: the run folder.
-
-    Raises:
-        UserError: if one has not; it says what to type.
-    """
-    names = [name for name in recorded.get("gym_packages") or () if isinstance(name, str)]
-    missing = [name for name in names if name not in sys.modules]
-    if not missing:
-        return
-    known = [m for m in recorded.get("user_modules") or () if isinstance(m, dict)]
-    words = [_to_type(name, known, folder) for name in missing]
-    raise UserError(
-        f"{folder} was made with modules of yours ({', '.join(map(_printable, missing))}), and no "
-        f"module is imported because a file asks: add --gym-packages {' '.join(words)}"
-    )
-
-
-def _to_type(name: str, known: Sequence[Mapping[str, Any]], folder: Path) -> str:
-    """What to type for a module that a run recorded: where it was, or else the run's copy."""
-    path = next((m.get("path") for m in known if m.get("name") == name), None)
-    copy = folder / COPIES / f"{name}.py"
-    if isinstance(path, str) and Path(path).exists():
-        near = Path(path)
-        if near.is_relative_to(Path.cwd()):
-            return _printable(f".{os.sep}{near.relative_to(Path.cwd())}")
-        return _printable(path)
-    return _printable(str(copy) if name.isidentifier() and copy.is_file() else name)
-
-
-def _printable(word: str) -> str:
-    return shlex.quote(word) if word.isprintable() else shown(word)

@@ -25,7 +25,7 @@ from pipeline.model_loading import (
     load_model,
     run_of,
 )
-from pipeline.user_modules import check_recorded
+from pipeline.module_records import check_recorded
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")

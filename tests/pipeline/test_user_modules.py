@@ -11,14 +11,8 @@ import pytest
 
 from pipeline.environments import check_env_id, make_env
 from pipeline.errors import UserError
-from pipeline.user_modules import (
-    UserModule,
-    as_flag,
-    check_recorded,
-    import_again,
-    import_typed,
-    keep_copies,
-)
+from pipeline.module_records import as_flag, check_recorded, keep_copies
+from pipeline.user_modules import UserModule, import_again, import_typed
 
 
 @pytest.fixture
