@@ -18,7 +18,7 @@ from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import generator_of
 from agents.compiled.loop import act, learn_from_step
 from agents.compiled.training_records import UNDECIDED
-from mdp.array_types import Floats, Ints
+from mdp.array_types import Bools, Floats, Ints
 from mdp.machine_code import inlined, kernel
 
 
@@ -28,21 +28,26 @@ class Tables(NamedTuple):
     Attributes:
         values: action values, shape (T, S, A).
         visit_counts: updates of each entry so far, shape (T, S, A).
+        allowed: what may be done at each observation, bool of shape (S, A), all of it where a row
+            is False; of no rows unless the settings say ``mask_actions``.
     """
 
     values: Floats
     visit_counts: Ints
+    allowed: Bools
 
 
 class Room(NamedTuple):
     """Where numbers are worked out; what it holds between two calls means nothing.
 
     Attributes:
-        values: a number for each action, shape (A,).
+        values: a number for each action that is allowed, shape (n,).
+        actions: these actions, in order, shape (n,).
         draws: the random numbers of one choice, shape (draws_per_choice,).
     """
 
     values: Floats
+    actions: Ints
     draws: Floats
 
 
@@ -66,8 +71,9 @@ class TabularAgent(NamedTuple):
 def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
     """What follows the step, as the target of the update of ``table`` has it.
 
-    ``agent.room.values`` holds the values of that table in ``env.next_obs``; ``env.uniform`` is a
-    number in [0, 1), uniform where there are several tables.
+    ``agent.room.values`` holds the values of that table in ``env.next_obs``, of the actions that
+    are allowed there, and ``agent.room.actions`` says which these are; ``env.uniform`` is a number
+    in [0, 1), uniform where there are several tables.
     """
     raise CompiledOnlyError
 
@@ -91,21 +97,44 @@ def exploration_rate(agent: TabularAgent, progress: Any) -> float:
 
 
 @inlined
+def room_for_allowed(agent: TabularAgent, obs: int) -> Room:
+    """Room for the allowed actions alone: rules and exploration see no others.
+
+    Without masks, or where none is known, these are all.
+    """
+    actions, allowed = agent.room.actions, agent.tables.allowed
+    n_allowed = len(actions)
+    if agent.settings.mask_actions:
+        n_allowed = 0
+        for action in range(len(actions)):
+            if allowed[obs, action]:
+                actions[n_allowed] = action
+                n_allowed += 1
+        if n_allowed == 0:
+            n_allowed = len(actions)
+            for action in range(n_allowed):
+                actions[action] = action
+    return Room(agent.room.values[:n_allowed], actions[:n_allowed], agent.room.draws)
+
+
+@inlined
 def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
-    """An action by the mean of the tables' values."""
-    settings, tables, room = agent.settings, agent.tables, agent.room
+    """An allowed action by the mean of the tables' values."""
+    settings, tables, room = agent.settings, agent.tables, room_for_allowed(agent, obs)
     rng = generator_of(agent.rng)
     for k in range(len(room.draws)):
         if settings.strategy == GAUSSIAN_NOISE:
             room.draws[k] = rng.standard_normal()
         else:
             room.draws[k] = rng.random()
-    for action in range(len(room.values)):
-        room.values[action] = tables.values[0, obs, action]
+    for k in range(len(room.values)):
+        action = room.actions[k]
+        room.values[k] = tables.values[0, obs, action]
         if tables.values.shape[0] > 1:
-            room.values[action] = 0.5 * (room.values[action] + tables.values[1, obs, action])
+            room.values[k] = 0.5 * (room.values[k] + tables.values[1, obs, action])
     rate = exploration_rate(agent, progress)
-    return choose_action(settings.strategy, room.values, rate, settings.tie_scale, room.draws)
+    chosen = choose_action(settings.strategy, room.values, rate, settings.tie_scale, room.draws)
+    return int(room.actions[chosen])
 
 
 @inlined
@@ -123,12 +152,14 @@ def update(agent: TabularAgent, env: Any, progress: Any) -> float:
 
     ``env.uniform`` decides which of two tables is updated.
     """
-    settings, tables, room = agent.settings, agent.tables, agent.room
+    settings, tables = agent.settings, agent.tables
     table = int(env.uniform * tables.values.shape[0])
-    for action in range(len(room.values)):
-        room.values[action] = tables.values[table, env.next_obs, action]
+    room = room_for_allowed(agent, env.next_obs)
+    for k in range(len(room.values)):
+        room.values[k] = tables.values[table, env.next_obs, room.actions[k]]
+    ahead = TabularAgent(settings, tables, room, agent.rng)
     discount = 0.0 if env.terminated else settings.gamma
-    target = env.reward + discount * next_value(agent, env, progress, table)
+    target = env.reward + discount * next_value(ahead, env, progress, table)
     tables.visit_counts[table, env.obs, env.action] += 1
     count = tables.visit_counts[table, env.obs, env.action]
     size = step_size(progress.learning_rate, settings.averages_samples, count)
@@ -166,7 +197,9 @@ def act_in_all(
     progress: Any,
     values: Floats,
     visit_counts: Ints,
+    allowed: Bools,
     room: Floats,
+    actions: Ints,
     draws: Floats,
     rng: Any,
 ) -> int:
@@ -179,7 +212,8 @@ def act_in_all(
     for i in range(len(envs)):
         if not 0 <= envs[i].obs < values.shape[1]:
             return i
-    agent = TabularAgent(settings[0], Tables(values, visit_counts), Room(room, draws), rng[0])
+    tables = Tables(values, visit_counts, allowed)
+    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0])
     for i in range(len(envs)):
         act(agent, envs[i], progress[0])
     return -1
@@ -192,7 +226,9 @@ def learn_from_all(
     progress: Any,
     values: Floats,
     visit_counts: Ints,
+    allowed: Bools,
     room: Floats,
+    actions: Ints,
     draws: Floats,
     rng: Any,
 ) -> int:
@@ -200,6 +236,7 @@ def learn_from_all(
     for i in range(len(envs)):
         if not 0 <= envs[i].next_obs < values.shape[1]:
             return i
-    agent = TabularAgent(settings[0], Tables(values, visit_counts), Room(room, draws), rng[0])
+    tables = Tables(values, visit_counts, allowed)
+    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0])
     learn_from_step(agent, envs, progress[0])
     return -1
