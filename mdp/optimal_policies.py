@@ -95,9 +95,7 @@ def value_iteration(
             return _plan(problem, values, change, iterations)
 
 
-def policy_iteration(
-    model: TransitionModel, discount: float, mask: Bools | None = None
-) -> Plan:
+def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None = None) -> Plan:
     """Plan by evaluating a policy exactly and making it greedy, until no action is better.
 
     The linear systems are solved directly, which suits some ten thousand states; beyond, use

@@ -28,11 +28,10 @@ from agents.compiled.engine_choice import EngineChoice, choose_engine
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import StepSize
 from agents.compiled.training_records import UNDECIDED
-from agents.tabular.masked_tables import MaskedArguments, MaskedTables
+from agents.tabular.mask_keeping import MaskedArguments, MaskKeeper
 from agents.tabular.q_table_policy import QTablePolicy
 from agents.tabular.temporal_difference import (
     Room,
-    Tables,
     TabularAgent,
     act_on_values,
     no_commitment,
@@ -44,7 +43,7 @@ from mdp.array_types import Floats, Ints
 ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
-class TabularAlgorithm(MaskedTables):
+class TabularAlgorithm(MaskKeeper):
     """Temporal-difference control on a table of action values.
 
     Args:
@@ -70,7 +69,7 @@ class TabularAlgorithm(MaskedTables):
             a hundred times faster, and is refused where there is none; ``"interpreted"`` calls
             them step by step; ``"auto"`` compiles where it can.
         policy_kwargs: further arguments of the policy.
-        kwargs: as in `MaskedTables`, ``mask_actions`` among them.
+        kwargs: as in `MaskKeeper`, ``mask_actions`` among them.
 
     Raises:
         ValueError: if an argument lies outside its range or a space does not fit.
@@ -84,7 +83,7 @@ class TabularAlgorithm(MaskedTables):
     learn_from_step = td_learning
     commit = no_commitment
 
-    _rebuilt = (*MaskedTables._rebuilt, "_in_use")
+    _rebuilt = (*MaskKeeper._rebuilt, "_in_use")
 
     def __init__(
         self,
@@ -174,7 +173,7 @@ class TabularAlgorithm(MaskedTables):
         n_draws = draws_per_choice(self.strategy, n_actions)
         return TabularAgent(
             self.settings()[0],
-            Tables(values, self.policy.visit_counts.numpy(), self.policy.masks),
+            self._tables(),
             Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
             handles_of([rng])[0],
         )
@@ -221,7 +220,7 @@ class TabularAlgorithm(MaskedTables):
         return workspace
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> Workspace:
-        return Workspace(self.compiled_agent(rng), rng, n)
+        return Workspace(self.compiled_agent(rng), self.policy.masks, rng, n)
 
     def _choose_actions(self) -> Ints:
         if self.asks_for_masks:

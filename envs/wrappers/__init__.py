@@ -1,4 +1,6 @@
-"""Wrappers that fit an environment to an agent: discrete or one-hot observations, other rewards, action masks.
+"""Wrappers that fit an environment to an agent: discrete or one-hot observations, other rewards.
+
+Two more say which actions an environment allows.
 
 The observation wrappers also map whole batches of observations (`map_observations`), which exact
 evaluation needs: it asks a policy for every state at once.

@@ -81,7 +81,7 @@ class IdleActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         if P is None:
             raise ValueError(f"IdleActionMasks needs an environment that holds P, not {env}")
         self.masks = np.array(
-            [[_changes(state, P[state][a]) for a in range(len(P[state]))] for state in range(len(P))]
+            [[_changes(s, P[s][action]) for action in range(len(P[s]))] for s in range(len(P))]
         )
         self.masks |= ~self.masks.any(axis=1, keepdims=True)
 

@@ -21,17 +21,18 @@ from agents.common.signatures import CommonArguments, TieBreaking
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from agents.tabular.q_table_policy import QTablePolicy
+from agents.tabular.temporal_difference import MaskedTables, Tables
 from envs.action_masks import INFO_KEY
 from mdp.array_types import Bools
 
 
 class MaskedArguments(CommonArguments, total=False):
-    """What the constructors of tabular agents hand on; see `MaskedTables`."""
+    """What the constructors of tabular agents hand on; see `MaskKeeper`."""
 
     mask_actions: bool
 
 
-class MaskedTables(LearningAlgorithm):
+class MaskKeeper(LearningAlgorithm):
     """Acts and bootstraps among the actions that the environment allows, where it is asked to.
 
     Masks have to depend on the observation alone: they are kept in the policy, a row for each
@@ -58,7 +59,6 @@ class MaskedTables(LearningAlgorithm):
 
     policy: QTablePolicy
     n_tables: ClassVar[int] = 1
-    parameters = {"mask_actions": np.bool_}  # noqa: RUF012
 
     _rebuilt = (*LearningAlgorithm._rebuilt, "masks_are_known", "_infos")
 
@@ -106,6 +106,16 @@ class MaskedTables(LearningAlgorithm):
             raise ValueError(f"tables must be 1 or 2, of shape {shape}, not {found[0]}")
         if self.mask_actions and self.policy.masks.shape != shape[1:]:
             raise ValueError(f"masks must be of shape {shape[1:]}, not {self.policy.masks.shape}")
+
+    def _tables(self) -> Tables | MaskedTables:
+        """What the agent knows, in the memory of its policy."""
+        policy = self.policy
+        values, counts = policy.q_tables.numpy(), policy.visit_counts.numpy()
+        return (
+            MaskedTables(values, counts, policy.masks)
+            if self.mask_actions
+            else Tables(values, counts)
+        )
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         prepared = super()._setup_learn(*args, **kwargs)
