@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 
 import envs  # noqa: F401  # registers the project's environments
+from envs.wrappers import ActionMasks
 from pipeline.errors import UserError, one_line, unknown
 from pipeline.train_spec import TrainSpec
 
@@ -87,7 +89,10 @@ def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
 
 
 def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
-    """The wrappers that the hyperparameters name, as one function, or None for none."""
+    """The wrappers that the hyperparameters name, as one function, or None for none.
+
+    Where the agent is to hold to action masks, the outermost tells them.
+    """
     from pipeline.settings.components import wrapper_factory
 
     inner = wrapper_factory(spec.hyperparams.env_wrapper, spec.gym_packages)
@@ -96,9 +101,12 @@ def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
         if training
         else None
     )
-    if inner is None or outer is None:
-        return inner or outer
-    return lambda env: outer(inner(env))
+    wraps = [wrap for wrap in (inner, outer) if wrap is not None]
+    if spec.hyperparams.algorithm.get("mask_actions", False):
+        wraps.append(ActionMasks)
+    if not wraps:
+        return None
+    return lambda env: reduce(lambda wrapped, wrap: wrap(wrapped), wraps, env)
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gym.Env[Any, Any]:

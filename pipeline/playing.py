@@ -89,14 +89,15 @@ def play_episodes(
     Yields:
         Return and length of each episode as it ends.
     """
+    from pipeline.evaluation.mask_telling import player
+
+    choose = player(model, env).predict
     obs: Any = env.reset()
     state = None
     starts = np.ones(1, dtype=bool)
     steps = finished = 0
     while finished < n_episodes and (n_steps is None or steps < n_steps):
-        actions, state = model.predict(
-            obs, state=state, episode_start=starts, deterministic=deterministic
-        )
+        actions, state = choose(obs, state=state, episode_start=starts, deterministic=deterministic)
         obs, _, starts, infos = env.step(actions)
         steps += 1
         after_step(bool(starts[0]))

@@ -60,14 +60,14 @@ def checked_masks(masks: Any, obs: Any, n_actions: int) -> Bools:
         ValueError: if one has another shape or allows nothing; the message names the observation.
     """
     for mask, one in zip(masks, obs, strict=True):
-        shape = np.shape(mask)
+        shape, shown = np.shape(mask), " ".join(str(one).split())
         if shape != (n_actions,):
             raise ValueError(
-                f"the action mask for observation {one} has shape {shape}, it must be "
+                f"the action mask for observation {shown} has shape {shape}, it must be "
                 f"({n_actions},), a bool for each action"
             )
         if not np.any(mask):
-            raise ValueError(f"the action mask for observation {one} allows no action")
+            raise ValueError(f"the action mask for observation {shown} allows no action")
     return np.asarray(masks, dtype=np.bool_)
 
 
