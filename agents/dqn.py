@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.dqn.policies import QNetwork
 
-from agents.common.action_masks import check_masks_exist, checked_masks, present_masks
+from agents.common.mask_reading import check_masks_exist, checked_masks, present_masks
 from agents.common.signatures import full_signature
 from envs.action_masks import INFO_KEY
 from mdp.array_types import Bools

@@ -155,8 +155,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     if isinstance(base, GridWorld) and kind.action_masks is GridWorld.action_masks:
         return base.dynamics.action_masks()
     if isinstance(base, TaxiEnv) and kind.action_mask is TaxiEnv.action_mask:
-        states = range(int(base.observation_space.n))
-        return np.array([base.action_mask(state) for state in states], dtype=np.bool_)
+        return np.array([base.action_mask(state) for state in sorted(base.P)], dtype=np.bool_)
     return None
 
 

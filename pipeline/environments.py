@@ -103,10 +103,17 @@ def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
     )
     wraps = [wrap for wrap in (inner, outer) if wrap is not None]
     if spec.hyperparams.algorithm.get("mask_actions", False):
-        wraps.append(ActionMasks)
+        wraps.append(_with_masks)
     if not wraps:
         return None
     return lambda env: reduce(lambda wrapped, wrap: wrap(wrapped), wraps, env)
+
+
+def _with_masks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    try:
+        return ActionMasks(env)
+    except ValueError as error:
+        raise UserError(f"mask_actions: {one_line(error)}") from error
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gym.Env[Any, Any]:

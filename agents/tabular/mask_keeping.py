@@ -10,7 +10,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.common.action_masks import (
+from agents.common.mask_reading import (
     check_masks_exist,
     checked_masks,
     masks_of_observations,
@@ -121,6 +121,7 @@ class MaskKeeper(LearningAlgorithm):
         prepared = super()._setup_learn(*args, **kwargs)
         if self.mask_actions:
             assert self.env is not None
+            check_masks_exist(self.env)
             known = masks_of_observations(self.env, len(self.policy.masks))
             self.masks_are_known = known is not None
             if known is not None:

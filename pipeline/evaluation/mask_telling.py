@@ -8,7 +8,7 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.common.action_masks import present_masks
+from agents.common.mask_reading import present_masks
 
 
 def takes_masks(model: Any) -> bool:
