@@ -110,7 +110,7 @@ class DQN(stable_baselines3.DQN):
             raise ValueError(f"mask_actions needs n_steps of 1, not {self.n_steps}")
         if isinstance(self.observation_space, spaces.Dict):
             raise ValueError("mask_actions does not work with Dict observations")
-        if self.replay_buffer_class not in {None, MaskedReplayBuffer}:
+        if self.replay_buffer_class not in {None, ReplayBuffer, MaskedReplayBuffer}:
             raise ValueError("mask_actions brings its own replay buffer: leave replay_buffer_class")
         if self.env is not None:
             check_masks_exist(self.env)

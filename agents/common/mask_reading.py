@@ -43,6 +43,8 @@ def present_masks(env: VecEnv, obs: Any) -> Bools:
     inside = env.unwrapped
     if isinstance(inside, DummyVecEnv):
         masks = [action_masks(one) for one in inside.envs]
+        if any(mask is None for mask in masks):
+            check_masks_exist(env)
     else:
         masks = env.env_method(METHOD)
     return checked_masks(masks, obs, int(env.action_space.n))  # type: ignore[attr-defined]

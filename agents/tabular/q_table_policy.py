@@ -67,6 +67,14 @@ class QTablePolicy(BasePolicy):
             return np.zeros((0, self.q_tables.shape[2]), dtype=np.bool_)
         return np.asarray(self.allowed_actions.numpy())
 
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Take over tables; an agent may go by masks that was saved without them, or no longer."""
+        tables = {name: state_dict[name] for name in state_dict if name != "allowed_actions"}
+        if "allowed_actions" in self._buffers:
+            unknown = th.zeros_like(self.allowed_actions)
+            tables["allowed_actions"] = state_dict.get("allowed_actions", unknown)
+        return super().load_state_dict(tables, strict, assign)
+
     def note_masks(self, obs: Any, masks: Bools) -> None:
         """Keep what may be done at observations, which are of shape (n,); masks of shape (n, A).
 

@@ -162,12 +162,22 @@ def test_a_zip_brings_it_back(algorithm, tmp_path):
     assert masks[buffer.observations[done, 0, 0], buffer.actions[done, 0, 0]].all()
 
 
+def test_a_plain_file_can_go_on_with_masks_and_a_masked_one_without(tmp_path):
+    plain = {**SMALL, "mask_actions": False}
+    DQN(env=warehouse(), **plain).save(tmp_path / "plain")
+    loaded = DQN.load(tmp_path / "plain", env=warehouse(), mask_actions=True).learn(60)
+    loaded.save(tmp_path / "masked")
+    assert isinstance(loaded.replay_buffer, MaskedReplayBuffer)
+    again = DQN.load(tmp_path / "masked", env=warehouse(), mask_actions=False).learn(60)
+    assert type(again.replay_buffer) is stable_baselines3.common.buffers.ReplayBuffer
+
+
 @pytest.mark.parametrize(
     ("kwargs", "message"),
     [
         ({"n_steps": 3}, "^mask_actions needs n_steps of 1, not 3$"),
         (
-            {"replay_buffer_class": stable_baselines3.common.buffers.ReplayBuffer},
+            {"replay_buffer_class": stable_baselines3.her.HerReplayBuffer},
             "^mask_actions brings its own replay buffer: leave replay_buffer_class$",
         ),
         ({"env": "CartPole-v1"}, r"^mask_actions: the environment has no method action_masks\(\)"),

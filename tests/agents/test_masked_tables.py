@@ -251,6 +251,18 @@ def test_a_zip_without_masks_says_nothing_of_them(tmp_path):
     assert set(agent.policy.state_dict()) == {"q_tables", "visit_counts"}
 
 
+def test_an_agent_can_begin_to_go_by_masks_and_cease_to(tmp_path):
+    QLearning, env = load_algorithm("qlearning"), make_vec_env("Taxi-v4", seed=0)  # noqa: N806
+    QLearning(env=env, seed=0).learn(500).save(tmp_path / "plain")
+    masked = QLearning.load(tmp_path / "plain", env=env, mask_actions=True)
+    assert not masked.policy.masks.any()
+    assert masked.learn(500).policy.masks.any()
+    masked.save(tmp_path / "masked")
+    plain = QLearning.load(tmp_path / "masked", env=env, mask_actions=False)
+    assert set(plain.policy.state_dict()) == {"q_tables", "visit_counts"}
+    assert plain.learn(100).engine_in_use == "compiled"
+
+
 BAD_MASKS = {
     "nothing": (np.zeros(A), "the action mask for observation 1 allows no action"),
     "shape": (
