@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
+import stable_baselines3
 import torch as th
-from stable_baselines3 import DQN
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.dqn.policies import QNetwork
 from torch.nn.functional import mse_loss
 from torch.nn.utils import clip_grad_norm_
 
+from agents.dqn import DQN, NextValues
 
-def double_q_values(online: QNetwork, target: QNetwork, next_obs: th.Tensor) -> th.Tensor:
+
+def double_q_values(online: NextValues, target: QNetwork, next_obs: th.Tensor) -> th.Tensor:
     """The target network's value of the action that the online network prefers.
 
     Args:
-        online: the network that is trained.
+        online: the network that is trained, or what counts of its values.
         target: its lagging copy.
         next_obs: observations, shape (batch, ...).
 
@@ -32,21 +32,16 @@ def double_q_values(online: QNetwork, target: QNetwork, next_obs: th.Tensor) -> 
 class DoubleDQN(DQN):
     """Double DQN (van Hasselt, Guez and Silver, 2016): DQN but for its target.
 
-    Arguments are those of `stable_baselines3.DQN`.
+    Arguments are those of `agents.dqn.DQN`.
     """
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
-        target_network = self.q_net_target
-        # DQN maximises over the columns of what this returns: there is one left to choose from.
-        self.q_net_target = partial(double_q_values, self.q_net, target_network)  # type: ignore[assignment]
-        try:
-            super().train(gradient_steps, batch_size)
-        finally:
-            self.q_net_target = target_network
+    def _next_values(self, target: QNetwork) -> NextValues:
+        # One column, so that there is nothing left to choose from.
+        online: NextValues = lambda next_obs: self._among_allowed(self.q_net(next_obs))  # noqa: E731
+        return lambda next_obs: double_q_values(online, target, next_obs)
 
 
-class DeepQLearning(DQN):
+class DeepQLearning(stable_baselines3.DQN):
     """Deep Q-learning with experience replay as first published (Mnih et al., 2013).
 
     DQN without what was added to it later: the target comes from the network that learns, as it is

@@ -22,13 +22,14 @@ from agents.common.online import OnlineAlgorithm
 from agents.common.signatures import CommonArguments
 from agents.common.table_policy import TablePolicy
 from envs.known_models import (
+    action_masks_of_states,
     model_check,
     observations_of_states,
     time_limit,
     transition_model,
 )
 from mdp import TransitionModel, finite_horizon_optimum, value_iteration
-from mdp.array_types import Ints
+from mdp.array_types import Bools, Ints
 
 
 class ActionTablePolicy(TablePolicy):
@@ -86,10 +87,12 @@ class PlanningAgent(OnlineAlgorithm):
         env: environment whose transition model is known, or its id.
         gamma: discount factor of the planning; by default 0.99 for value iteration, and 1 for the
             optimum under the time limit.
+        mask_actions: plan among the actions alone that the environment allows in each state.
         kwargs: as in `OnlineAlgorithm`.
 
     Raises:
-        ValueError: if ``gamma`` lies outside [0, 1]; by `learn`, if the model is not known.
+        ValueError: if ``gamma`` lies outside [0, 1]; by `learn`, if the model is not known, or
+            the masks are to count and are not.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"ActionTablePolicy": ActionTablePolicy}
@@ -101,9 +104,11 @@ class PlanningAgent(OnlineAlgorithm):
         policy: str | type[BasePolicy] = "ActionTablePolicy",
         env: GymEnv | str | None = None,
         gamma: float | None = None,
+        mask_actions: bool = False,
         **kwargs: Unpack[CommonArguments],
     ) -> None:
         self.gamma = self.default_gamma if gamma is None else gamma
+        self.mask_actions = mask_actions
         self._steps = np.zeros(0, dtype=np.int64)
         super().__init__(policy, env, supported_action_spaces=(spaces.Discrete,), **kwargs)
 
@@ -139,16 +144,25 @@ class PlanningAgent(OnlineAlgorithm):
             raise ValueError(f"{name} needs an environment whose transition model is known{why}")
         if observations.ndim != 1 or len(np.unique(observations)) < len(observations):
             raise ValueError(f"{name} needs observations that are the numbers of the states")
-        by_state, horizon = self._plan(model, time_limit(env))
+        mask = action_masks_of_states(env) if self.mask_actions else None
+        if self.mask_actions and mask is None:
+            raise ValueError(f"mask_actions: {name} needs an environment whose masks are known")
+        by_state, horizon = self._plan(model, time_limit(env), mask)
         actions = np.zeros((len(by_state), int(self.observation_space.n)), dtype=np.int64)  # type: ignore[attr-defined]
         actions[:, observations] = by_state
         self.policy.set_actions(actions, horizon)
 
     @abstractmethod
     def _plan(
-        self, model: TransitionModel, limit: int | None
+        self, model: TransitionModel, limit: int | None, mask: Bools | None
     ) -> tuple[NDArray[np.integer[Any]], int]:
-        """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon."""
+        """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon.
+
+        Args:
+            model: the dynamics.
+            limit: the time limit, or None.
+            mask: the actions that may be taken, bool of shape (S, A), or None for all.
+        """
 
     def _choose_actions(self) -> Ints:
         actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)
@@ -193,9 +207,9 @@ class ValueIteration(PlanningAgent):
     default_gamma = 0.99
 
     def _plan(
-        self, model: TransitionModel, limit: int | None
+        self, model: TransitionModel, limit: int | None, mask: Bools | None
     ) -> tuple[NDArray[np.integer[Any]], int]:
-        return value_iteration(model, self.gamma).policy[None], 1
+        return value_iteration(model, self.gamma, mask=mask).policy[None], 1
 
 
 class Optimal(PlanningAgent):
@@ -204,9 +218,9 @@ class Optimal(PlanningAgent):
     default_gamma = 1.0
 
     def _plan(
-        self, model: TransitionModel, limit: int | None
+        self, model: TransitionModel, limit: int | None, mask: Bools | None
     ) -> tuple[NDArray[np.integer[Any]], int]:
         if limit is None:
             raise ValueError("Optimal needs a time limit: give the environment max_episode_steps")
-        plan = finite_horizon_optimum(model, limit, self.gamma)
+        plan = finite_horizon_optimum(model, limit, self.gamma, mask)
         return plan.actions_left, limit

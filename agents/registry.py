@@ -133,7 +133,7 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "double_qlearning": _tabular(
         "double_q_learning:DoubleQLearning", "double Q-learning on two tables"
     ),
-    "dqn": _deep("stable_baselines3:DQN", "deep Q-network (Stable-Baselines3)"),
+    "dqn": _deep("agents.dqn:DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
     "deep_qlearning": _deep(
         "agents.deep:DeepQLearning", "DQN of 2013: squared loss, no target network"

@@ -17,7 +17,7 @@ from envs.grid_map import GOAL, Description, GridMap
 from envs.rendering import GridRenderer
 from envs.scene import Scene
 from envs.text_rendering import render_text
-from mdp.array_types import AnyInts, Floats, Ints
+from mdp.array_types import AnyInts, Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from mdp.transition_model import TransitionModel
@@ -116,6 +116,15 @@ class GridWorld(gym.Env[Any, Any]):
         if self.render_mode == "human":
             self.render()
         return self._observe(), move.reward, move.terminated, False, self._info(move.bumped)
+
+    def action_masks(self) -> Bools:
+        """Which moves neither a wall nor the edge stops, bool of shape (4,).
+
+        Where moves may slip, the one that is meant counts: slipping to the side is not ruled out.
+        Never none: all may be tried in a cell that is walled in, and where an episode has ended.
+        The convention is that of sb3-contrib's agents.
+        """
+        return self.dynamics.action_mask(self.s)
 
     def render(self) -> str | NDArray[np.uint8] | None:
         """The map as text (``ansi``), as a picture of shape (height, width, 3), or in a window."""

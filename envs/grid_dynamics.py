@@ -128,12 +128,25 @@ class GridDynamics:
             initial=initial,
         )
 
+    def action_mask(self, state: int) -> Bools:
+        """The moves that neither a wall nor the edge stops, bool of shape (4,), never none."""
+        free = [not self.move(state, direction).bumped for direction in range(len(MOVES))]
+        return np.array(free) | (not any(free))
+
+    def action_masks(self) -> Bools:
+        """`action_mask` of all states, bool of shape (S, 4)."""
+        codes = np.frombuffer(self.codes, np.uint8)
+        blocked = self._per_code("blocked", np.bool_)
+        entered, _ = self._entered()
+        free = ~blocked[entered]
+        free |= (blocked | self._per_code("terminated", np.bool_))[codes][:, None]
+        free |= ~free.any(axis=1, keepdims=True)
+        return np.tile(free, (self.n_states // self.n_cells, 1))
+
     def _all_moves(self) -> tuple[Ints, Floats, Bools]:
         """`move` for all states and directions: next states, rewards, ends; each (S, 4)."""
         codes = np.frombuffer(self.codes, np.uint8)
-        target, inside = self._targets()
-        # The edge takes the place of a letter: code 0, which no map holds.
-        entered = np.where(inside, codes[target], 0)
+        entered, target = self._entered()
         stays = self._per_code("blocked", np.bool_)[entered]
         cells = np.arange(self.n_cells)[:, None]
         destination = np.where(stays, cells, target)
@@ -157,6 +170,13 @@ class GridDynamics:
         terminated[:, over] = True
         shape = (self.n_states, len(MOVES))
         return next_state.reshape(shape), reward.reshape(shape), terminated.reshape(shape)
+
+    def _entered(self) -> tuple[NDArray[np.uint8], Ints]:
+        """The code of what each move meets, and the cell it aims at; each (cells, 4)."""
+        codes = np.frombuffer(self.codes, np.uint8)
+        target, inside = self._targets()
+        # The edge takes the place of a letter: code 0, which no map holds.
+        return np.where(inside, codes[target], 0).astype(np.uint8), target
 
     def _targets(self) -> tuple[Ints, Bools]:
         """The cell each move aims at, and whether it lies on the map; each (cells, 4)."""

@@ -20,8 +20,10 @@ from envs.grid import GridWorld
 from envs.grid_map import GOAL
 from envs.model_checks import ModelCheck, checked
 from envs.wrappers import (
+    ActionMasks,
     DiscretizeObservation,
     FlattenToDiscrete,
+    IdleActionMasks,
     OneHotObservation,
     ScaleReward,
     TerminationReward,
@@ -140,6 +142,30 @@ def observations_of_states(env: Env) -> NDArray[Any] | None:
     return observations
 
 
+def action_masks_of_states(env: Env) -> Bools | None:
+    """What may be done in each state of `transition_model`, bool of shape (S, A).
+
+    Known are the masks of this project's grid worlds, of Gymnasium's Taxi, and of
+    `IdleActionMasks`, under the wrappers that `transition_model` knows.
+
+    Returns:
+        What `envs.action_masks.action_masks` says in each state, or None where that is not known.
+    """
+    base, wrappers = _layers(env)
+    if not all(_folds(wrapper) for wrapper in wrappers):
+        return None
+    idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
+    if idle:
+        return np.array(idle[-1])
+    # A class of one's own may have masks of its own.
+    kind: Any = type(base)
+    if isinstance(base, GridWorld) and kind.action_masks is GridWorld.action_masks:
+        return base.dynamics.action_masks()
+    if isinstance(base, TaxiEnv) and kind.action_mask is TaxiEnv.action_mask:
+        return np.array([base.action_mask(state) for state in sorted(base.P)], dtype=np.bool_)
+    return None
+
+
 def _layers(env: Env) -> tuple[Env, list[Wrapper]]:
     """The environment without its wrappers, and these, the innermost first."""
     wrappers = []
@@ -153,7 +179,7 @@ def _folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper leaves the states alone and changes rewards, if so, in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
-    if type(wrapper) in {ScaleReward, *OBSERVATION_WRAPPERS}:
+    if type(wrapper) in {ScaleReward, ActionMasks, IdleActionMasks, *OBSERVATION_WRAPPERS}:
         return True
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
 

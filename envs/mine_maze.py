@@ -63,6 +63,8 @@ class MineMazeEnv(GridWorld):
     ## Information
     `reset` and `step` give `position` (row, column), `bumped` (whether the robot ran into the outer
     wall) and `is_success` (whether it stands on the goal).
+    `action_masks()` tells which moves do not run into the outer wall; with `slip` it
+    judges the move that is meant, and in a cell that is walled in it allows all.
     The exact dynamics are available as arrays from `transition_model()`, and as `P` and
     `initial_state_distrib` as in Gymnasium's FrozenLake.
 

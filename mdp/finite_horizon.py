@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.machine_code import compiled
 from mdp.sweeps import TIE_TOLERANCE
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import TransitionModel, allowed_actions
 
 # Of as few bytes each as the number of actions allows.
 Actions = NDArray[np.unsignedinteger]
@@ -51,7 +51,7 @@ class FiniteHorizonPlan:
 
 
 def finite_horizon_optimum(
-    model: TransitionModel, horizon: int, discount: float = 1.0
+    model: TransitionModel, horizon: int, discount: float = 1.0, mask: Bools | None = None
 ) -> FiniteHorizonPlan:
     """Plan backwards from the time limit.
 
@@ -63,16 +63,18 @@ def finite_horizon_optimum(
         model: the decision process; rows of unreachable states are ignored.
         horizon: the time limit in steps, at least 1.
         discount: from 0 to 1.
+        mask: the actions that may be taken, bool of shape (S, A), or None for all.
 
     Raises:
-        ValueError: for a horizon or discount out of range.
+        ValueError: for a horizon or discount out of range, or a malformed mask.
     """
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, it must be at least 1")
     if not 0 <= discount <= 1:
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
     states = np.flatnonzero(model.reachable)
-    arrays = (model.prob, model.next_state, model.terminated, model.expected_reward)
+    allowed = allowed_actions(model, mask)
+    arrays = (model.prob, model.next_state, model.terminated, model.expected_reward, allowed)
     values = np.zeros(model.n_states)
     rows: list[Actions] = []
     for _ in range(horizon):
@@ -92,6 +94,7 @@ def back_up(
     next_state: AnyInts,
     terminated: Bools,
     mean_reward: Floats,
+    allowed: Bools,
     discount: float,
     states: Ints,
     values: Floats,
@@ -102,6 +105,9 @@ def back_up(
     action_values = np.empty(prob.shape[1])
     for state in states:
         for action in range(prob.shape[1]):
+            if not allowed[state, action]:
+                action_values[action] = -np.inf
+                continue
             value = mean_reward[state, action]
             for k in range(prob.shape[2]):
                 if prob[state, action, k] > 0 and not terminated[state, action, k]:

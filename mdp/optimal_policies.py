@@ -53,7 +53,9 @@ class Plan:
     start_value: float
 
 
-def value_iteration(model: TransitionModel, discount: float, tolerance: float = 1e-10) -> Plan:
+def value_iteration(
+    model: TransitionModel, discount: float, tolerance: float = 1e-10, mask: Bools | None = None
+) -> Plan:
     """Plan by sweeping the Bellman optimality operator over the states.
 
     The sweeps are Gauss-Seidel, the states nearest to the end first, and between them the greedy
@@ -65,14 +67,15 @@ def value_iteration(model: TransitionModel, discount: float, tolerance: float = 
         discount: from 0 to 1; 1 sums rewards until the episode ends.
         tolerance: sweeping stops when the proven error bound is at most this, and otherwise
             when values change by no more than rounding makes them.
+        mask: the actions that may be taken, bool of shape (S, A), or None for all.
 
     Raises:
-        ValueError: for a discount or tolerance out of range, or where the undiscounted optimum
-            is not finite.
+        ValueError: for a discount or tolerance out of range, a mask of another shape or that
+            allows nothing in a state, or where the undiscounted optimum is not finite.
     """
     if not tolerance > 0:
         raise ValueError(f"tolerance is {tolerance}, it must be positive")
-    problem = PlanningProblem.of(model, discount)
+    problem = PlanningProblem.of(model, discount, mask)
     values, policy = problem.start()
     floor = np.where(problem.part.resting, 0.0, -np.inf)
     order = problem.order
@@ -92,7 +95,7 @@ def value_iteration(model: TransitionModel, discount: float, tolerance: float = 
             return _plan(problem, values, change, iterations)
 
 
-def policy_iteration(model: TransitionModel, discount: float) -> Plan:
+def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None = None) -> Plan:
     """Plan by evaluating a policy exactly and making it greedy, until no action is better.
 
     The linear systems are solved directly, which suits some ten thousand states; beyond, use
@@ -101,11 +104,13 @@ def policy_iteration(model: TransitionModel, discount: float) -> Plan:
     Args:
         model: the decision process; rows of unreachable states are ignored.
         discount: from 0 to 1; 1 sums rewards until the episode ends.
+        mask: as in ``value_iteration``.
 
     Raises:
-        ValueError: for a discount out of range, or where the undiscounted optimum is not finite.
+        ValueError: for a discount out of range, a malformed mask, or where the undiscounted
+            optimum is not finite.
     """
-    problem = PlanningProblem.of(model, discount)
+    problem = PlanningProblem.of(model, discount, mask)
     _, policy = problem.start()
     states = problem.order
     iterations = 0

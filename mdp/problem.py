@@ -30,15 +30,23 @@ class PlanningProblem:
     part: FinitePart
 
     @classmethod
-    def of(cls, model: TransitionModel, discount: float) -> PlanningProblem:
+    def of(
+        cls, model: TransitionModel, discount: float, mask: Bools | None = None
+    ) -> PlanningProblem:
         """Check the discount, and that the optimum is finite.
 
+        Args:
+            model: the decision process.
+            discount: from 0 to 1.
+            mask: the actions that may be taken, bool of shape (S, A), or None for all.
+
         Raises:
-            ValueError: if the discount is not in [0, 1] or the undiscounted optimum not finite.
+            ValueError: if the discount is not in [0, 1], the mask malformed, or the undiscounted
+                optimum not finite.
         """
         if not 0 <= discount <= 1:
             raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
-        part = finite_part(model) if discount == 1 else FinitePart.everything(model)
+        part = finite_part(model, mask) if discount == 1 else FinitePart.everything(model, mask)
         return cls(model, float(discount), part)
 
     @cached_property

@@ -194,6 +194,28 @@ class TransitionModel:
             raise ValueError(f"state {state}, action {action} has {problem}")
 
 
+def allowed_actions(model: TransitionModel, mask: Bools | None) -> Bools:
+    """The actions that planning may take, bool of shape (S, A); none in unreachable states.
+
+    Args:
+        model: the decision process.
+        mask: bool of shape (S, A), or None for all actions.
+
+    Raises:
+        ValueError: if the mask has another shape, or allows nothing in a state that is reachable.
+    """
+    shape = (model.n_states, model.n_actions)
+    reachable = model.reachable[:, None]
+    if mask is None:
+        return np.repeat(reachable, model.n_actions, axis=1)
+    if mask.shape != shape:
+        raise ValueError(f"the mask has shape {mask.shape}, it must be {shape}")
+    stuck = np.flatnonzero(model.reachable & ~mask.any(axis=1))
+    if stuck.size:
+        raise ValueError(f"the mask allows nothing in state {stuck[0]}")
+    return reachable & mask.astype(np.bool_)
+
+
 def _row(P: Mapping[int, Mapping[int, Outcomes]], state: int, action: int) -> Outcomes:  # noqa: N803
     if state not in P:
         raise ValueError(f"P has no state {state}: states must be numbered from 0 to {len(P) - 1}")

@@ -14,7 +14,7 @@ import numpy as np
 
 from mdp.array_types import Bools
 from mdp.graph import end_components, steps_to_end
-from mdp.transition_model import TransitionModel
+from mdp.transition_model import TransitionModel, allowed_actions
 
 # Expected rewards are sums of products; closer to zero than this they are zero up to rounding.
 ROUNDING = 1e-12
@@ -41,21 +41,26 @@ class FinitePart:
     step_cost: float
 
     @classmethod
-    def everything(cls, model: TransitionModel) -> FinitePart:
-        """All reachable states and their actions, as with a discount below one."""
-        allowed = np.repeat(model.reachable[:, None], model.n_actions, axis=1)
+    def everything(cls, model: TransitionModel, mask: Bools | None = None) -> FinitePart:
+        """All reachable states and their allowed actions, as with a discount below one."""
+        allowed = allowed_actions(model, mask)
         none = np.zeros_like(allowed)
         return cls(model.reachable, allowed, np.zeros_like(model.reachable), none, 0.0)
 
 
-def finite_part(model: TransitionModel) -> FinitePart:
+def finite_part(model: TransitionModel, mask: Bools | None = None) -> FinitePart:
     """Find where the undiscounted optimum is finite.
 
+    Args:
+        model: the decision process.
+        mask: the actions that may be taken, bool of shape (S, A), or None for all.
+
     Raises:
-        ValueError: if it is infinite, because an agent can earn for ever, or minus infinity from
-            a starting state, because from there no policy surely ends the episode.
+        ValueError: if the mask is malformed, or the optimum infinite, because an agent can earn
+            for ever, or minus infinity from a starting state, because from there no policy surely
+            ends the episode.
     """
-    allowed = np.repeat(model.reachable[:, None], model.n_actions, axis=1)
+    allowed = allowed_actions(model, mask)
     ends = (model.terminated & (model.prob > 0)).any(axis=2)
     endless = allowed & ~ends
     # Where every step may end the episode, any cost will do; one of the rewards' own size makes

@@ -6,6 +6,7 @@ import inspect
 import shlex
 import sys
 from collections.abc import Callable, Mapping
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
 import envs  # noqa: F401  # registers the project's environments
+from envs.wrappers import ActionMasks
 from pipeline.environment_mistakes import environment_mistake
 from pipeline.errors import UserError, one_line, shown, unknown
 from pipeline.train_spec import TrainSpec
@@ -115,7 +117,10 @@ def _usual_kwargs(env_id: str) -> dict[str, Any]:
 
 
 def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
-    """The wrappers that the hyperparameters name, as one function, or None for none."""
+    """The wrappers that the hyperparameters name, as one function, or None for none.
+
+    Where the agent is to hold to action masks, the outermost tells them.
+    """
     from pipeline.settings.components import wrapper_factory
 
     inner = wrapper_factory(spec.hyperparams.env_wrapper, spec.gym_packages)
@@ -124,9 +129,19 @@ def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
         if training
         else None
     )
-    if inner is None or outer is None:
-        return inner or outer
-    return lambda env: outer(inner(env))
+    wraps = [wrap for wrap in (inner, outer) if wrap is not None]
+    if spec.hyperparams.algorithm.get("mask_actions", False):
+        wraps.append(_with_masks)
+    if not wraps:
+        return None
+    return lambda env: reduce(lambda wrapped, wrap: wrap(wrapped), wraps, env)
+
+
+def _with_masks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    try:
+        return ActionMasks(env)
+    except ValueError as error:
+        raise UserError(f"mask_actions: {one_line(error)}") from error
 
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gym.Env[Any, Any]:

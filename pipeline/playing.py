@@ -93,15 +93,16 @@ def play_episodes(
     Yields:
         Return and length of each episode as it ends.
     """
+    from pipeline.evaluation.mask_telling import player
+
+    choose = player(model, env).predict
     obs: Any = env.reset()
     state = None
     starts = np.ones(env.num_envs, dtype=bool)
     due = _shares(n_episodes, env.num_envs)
     steps = 0
     while any(due > 0) and (n_steps is None or steps < n_steps):
-        actions, state = model.predict(
-            obs, state=state, episode_start=starts, deterministic=deterministic
-        )
+        actions, state = choose(obs, state=state, episode_start=starts, deterministic=deterministic)
         obs, _, starts, infos = env.step(actions)
         steps += env.num_envs
         after_step(bool(starts[0]))

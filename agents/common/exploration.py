@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from mdp.array_types import Floats
+from mdp.array_types import Bools, Floats
 from mdp.machine_code import inlined
 
 EPSILON_GREEDY = 0
@@ -149,7 +149,12 @@ def expected_value(strategy: int, values: Floats, rate: float) -> float:
 
 
 def action_probabilities(
-    strategy: int, values: Floats, rate: float, *, random_ties: bool
+    strategy: int,
+    values: Floats,
+    rate: float,
+    *,
+    random_ties: bool,
+    masks: Bools | None = None,
 ) -> Floats:
     """The exploring policy as a matrix.
 
@@ -158,6 +163,8 @@ def action_probabilities(
         values: action values, shape (S, A).
         rate: epsilon or temperature.
         random_ties: whether tied greedy actions share their probability or the first has it all.
+        masks: the allowed actions, bool of shape (S, A), all where a row is False; None, or
+            no rows, for all.
 
     Returns:
         Probabilities, shape (S, A).
@@ -167,6 +174,10 @@ def action_probabilities(
     """
     if strategy == GAUSSIAN_NOISE:
         raise ValueError("Gaussian noise on the values has no closed-form action probabilities")
+    allowed = np.ones(values.shape, dtype=np.bool_)
+    if masks is not None and len(masks):
+        allowed = masks | ~masks.any(axis=1, keepdims=True)
+        values = np.where(allowed, values, -np.inf)
     highest = values.max(axis=1, keepdims=True)
     if strategy == BOLTZMANN:
         weights = np.exp((values - highest) / rate)
@@ -175,4 +186,5 @@ def action_probabilities(
     if not random_ties:
         greedy = np.eye(values.shape[1])[values.argmax(axis=1)]
     greedy /= greedy.sum(axis=1, keepdims=True)
-    return np.asarray(rate / values.shape[1] + (1.0 - rate) * greedy)
+    random = rate * allowed / allowed.sum(axis=1, keepdims=True)
+    return np.asarray(random + (1.0 - rate) * greedy)

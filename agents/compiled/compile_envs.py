@@ -23,8 +23,10 @@ from envs.known_models import (
     transition_model,
 )
 from envs.wrappers import (
+    ActionMasks,
     DiscretizeObservation,
     FlattenToDiscrete,
+    IdleActionMasks,
     ScaleReward,
     TerminationReward,
 )
@@ -36,7 +38,9 @@ World = FiniteModel | CartPole
 # Wrappers whose work the engine does itself, or that have none to do.
 COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
 CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
-MODEL_WRAPPERS = {FlattenToDiscrete, ScaleReward, TerminationReward, *COMMON_WRAPPERS}
+MASK_WRAPPERS = {ActionMasks, IdleActionMasks}
+CHANGE_WRAPPERS = {FlattenToDiscrete, ScaleReward, TerminationReward}
+MODEL_WRAPPERS = {*CHANGE_WRAPPERS, *MASK_WRAPPERS, *COMMON_WRAPPERS}
 
 
 class NotCompilable(ValueError):  # noqa: N818  # no error: the interpreted loop takes over

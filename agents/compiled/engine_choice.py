@@ -70,6 +70,7 @@ def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> World:
     unknown = unknown_callbacks(callback)
     if unknown:
         raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
+    agent.check_compilable()
     for schedule in agent.schedules().values():
         compiled_schedule(schedule)
     assert agent.env is not None

@@ -124,6 +124,13 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         """How much the agent explores now; 0 for agents that explore by a rule of their own."""
         return self.exploration_schedule(self._current_progress_remaining)
 
+    def check_compilable(self) -> None:
+        """Make sure that compiled functions are handed all that the training asks for.
+
+        Raises:
+            NotCompilable: saying what is missing.
+        """
+
     def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
         """What compiled functions work on: for ``n`` environments, drawing from ``rng``."""
         return None

@@ -19,7 +19,7 @@ def value_by_the_other_table(agent: TabularAgent, env: Any, progress: Any, table
     values = agent.tables.values
     uniform = (env.uniform * values.shape[0] - table) * agent.settings.tie_scale
     best = greedy_action(agent.room.values, uniform)
-    return float(values[1 - table, env.next_obs, best])
+    return float(values[1 - table, env.next_obs, agent.room.actions[best]])
 
 
 class DoubleQLearning(TabularAlgorithm):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.table_policy import TablePolicy
-from mdp.array_types import Floats
+from mdp.array_types import Bools, Floats, Ints
 
 
 class QTablePolicy(TablePolicy):
@@ -28,10 +30,13 @@ class QTablePolicy(TablePolicy):
     Attributes:
         q_tables: action values, float64 of shape (T, S, A).
         visit_counts: number of updates of each entry, int64 of shape (T, S, A).
+        allowed_actions: what the environment allows at each observation, bool of shape (S, A), a
+            row of False where that is not known; only there after `keep_masks`.
     """
 
     q_tables: th.Tensor
     visit_counts: th.Tensor
+    allowed_actions: th.Tensor
 
     def __init__(
         self,
@@ -54,10 +59,67 @@ class QTablePolicy(TablePolicy):
         """The action values that the agent acts on, shape (S, A)."""
         return np.asarray(self.q_tables.numpy().mean(axis=0))
 
+    def keep_masks(self) -> None:
+        """Make room for what the environment allows."""
+        self.register_buffer("allowed_actions", th.zeros(self.q_tables.shape[1:], dtype=th.bool))
+
+    @property
+    def masks(self) -> Bools:
+        """`allowed_actions` as an array that shares its memory, of no rows where there are none."""
+        if "allowed_actions" not in self._buffers:
+            return np.zeros((0, self.q_tables.shape[2]), dtype=np.bool_)
+        return np.asarray(self.allowed_actions.numpy())
+
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Take over tables; an agent may go by masks that was saved without them, or no longer."""
+        tables = {name: state_dict[name] for name in state_dict if name != "allowed_actions"}
+        if "allowed_actions" in self._buffers:
+            unknown = th.zeros_like(self.allowed_actions)
+            tables["allowed_actions"] = state_dict.get("allowed_actions", unknown)
+        return super().load_state_dict(tables, strict, assign)
+
+    def note_masks(self, obs: Any, masks: Bools) -> None:
+        """Keep what may be done at observations, which are of shape (n,); masks of shape (n, A).
+
+        Raises:
+            ValueError: if something else was allowed at one of them before.
+        """
+        allowed, obs = self.masks, np.asarray(obs)
+        before = allowed[obs]
+        changed = before.any(axis=1) & (before != masks).any(axis=1)
+        allowed[obs] = masks
+        if changed.any() or not np.array_equal(allowed[obs], masks):
+            odd = obs[np.flatnonzero(changed | (allowed[obs] != masks).any(axis=1))[0]]
+            raise ValueError(
+                f"observation {odd} comes with different action masks: mask_actions needs masks "
+                "that depend on the observation alone"
+            )
+
+    @contextmanager
+    def told(self, obs: Ints, masks: Any) -> Iterator[None]:
+        """Within the ``with`` statement these masks count at these observations; none if None."""
+        if masks is None or not len(self.masks):
+            yield
+            return
+        kept = self.masks[obs]
+        self.masks[obs] = masks
+        try:
+            yield
+        finally:
+            self.masks[obs] = kept
+
+    def allowed_values(self, obs: Ints) -> Floats:
+        """Action values at some observations, minus infinity where masked, shape (n, A)."""
+        values = self.q_tables[:, th.from_numpy(obs)].mean(dim=0).numpy()
+        if not len(self.masks):
+            return values
+        masks = self.masks[obs]
+        return np.where(masks | ~masks.any(axis=1, keepdims=True), values, -np.inf)
+
     def _predict(
         self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
     ) -> th.Tensor:
-        """The first of the best actions; shapes (n,) to (n,)."""
+        """The first of the best allowed actions; shapes (n,) to (n,)."""
         assert isinstance(observation, th.Tensor)
-        values = self.q_tables[:, observation.long().flatten()].mean(dim=0)
-        return th.from_numpy(values.numpy().argmax(axis=1))
+        obs = observation.long().flatten().numpy()
+        return th.from_numpy(self.allowed_values(obs).argmax(axis=1))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal, Unpack, cast
+from typing import Any, ClassVar, Literal, Unpack
 
 import numpy as np
 import torch as th
@@ -23,15 +23,15 @@ from agents.common.setting_checks import (
     check_space,
     settings_of,
 )
-from agents.common.signatures import CommonArguments, ExplorationDecay, TieBreaking
+from agents.common.signatures import ExplorationDecay, TieBreaking
 from agents.compiled.engine_choice import EngineChoice, choose_engine
 from agents.compiled.generators import handles_of
-from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
+from agents.compiled.learning_algorithm import StepSize
 from agents.compiled.training_records import UNDECIDED
+from agents.tabular.mask_keeping import MaskedArguments, MaskKeeper
 from agents.tabular.q_table_policy import QTablePolicy
 from agents.tabular.temporal_difference import (
     Room,
-    Tables,
     TabularAgent,
     act_on_values,
     no_commitment,
@@ -43,7 +43,7 @@ from mdp.array_types import Floats, Ints
 ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
-class TabularAlgorithm(LearningAlgorithm):
+class TabularAlgorithm(MaskKeeper):
     """Temporal-difference control on a table of action values.
 
     Args:
@@ -69,15 +69,13 @@ class TabularAlgorithm(LearningAlgorithm):
             a hundred times faster, and is refused where there is none; ``"interpreted"`` calls
             them step by step; ``"auto"`` compiles where it can.
         policy_kwargs: further arguments of the policy.
-        kwargs: as in `OnlineAlgorithm`.
+        kwargs: as in `MaskKeeper`, ``mask_actions`` among them.
 
     Raises:
         ValueError: if an argument lies outside its range or a space does not fit.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
-    policy: QTablePolicy
-    n_tables: ClassVar[int] = 1
     parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
 
     # What the training loops call; `next_value` is each algorithm's own.
@@ -85,7 +83,7 @@ class TabularAlgorithm(LearningAlgorithm):
     learn_from_step = td_learning
     commit = no_commitment
 
-    _rebuilt = (*LearningAlgorithm._rebuilt, "_in_use")
+    _rebuilt = (*MaskKeeper._rebuilt, "_in_use")
 
     def __init__(
         self,
@@ -106,7 +104,7 @@ class TabularAlgorithm(LearningAlgorithm):
         skip_terminal_update: bool = False,
         engine: EngineChoice = "auto",
         policy_kwargs: dict[str, Any] | None = None,
-        **kwargs: Unpack[CommonArguments],
+        **kwargs: Unpack[MaskedArguments],
     ) -> None:
         self.gamma = gamma
         self.exploration = exploration
@@ -127,6 +125,7 @@ class TabularAlgorithm(LearningAlgorithm):
         super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
+        super()._check_arguments()
         check_space(self, "observations", self.observation_space)
         check_space(self, "actions", self.action_space)
         check_option("exploration", self.exploration, ExplorationStrategy)
@@ -136,13 +135,7 @@ class TabularAlgorithm(LearningAlgorithm):
         check_above_zero(settings_of(self, "temperature"))
 
     def _make_policy(self) -> QTablePolicy:
-        policy: QTablePolicy = self.policy_class(  # type: ignore[assignment]
-            self.observation_space,
-            self.action_space,
-            self.lr_schedule,
-            n_tables=self.n_tables,
-            **self.policy_kwargs,
-        )
+        policy = super()._make_policy()
         noise = self.rng.standard_normal(policy.q_tables.shape)
         policy.q_tables.copy_(th.from_numpy(self.initial_q + self.initial_q_std * noise))
         return policy
@@ -180,22 +173,13 @@ class TabularAlgorithm(LearningAlgorithm):
         n_draws = draws_per_choice(self.strategy, n_actions)
         return TabularAgent(
             self.settings()[0],
-            Tables(values, self.policy.visit_counts.numpy()),
-            Room(np.empty(n_actions), np.empty(n_draws)),
+            self._tables(),
+            Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
             handles_of([rng])[0],
         )
 
     def _check_tables(self) -> None:
-        """Refuse tables that compiled code would read beside.
-
-        Raises:
-            ValueError: naming the shape that they must have.
-        """
-        spaces = cast(Any, (self.observation_space, self.action_space))
-        shape = (self.n_tables, *(int(space.n) for space in spaces))
-        found = tuple(self.policy.q_tables.shape), tuple(self.policy.visit_counts.shape)
-        if found != (shape, shape) or self.n_tables not in (1, 2):
-            raise ValueError(f"tables must be 1 or 2, of shape {shape}, not {found[0]}")
+        super()._check_tables()
         if self.strategy not in STRATEGIES.values():
             raise ValueError(f"unknown exploration strategy {self.strategy}")
 
@@ -236,9 +220,11 @@ class TabularAlgorithm(LearningAlgorithm):
         return workspace
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> Workspace:
-        return Workspace(self.compiled_agent(rng), rng, n)
+        return Workspace(self.compiled_agent(rng), self.policy.masks, rng, n)
 
     def _choose_actions(self) -> Ints:
+        if self.asks_for_masks:
+            self._note_present_masks()
         workspace = self._in_use
         if workspace is None or workspace.rng is not self.rng:
             workspace = self._present_workspace()
@@ -248,6 +234,8 @@ class TabularAlgorithm(LearningAlgorithm):
         return workspace.act(self._last_obs)
 
     def _learn_from(self, transitions: Transitions) -> None:
+        if self.asks_for_masks:
+            self._note_next_masks(transitions)
         self._in_use = workspace = self._present_workspace()
         self.mean_td_error = workspace.learn(transitions)
         self._n_updates += self.n_envs
@@ -258,20 +246,25 @@ class TabularAlgorithm(LearningAlgorithm):
         state: tuple[NDArray[Any], ...] | None = None,
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
+        action_masks: Any = None,
     ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
         """The greedy action, or an exploring one unless ``deterministic``, as DQN has it.
 
         Takes one state index or an array of shape (n,), and returns actions of the same shape and
-        ``state``; ``episode_start`` is not used.
+        ``state``; ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape
+        (n, A) count here in place of those that the agent has kept.
         """
-        if deterministic:
+        if deterministic and action_masks is None:
             return super().predict(observation, state, episode_start, deterministic)
         obs = np.asarray(observation, dtype=np.int64)
-        workspace = self._workspace_for(self.predict_rng, obs.size)
-        rate = self.exploration_schedule(self._current_progress_remaining)
-        workspace.note_progress(rate, 0.0, self._episode_num)
-        workspace.next_actions[:] = UNDECIDED
-        actions = workspace.act(obs.reshape(-1))
+        with self.policy.told(obs.reshape(-1), action_masks):
+            if deterministic:
+                return super().predict(observation, state, episode_start, deterministic)
+            workspace = self._workspace_for(self.predict_rng, obs.size)
+            rate = self.exploration_schedule(self._current_progress_remaining)
+            workspace.note_progress(rate, 0.0, self._episode_num)
+            workspace.next_actions[:] = UNDECIDED
+            actions = workspace.act(obs.reshape(-1))
         return actions.reshape(obs.shape), state
 
     def action_probabilities(self) -> Floats:
@@ -285,6 +278,7 @@ class TabularAlgorithm(LearningAlgorithm):
             self.policy.q_table,
             self.exploration_rate,
             random_ties=self.tie_breaking == "random",
+            masks=self.policy.masks,
         )
 
     def _record_training(self) -> None:

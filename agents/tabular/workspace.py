@@ -10,7 +10,7 @@ from agents.common.online import Transitions
 from agents.compiled.generators import handles_of
 from agents.compiled.training_records import ENV, PROGRESS, UNDECIDED
 from agents.tabular.temporal_difference import TabularAgent, act_in_all, learn_from_all
-from mdp.array_types import Ints
+from mdp.array_types import Bools, Ints
 
 
 class Workspace:
@@ -18,11 +18,12 @@ class Workspace:
 
     Args:
         agent: whose settings and tables are worked on in place.
+        masks: what the environment allows at each observation, or of no rows for everything.
         rng: its generator, or another one to choose by.
         n: number of environments, or of observations.
     """
 
-    def __init__(self, agent: TabularAgent, rng: np.random.Generator, n: int) -> None:
+    def __init__(self, agent: TabularAgent, masks: Bools, rng: np.random.Generator, n: int) -> None:
         self.rng = rng  # the handle does not keep it alive
         self.envs = np.zeros(n, dtype=ENV)
         self.envs["next_action"] = UNDECIDED
@@ -32,7 +33,8 @@ class Workspace:
             np.array([agent.settings]),
             self.envs,
             self.progress,
-            *agent.tables,
+            *agent.tables[:2],
+            masks,
             *agent.room,
             handles_of([rng]),
         )

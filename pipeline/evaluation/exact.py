@@ -20,6 +20,7 @@ from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from envs.known_models import (
+    action_masks_of_states,
     model_check,
     observations_of_states,
     success_outcomes,
@@ -36,6 +37,7 @@ from mdp import (
 )
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
+from pipeline.evaluation.mask_telling import takes_masks
 from pipeline.evaluation.sampled import KNOWN_LIBRARIES, Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec
 
@@ -54,6 +56,8 @@ class ExactEvaluator:
         success: the outcomes that count as success, shape (S, A, K), or None.
         yardstick: the best possible and the best blind return.
         layout: where the states lie on a map, for grid worlds.
+        masks: what may be done in each state, bool of shape (S, A), or None where that is not
+            known; for agents that are told.
     """
 
     model: TransitionModel
@@ -62,6 +66,7 @@ class ExactEvaluator:
     success: Bools | None
     yardstick: Yardstick
     layout: GridLayout | None = None
+    masks: Bools | None = None
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """The exact worth of the agent's policy as it is."""
@@ -86,7 +91,7 @@ class ExactEvaluator:
         if isinstance(agent, PlanningAgent):
             steps = np.arange(self.horizon)[:, None]
             return agent.policy.actions_after(self.observations[None], steps)
-        return policy_matrix(agent, self.observations, deterministic)
+        return policy_matrix(agent, self.observations, deterministic, self.masks)
 
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
@@ -101,6 +106,9 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
             return None
         if model.n_states > MAX_STATES:
             return None
+        masks = action_masks_of_states(env)
+        if masks is None and special.algorithm.get("mask_actions", False):
+            return None
         success, layout = success_outcomes(env), grid_layout(env)
     finally:
         env.close()
@@ -110,7 +118,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         optimum=float(finite_horizon_optimum(model, horizon).start_value),
         blind=float(best_blind_return(model, horizon)),
     )
-    return ExactEvaluator(model, observations, horizon, success, yardstick, layout)
+    return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks)
 
 
 def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
@@ -159,7 +167,10 @@ def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
 
 
 def policy_matrix(
-    agent: BaseAlgorithm, observations: NDArray[Any], deterministic: bool = True
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    deterministic: bool = True,
+    masks: Bools | None = None,
 ) -> Floats:
     """The agent's policy as probabilities of shape (S, A).
 
@@ -167,15 +178,17 @@ def policy_matrix(
         agent: any agent with discrete actions whose policy depends on the observation alone.
         observations: what it observes in each state, states along the first axis.
         deterministic: its best actions rather than what it samples.
+        masks: what may be done in each state, bool of shape (S, A), for agents that are told.
 
     Raises:
         TypeError: if the probabilities that the agent samples from are not known.
     """
     n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
+    told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
     if isinstance(agent, RandomAgent):
         return np.full((n_states, n_actions), 1 / n_actions)
     if deterministic:
-        actions, _ = agent.predict(observations, deterministic=True)
+        actions, _ = agent.predict(observations, deterministic=True, **told)
         return np.eye(n_actions)[np.asarray(actions, dtype=np.int64)]
     if isinstance(agent, TabularAlgorithm):
         return np.asarray(agent.action_probabilities()[observations])
@@ -186,8 +199,10 @@ def policy_matrix(
         return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
     if _is_epsilon_greedy(agent):
         epsilon = float(vars(agent)["exploration_rate"])
-        greedy = policy_matrix(agent, observations)
-        return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
+        greedy = policy_matrix(agent, observations, masks=masks)
+        allowed = told.get("action_masks", np.ones(greedy.shape, dtype=np.bool_))
+        random = epsilon * allowed / allowed.sum(axis=1, keepdims=True)
+        return np.asarray(random + (1 - epsilon) * greedy)
     raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
 
 

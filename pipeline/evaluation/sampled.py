@@ -12,6 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from mdp.array_types import Floats
+from pipeline.evaluation.mask_telling import player
 
 # The agents of these packages take any number of observations at once.
 KNOWN_LIBRARIES = ("agents", "stable_baselines3")
@@ -122,7 +123,7 @@ def evaluate(
 
     env.seed(seed)
     returns, lengths = evaluate_policy(
-        model,
+        player(model, env),
         env,
         n_eval_episodes=n_episodes,
         deterministic=deterministic,

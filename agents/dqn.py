@@ -1,0 +1,214 @@
+"""Stable-Baselines3's DQN, which can be told what the environment allows."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+import stable_baselines3
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
+from stable_baselines3.dqn.policies import QNetwork
+
+from agents.common.mask_reading import check_masks_exist, checked_masks, present_masks
+from agents.common.signatures import full_signature
+from envs.action_masks import INFO_KEY
+from mdp.array_types import Bools
+
+# From observations of shape (batch, ...) to the values that targets are made of.
+NextValues = Callable[[th.Tensor], th.Tensor]
+
+
+class MaskedReplayBuffer(ReplayBuffer):
+    """Keeps with each transition what the state allows that it leads to.
+
+    The masks lie beside the actions in the same array, so that both are drawn together.
+
+    Attributes:
+        sampled_masks: those of the batch that was drawn last, bool of shape (batch, n_actions).
+    """
+
+    action_space: spaces.Discrete
+    sampled_masks: th.Tensor
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.action_dim = 1 + int(self.action_space.n)
+        shape = (self.buffer_size, self.n_envs, self.action_dim)
+        self.actions = np.zeros(shape, dtype=self.actions.dtype)
+
+    def add(
+        self,
+        obs: NDArray[Any],
+        next_obs: NDArray[Any],
+        action: NDArray[Any],
+        reward: NDArray[Any],
+        done: NDArray[Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Keep a step of every environment, whose ``infos`` hold the masks."""
+        everything = np.ones(self.action_dim - 1, dtype=np.bool_)
+        masks = [
+            # Nothing follows a termination, and nothing is asked for there.
+            everything if ended and not info.get("TimeLimit.truncated", False) else info[INFO_KEY]
+            for ended, info in zip(done, infos, strict=True)
+        ]
+        checked = checked_masks(masks, next_obs, self.action_dim - 1)
+        with_masks = np.column_stack([action.reshape(self.n_envs), checked])
+        super().add(obs, next_obs, with_masks, reward, done, infos)
+
+    def _get_samples(
+        self, batch_inds: NDArray[Any], env: VecNormalize | None = None
+    ) -> ReplayBufferSamples:
+        samples = super()._get_samples(batch_inds, env)
+        self.sampled_masks = samples.actions[:, 1:].bool()
+        return samples._replace(actions=samples.actions[:, :1])
+
+
+class DQN(stable_baselines3.DQN):
+    """Stable-Baselines3's DQN; with ``mask_actions`` among the actions that are allowed.
+
+    Masks then hold in exploration, in the greedy choice, and in the maximum of the target, for
+    which they are kept with the transitions. Without, it is the library's agent in everything, and
+    so are its model files. Arguments are those of `stable_baselines3.DQN` and:
+
+    Args:
+        mask_actions: whether masks count. The environment has to tell them by ``action_masks()``
+            and by ``info["action_mask"]``: `envs.wrappers.ActionMasks` does both.
+
+    Raises:
+        ValueError: if it does not, or with ``n_steps`` above 1, Dict observations, or another
+            replay buffer.
+    """
+
+    __signature__: ClassVar[inspect.Signature]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.__signature__ = full_signature(cls)
+
+    def __init__(self, *args: Any, mask_actions: bool = False, **kwargs: Any) -> None:
+        self.mask_actions = mask_actions
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        if self.mask_actions:
+            self._check_maskable()
+            self.replay_buffer_class = MaskedReplayBuffer
+        super()._setup_model()
+
+    def _check_maskable(self) -> None:
+        if self.n_steps != 1:
+            raise ValueError(f"mask_actions needs n_steps of 1, not {self.n_steps}")
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ValueError("mask_actions does not work with Dict observations")
+        if self.replay_buffer_class not in {None, ReplayBuffer, MaskedReplayBuffer}:
+            raise ValueError("mask_actions brings its own replay buffer: leave replay_buffer_class")
+        if self.env is not None:
+            check_masks_exist(self.env)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self.mask_actions:
+            assert self.env is not None
+            check_masks_exist(self.env)
+            if not all(INFO_KEY in (info or {}) for info in self.env.unwrapped.reset_infos):
+                raise ValueError(
+                    f"mask_actions of {type(self).__name__}: info holds no {INFO_KEY}, which tells "
+                    "of states that episodes are cut off in: wrap the environment in "
+                    "envs.wrappers.ActionMasks"
+                )
+        return prepared
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        if not self.mask_actions:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        assert self.env is not None
+        obs: Any = self._last_obs
+        masks = present_masks(self.env, obs)
+        if self.num_timesteps < learning_starts:
+            actions = self._random_actions(masks)
+        else:
+            actions, _ = self.predict(obs, action_masks=masks)
+        return actions, actions
+
+    def _random_actions(self, masks: Bools) -> NDArray[Any]:
+        """A uniformly random allowed action for each row of ``masks``."""
+        space: Any = self.action_space
+        return np.array([space.sample(mask.astype(np.int8)) for mask in masks])
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+        action_masks: Any = None,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The greedy action, or an exploring one unless ``deterministic``, as the library has it.
+
+        Args:
+            observation: one, or several along the first axis.
+            state: handed back.
+            episode_start: not used.
+            deterministic: the greedy action.
+            action_masks: the allowed actions, bool of shape (n, n_actions), or (n_actions,) for one
+                observation; all where it is left out.
+        """
+        if action_masks is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        masks = np.atleast_2d(np.asarray(action_masks, dtype=np.bool_))
+        self.policy.set_training_mode(False)
+        obs, is_batch = self.policy.obs_to_tensor(observation)
+        # One toss for all observations, as in the library.
+        if not deterministic and np.random.rand() < self.exploration_rate:  # noqa: NPY002
+            actions = self._random_actions(masks)
+        else:
+            with th.no_grad():
+                values = masked(self.q_net(obs), th.as_tensor(masks, device=self.device))
+            actions = values.argmax(dim=1).cpu().numpy()
+        return (actions if is_batch else actions[0]), state
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
+        target_network = self.q_net_target
+        # The library maximises over the columns of what this returns.
+        self.q_net_target = self._next_values(target_network)  # type: ignore[assignment]
+        try:
+            super().train(gradient_steps, batch_size)
+        finally:
+            self.q_net_target = target_network
+
+    def _next_values(self, target: QNetwork) -> NextValues:
+        """What a target's maximum goes over: the target network's values of allowed actions."""
+        return lambda next_obs: self._among_allowed(target(next_obs))
+
+    def _among_allowed(self, next_values: th.Tensor) -> th.Tensor:
+        """Minus infinity for what the states that a batch leads to do not allow."""
+        if not self.mask_actions:
+            return next_values
+        assert isinstance(self.replay_buffer, MaskedReplayBuffer)
+        return masked(next_values, self.replay_buffer.sampled_masks)
+
+    def _excluded_save_params(self) -> list[str]:
+        # A file without masks is one of the library's; with them, the buffer's class follows.
+        left_out = "replay_buffer_class" if self.mask_actions else "mask_actions"
+        return [*super()._excluded_save_params(), left_out]
+
+
+def masked(values: th.Tensor, masks: th.Tensor) -> th.Tensor:
+    """Minus infinity where the mask is False; both of shape (n, n_actions)."""
+    return values.masked_fill(~masks, -th.inf)
+
+
+DQN.__signature__ = full_signature(DQN)

@@ -1,0 +1,41 @@
+"""Agents that have to be told what the environment allows, played as any other."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.common.mask_reading import present_masks
+
+
+def takes_masks(model: Any) -> bool:
+    """Whether `predict` takes ``action_masks``, and the agent goes by them."""
+    known = "action_masks" in inspect.signature(model.predict).parameters
+    return known and bool(getattr(model, "mask_actions", True))
+
+
+def player(model: BaseAlgorithm, env: VecEnv) -> Any:
+    """What to ask by ``predict`` on ``env``: the agent, told the masks where it takes them."""
+    return MaskTold(model, env) if takes_masks(model) else model
+
+
+class MaskTold:
+    """An agent, and the environments that tell it what may be done.
+
+    Args:
+        model: the agent.
+        env: the environments that it is played on.
+    """
+
+    def __init__(self, model: Any, env: VecEnv) -> None:
+        self.model = model
+        self.env = env
+
+    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """The agent's own, for what the environments show now."""
+        masks = present_masks(self.env, observation)
+        actions, state = self.model.predict(observation, action_masks=masks, **kwargs)
+        return actions, state
