@@ -107,7 +107,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         if model.n_states > MAX_STATES:
             return None
         masks = action_masks_of_states(env)
-        if masks is None and special.algorithm.get("mask_actions", False):
+        if masks is None and spec.hyperparams.algorithm.get("mask_actions", False):
             return None
         success, layout = success_outcomes(env), grid_layout(env)
     finally:
