@@ -11,6 +11,7 @@ import numpy as np
 
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError, one_line
+from pipeline.evaluation.policy_kinds import actor_on
 from pipeline.model_choice import ChosenModel
 
 if TYPE_CHECKING:
@@ -89,12 +90,13 @@ def play_episodes(
     Yields:
         Return and length of each episode as it ends.
     """
+    actor = actor_on(model, env)
     obs: Any = env.reset()
     state = None
     starts = np.ones(1, dtype=bool)
     steps = finished = 0
     while finished < n_episodes and (n_steps is None or steps < n_steps):
-        actions, state = model.predict(
+        actions, state = actor.predict(
             obs, state=state, episode_start=starts, deterministic=deterministic
         )
         obs, _, starts, infos = env.step(actions)

@@ -19,7 +19,7 @@ from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator
 from pipeline.evaluation.sampled import evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
@@ -28,6 +28,7 @@ from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.run_folder import Run
 from pipeline.settings import components
+from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.train_spec import TrainSpec
 
@@ -64,8 +65,10 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     Raises:
         UserError: if one is unknown or has a wrong type or range.
     """
+    algorithm = load_algorithm(spec.algo)
+    check_action_noise(spec.hyperparams, algorithm, spec.algo)
     return build_algorithm_kwargs(
-        load_algorithm(spec.algo), spec.hyperparams.algorithm, spec.algo, spec.gym_packages
+        algorithm, spec.hyperparams.algorithm, spec.algo, spec.gym_packages
     )
 
 
@@ -81,7 +84,8 @@ def set_up(
     eval_env = make_evaluation_env(spec, min(spec.n_eval_envs, spec.eval_episodes))
     undo.callback(eval_env.close)
     is_bandit = are_bandits(env)
-    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit)
+    exact = _exact_evaluator(spec, model, console)
+    evaluation = _evaluation(spec, run, eval_env, env.num_envs, exact, is_bandit=is_bandit)
     display = ProgressDisplay(console, live=spec.progress or console.is_terminal)
     callbacks = _named_callbacks(spec, run, model)
     pulls = _pull_recorder(model, run, console) if is_bandit else None
@@ -95,11 +99,27 @@ def set_up(
     return Training(spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls)
 
 
-def _evaluation(
-    spec: TrainSpec, run: Run, eval_env: VecEnv, n_envs: int, is_bandit: bool
-) -> EvaluationCallback:
-    """The evaluations during training: exact ones where the environment's model is known."""
+def _exact_evaluator(
+    spec: TrainSpec, model: BaseAlgorithm, console: Console
+) -> ExactEvaluator | None:
+    """The exact evaluator where the environment's model is known and the agent's policy fits it."""
     exact = exact_evaluator(spec)
+    obstacle = "" if exact is None else exact.obstacle(model)
+    if obstacle:
+        console.print(f"[dim]evaluation: sampled, not exact: {spec.algo}: {obstacle}[/]")
+    return None if obstacle else exact
+
+
+def _evaluation(
+    spec: TrainSpec,
+    run: Run,
+    eval_env: VecEnv,
+    n_envs: int,
+    exact: ExactEvaluator | None,
+    *,
+    is_bandit: bool,
+) -> EvaluationCallback:
+    """The evaluations during training: exact ones where they can be."""
     seed = evaluation_seed(spec.seed, 1)
     sampled = partial(evaluate, env=eval_env, n_episodes=spec.eval_episodes, seed=seed)
     return EvaluationCallback(
@@ -162,6 +182,7 @@ def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlg
         "tensorboard_log": None
         if spec.tensorboard_log is None
         else str(spec.tensorboard_log / spec.env_id),
+        **action_noise(spec.hyperparams, env.action_space),
     }
     if spec.trained_agent is None:
         return load_algorithm(spec.algo)(env=env, device=spec.device, **common, **kwargs)

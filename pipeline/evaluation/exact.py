@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
@@ -30,6 +29,7 @@ from mdp import (
 )
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
+from pipeline.evaluation.policy_kinds import has_memory, needs_masks, takes_masks
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec
 
@@ -48,6 +48,7 @@ class ExactEvaluator:
         success: the outcomes that count as success, shape (S, A, K), or None.
         yardstick: the best possible and the best blind return.
         layout: where the states lie on a map, for grid worlds.
+        masks: the actions that are valid in each state, shape (S, A), or None where nobody says.
     """
 
     model: TransitionModel
@@ -56,6 +57,7 @@ class ExactEvaluator:
     success: Bools | None
     yardstick: Yardstick
     layout: GridLayout | None = None
+    masks: Bools | None = None
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """The exact worth of the agent's policy as it is."""
@@ -80,7 +82,11 @@ class ExactEvaluator:
         if isinstance(agent, PlanningAgent):
             steps = np.arange(self.horizon)[:, None]
             return agent.policy.actions_after(self.observations[None], steps)
-        return policy_matrix(agent, self.observations, deterministic)
+        return policy_matrix(agent, self.observations, deterministic, self.masks)
+
+    def obstacle(self, agent: BaseAlgorithm) -> str:
+        """Why the agent's policy cannot be had by asking it for every state; empty where it can."""
+        return _obstacle(agent, self.masks)
 
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
@@ -107,7 +113,10 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
 
 
 def policy_matrix(
-    agent: BaseAlgorithm, observations: NDArray[Any], deterministic: bool = True
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    deterministic: bool = True,
+    masks: Bools | None = None,
 ) -> Floats:
     """The agent's policy as probabilities of shape (S, A).
 
@@ -115,26 +124,45 @@ def policy_matrix(
         agent: any agent with discrete actions whose policy depends on the observation alone.
         observations: what it observes in each state, states along the first axis.
         deterministic: its best actions rather than what it samples.
+        masks: the actions that are valid in each state, shape (S, A), for agents that listen.
 
     Raises:
-        TypeError: if the probabilities that the agent samples from are not known.
+        TypeError: if the probabilities that the agent acts with are not known.
     """
+    obstacle = _obstacle(agent, masks)
+    if obstacle:
+        raise TypeError(f"{type(agent).__name__}: {obstacle}")
     n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
+    told = {"action_masks": masks} if masks is not None and takes_masks(agent) else {}
     if isinstance(agent, RandomAgent):
         return np.full((n_states, n_actions), 1 / n_actions)
     if deterministic:
-        actions, _ = agent.predict(observations, deterministic=True)
+        actions, _ = agent.predict(observations, deterministic=True, **told)  # type: ignore[arg-type]
         return np.eye(n_actions)[np.asarray(actions, dtype=np.int64)]
     if isinstance(agent, TabularAlgorithm):
         return np.asarray(agent.action_probabilities()[observations])
-    if isinstance(agent, PPO | A2C):
-        with th.no_grad():
-            tensor, _ = agent.policy.obs_to_tensor(observations)
-            distribution: Any = agent.policy.get_distribution(tensor).distribution
-        return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
+    policy = getattr(agent, "policy", None)
+    if hasattr(policy, "get_distribution"):
+        return _actor_probabilities(policy, observations, told)
     if hasattr(agent, "exploration_rate"):
         # DQN and agents like it: QR-DQN too, which may not be installed and is no subclass of DQN.
         epsilon = float(agent.exploration_rate)
         greedy = policy_matrix(agent, observations)
         return np.asarray(epsilon / n_actions + (1 - epsilon) * greedy)
     raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
+
+
+def _obstacle(agent: BaseAlgorithm, masks: Bools | None) -> str:
+    if has_memory(agent):
+        return "it acts by what it remembers, not by the state alone"
+    if masks is None and needs_masks(agent):
+        return "which actions are valid in each state is not known"
+    return ""
+
+
+def _actor_probabilities(policy: Any, observations: NDArray[Any], told: dict[str, Any]) -> Floats:
+    """The probabilities of an actor with a softmax over its actions, shape (S, A)."""
+    with th.no_grad():
+        tensor, _ = policy.obs_to_tensor(observations)
+        distribution = policy.get_distribution(tensor, **told).distribution
+    return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)

@@ -12,6 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from mdp.array_types import Floats
+from pipeline.evaluation.policy_kinds import actor_on
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def evaluate(
 
     env.seed(seed)
     returns, lengths = evaluate_policy(
-        model,
+        actor_on(model, env),
         env,
         n_eval_episodes=n_episodes,
         deterministic=deterministic,

@@ -31,7 +31,7 @@ def spec_of(algo, env_id, **changes):
 
 def environment_for(algo):
     """One that the agent's file names, or any that fits where the file has a default alone."""
-    for env_id in [*entry_names(algo), "FrozenLake-v1", "CartPole-v1", "GaussianBandit-v0"]:
+    for env_id in [*entry_names(algo), "FrozenLake-v1", "CartPole-v1", "GaussianBandit-v0", "Pendulum-v1", "Valid-v0"]:
         env = gym.make(env_id)
         fits = ALGORITHMS[algo].env_misfit(env) == ""
         env.close()

@@ -10,16 +10,19 @@ from typing import Any, Literal
 import pytest
 import stable_baselines3 as sb3
 import yaml
+from gymnasium.spaces import Box
 from hypothesis import given
 from hypothesis import strategies as st
-from sb3_contrib import QRDQN
+from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents import load_algorithm
 from pipeline.errors import UserError
+from pipeline.settings.action_noise import action_noise, check_action_noise
+from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.settings.coercion import ScheduleSpec, coerce, parse_schedule
-from pipeline.settings.components import build_value
 from pipeline.settings.constructor_arguments import RANGES, constructor_parameters
 from pipeline.settings.hyperparam_entries import (
     NoEntryError,
@@ -28,6 +31,7 @@ from pipeline.settings.hyperparam_entries import (
     read_hyperparams,
 )
 from pipeline.settings.hyperparams import (
+    SPECIAL_KEYS,
     ComponentSpec,
     Hyperparams,
     check_algorithm_kwargs,
@@ -51,6 +55,16 @@ ZOO_ALGORITHMS: Mapping[str, type[BaseAlgorithm]] = {
     "dqn": sb3.DQN,
     "a2c": sb3.A2C,
     "qrdqn": QRDQN,
+    "sac": sb3.SAC,
+    "td3": sb3.TD3,
+    "ddpg": sb3.DDPG,
+    "tqc": TQC,
+    "crossq": CrossQ,
+    "trpo": TRPO,
+    "ars": ARS,
+    "ppo_lstm": RecurrentPPO,
+    # No algorithm, but settings of TQC for robots with goals.
+    "her": TQC,
 }
 ZOO_ENTRIES = [
     (algo, env_id)
@@ -59,6 +73,7 @@ ZOO_ENTRIES = [
 ]
 PPO = constructor_parameters(sb3.PPO)
 DQN = constructor_parameters(sb3.DQN)
+TD3 = constructor_parameters(sb3.TD3)
 QLEARNING = constructor_parameters(load_algorithm("qlearning"))
 
 
@@ -87,9 +102,15 @@ def test_rl_zoo3_entries_load_unchanged(algo: str, env_id: str) -> None:
     assert raw == yaml.safe_load((ZOO / f"{algo}.yml").read_text())[env_id]
     hyperparams = split(raw)
     assert hyperparams.n_timesteps == int(float(raw["n_timesteps"]))
-    parameters = constructor_parameters(ZOO_ALGORITHMS[algo])
-    checked = check_algorithm_kwargs(hyperparams.algorithm, parameters, algo)
-    assert build_value(checked).keys() <= parameters.keys()
+    built = build_algorithm_kwargs(ZOO_ALGORITHMS[algo], hyperparams.algorithm, algo)
+    # Nothing is left over, and nothing is lost.
+    assert built.keys() == raw.keys() - set(SPECIAL_KEYS)
+    noise = action_noise(hyperparams, Box(-1, 1, (3,)))
+    assert noise.keys() == ({"action_noise"} if "noise_type" in raw else set())
+
+
+def test_every_rl_zoo3_file_is_held_against_its_algorithm() -> None:
+    assert {path.stem for path in ZOO.glob("*.yml")} == ZOO_ALGORITHMS.keys()
 
 
 @pytest.mark.parametrize("path", sorted(ZOO.glob("*.yml")), ids=lambda path: path.stem)
@@ -347,7 +368,9 @@ def test_splitting_leaves_the_entry_alone() -> None:
         ({"env_kwargs": "dict(a=nn.Tanh)"}, "env_kwargs takes plain values, not names"),
         ({"monitor_kwargs": {"info_keywords": [1]}}, "info_keywords[0] must be a text, not 1"),
         ({"noise_type": "norml"}, "not 'norml': did you mean 'normal'?"),
-        ({"noise_std": -1}, "noise_std must be at least 0, not -1"),
+        ({"noise_type": "normal", "noise_std": -1}, "noise_std must be at least 0, not -1"),
+        ({"noise_type": "normal"}, "noise_type needs noise_std, the standard deviation"),
+        ({"noise_type": "normal", "noise_std": None}, "noise_type needs noise_std"),
         ({"env_wrapper": 5}, "env_wrapper must be the dotted name of a class"),
         ({"env_wrapper": [{"a.B": {}, "a.C": {}}]}, "must be the dotted name of a class"),
         ({"callback": [{"a.B": [1]}]}, "callback must be the dotted name of a class"),
@@ -366,6 +389,39 @@ def test_one_budget_replaces_the_other() -> None:
     assert override(entry, {"n_episodes": 5}) == {"gamma": 0.9, "n_episodes": 5}
     assert override(entry, {"gamma": 0.8}) == {"n_timesteps": 100, "gamma": 0.8}
     assert entry == {"n_timesteps": 100, "gamma": 0.9}
+
+
+# --- action noise --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "noise"),
+    [("normal", NormalActionNoise), ("ornstein-uhlenbeck", OrnsteinUhlenbeckActionNoise)],
+)
+def test_action_noise_has_the_shape_of_an_action(kind: str, noise: type) -> None:
+    hyperparams = split({"noise_type": kind, "noise_std": "0.5"})
+    assert hyperparams.algorithm == {}
+    built = action_noise(hyperparams, Box(-2, 2, (3,)))["action_noise"]
+    assert type(built) is noise
+    assert built._mu.tolist() == [0, 0, 0]
+    assert built._sigma.tolist() == [0.5, 0.5, 0.5]
+    assert built().shape == (3,)
+
+
+def test_noise_on_actions_is_for_agents_that_take_it() -> None:
+    noisy = split({"noise_type": "normal", "noise_std": 0.1})
+    check_action_noise(noisy, sb3.TD3, "td3")
+    check_action_noise(split({}), sb3.PPO, "ppo")
+    with pytest.raises(UserError, match="^ppo: noise_type is for agents that add noise to"):
+        check_action_noise(noisy, sb3.PPO, "ppo")
+
+
+def test_an_agents_own_noise_is_its_own() -> None:
+    """Gaussian noise on the values of a table, which no key of the file format may swallow."""
+    hyperparams = split({"exploration": "gaussian_noise", "noise_std": 0.25})
+    assert hyperparams.noise_std is None
+    kwargs = build_algorithm_kwargs(load_algorithm("qlearning"), hyperparams.algorithm, "here")
+    assert kwargs["noise_std"] == 0.25
 
 
 # --- an algorithm's arguments --------------------------------------------------------------------
@@ -416,6 +472,8 @@ def test_arguments_are_read_as_their_annotations_ask(
         (PPO, {"_init_setup_model": False}, "unknown hyperparameter '_init_setup_model'"),
         (PPO, {"seed": 1}, "seed is set by --seed, not here"),
         (PPO, {"env": "CartPole-v1"}, "env is set by --env, not here"),
+        (PPO, {"noise_std": 0.1}, "noise_std needs noise_type: normal or ornstein-uhlenbeck"),
+        (TD3, {"action_noise": 0.1}, "action_noise is set by noise_type and noise_std, not here"),
         (PPO, {"gamma": 1.5}, "gamma must be between 0 and 1, not 1.5"),
         (PPO, {"gamma": "much"}, "gamma must be a number, not 'much'"),
         (PPO, {"gamma": True}, "gamma must be a number, not True"),
