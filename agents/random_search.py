@@ -21,8 +21,8 @@ class ARS(sb3_contrib.ARS):
     """Augmented random search (Mania, Guy and Recht, 2018), as sb3-contrib has it.
 
     Arguments are those of `sb3_contrib.ARS`. What differs lies around the algorithm: callbacks are
-    told what each step brought, are called once for it and can end the training, and an agent that
-    was loaded goes on from its weights, not from zero.
+    told what each step brought, are called once for it and can end the training; an agent that was
+    loaded goes on from its weights, not from zero; and its schedules go on as well.
     """
 
     _last_dones: Any = None
@@ -50,6 +50,10 @@ class ARS(sb3_contrib.ARS):
         callback.update_locals(_locals)
         if not callback.on_step():
             raise _TrainingStoppedError(callback)
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # What a callback or an earlier training changed about the total counts here too.
+        super()._update_current_progress_remaining(num_timesteps, self._total_timesteps)
 
     def set_parameters(self, *args: Any, **kwargs: Any) -> None:
         """As in the library; the search goes on around what was set."""

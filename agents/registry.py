@@ -197,7 +197,9 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "ppo_lstm": _contrib(
         "sb3_contrib:RecurrentPPO",
         "PPO with a memory",
-        POLICY_GRADIENT_OUTPUTS,
+        # As it is in sb3-contrib 2.9, which fails on the other spaces.
+        ("Box", "Discrete", "MultiDiscrete"),
+        ("Box", "Discrete", "MultiBinary", "Dict"),
         has_memory=True,
     ),
     "ppo_mask": _contrib(

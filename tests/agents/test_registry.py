@@ -171,7 +171,7 @@ SMALL = {
     # Two of each of their networks, and a memory: smaller, as time goes with their size.
     "ppo_lstm": {**ON_POLICY, "n_epochs": 1, "policy_kwargs": {"lstm_hidden_size": 4}},
     "crossq": {"policy_kwargs": {"net_arch": [8]}},
-    "trpo": {"n_steps": 4},
+    "trpo": {"n_steps": 4, "batch_size": 4},
     "ars": {"n_delta": 2},
 }
 

@@ -13,12 +13,11 @@ import yaml
 from gymnasium.spaces import Box
 from hypothesis import given
 from hypothesis import strategies as st
-from sb3_contrib import ARS, QRDQN, TQC, TRPO, CrossQ, RecurrentPPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.type_aliases import Schedule
 
-from agents import load_algorithm
+from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError
 from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
@@ -50,26 +49,16 @@ def rl_zoo3_folder() -> Path:
 
 
 ZOO = rl_zoo3_folder()
+# her.yml says of itself that it is no longer used: it is of an algorithm that there is no more.
 ZOO_ALGORITHMS: Mapping[str, type[BaseAlgorithm]] = {
-    "ppo": sb3.PPO,
-    "dqn": sb3.DQN,
-    "a2c": sb3.A2C,
-    "qrdqn": QRDQN,
-    "sac": sb3.SAC,
-    "td3": sb3.TD3,
-    "ddpg": sb3.DDPG,
-    "tqc": TQC,
-    "crossq": CrossQ,
-    "trpo": TRPO,
-    "ars": ARS,
-    "ppo_lstm": RecurrentPPO,
-    # No algorithm, but settings of TQC for robots with goals.
-    "her": TQC,
+    path.stem: load_algorithm(path.stem) for path in sorted(ZOO.glob("*.yml")) if path.stem != "her"
 }
 ZOO_ENTRIES = [
     (algo, env_id)
     for algo in ZOO_ALGORITHMS
     for env_id in yaml.safe_load((ZOO / f"{algo}.yml").read_text())
+    # A slip that rl_zoo3 stumbles over itself; see below.
+    if (algo, env_id) != ("ppo_lstm", "default")
 ]
 PPO = constructor_parameters(sb3.PPO)
 DQN = constructor_parameters(sb3.DQN)
@@ -109,8 +98,11 @@ def test_rl_zoo3_entries_load_unchanged(algo: str, env_id: str) -> None:
     assert noise.keys() == ({"action_noise"} if "noise_type" in raw else set())
 
 
-def test_every_rl_zoo3_file_is_held_against_its_algorithm() -> None:
-    assert {path.stem for path in ZOO.glob("*.yml")} == ZOO_ALGORITHMS.keys()
+def test_the_one_entry_that_rl_zoo3_cannot_use_is_refused_with_the_right_word() -> None:
+    """RecurrentPPO of sb3-contrib knows no MlpPolicy."""
+    raw = read_hyperparams("ppo_lstm", "NoOther-v0", ZOO / "ppo_lstm.yml")
+    with pytest.raises(UserError, match="'MlpPolicy': did you mean 'MlpLstmPolicy'"):
+        build_algorithm_kwargs(load_algorithm("ppo_lstm"), split(raw).algorithm, "here")
 
 
 @pytest.mark.parametrize("path", sorted(ZOO.glob("*.yml")), ids=lambda path: path.stem)
@@ -412,7 +404,7 @@ def test_noise_on_actions_is_for_agents_that_take_it() -> None:
     noisy = split({"noise_type": "normal", "noise_std": 0.1})
     check_action_noise(noisy, sb3.TD3, "td3")
     check_action_noise(split({}), sb3.PPO, "ppo")
-    with pytest.raises(UserError, match="^ppo: noise_type is for agents that add noise to"):
+    with pytest.raises(UserError, match=r"^ppo: noise_type is for agents that add noise to"):
         check_action_noise(noisy, sb3.PPO, "ppo")
 
 
@@ -517,13 +509,14 @@ def test_a_wrong_argument_is_told(
     assert len(str(caught.value)) < 400
 
 
-@pytest.mark.parametrize("algorithm", [*ZOO_ALGORITHMS.values(), load_algorithm("qlearning")])
+@pytest.mark.parametrize("algorithm", [load_algorithm(name) for name in ALGORITHMS])
 def test_an_algorithms_own_defaults_pass(algorithm: type[BaseAlgorithm]) -> None:
     parameters = constructor_parameters(algorithm)
     defaults = {
         name: parameter.default
         for name, parameter in parameters.items()
-        if name not in {"policy", "env", "seed", "device", "verbose", "tensorboard_log"}
+        if name
+        not in {"policy", "env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
         and not name.startswith("_")
     }
     assert check_algorithm_kwargs(defaults, parameters, "here") == defaults
@@ -531,7 +524,7 @@ def test_an_algorithms_own_defaults_pass(algorithm: type[BaseAlgorithm]) -> None
 
 def test_every_range_is_that_of_some_known_name() -> None:
     known = set(Hyperparams.__dataclass_fields__)
-    for algorithm in (*ZOO_ALGORITHMS.values(), load_algorithm("qlearning")):
+    for algorithm in map(load_algorithm, ALGORITHMS):
         known |= constructor_parameters(algorithm).keys()
     assert RANGES.keys() <= known
 
