@@ -22,7 +22,7 @@ class ARS(sb3_contrib.ARS):
 
     Arguments are those of `sb3_contrib.ARS`. What differs lies around the algorithm: callbacks are
     told what each step brought, are called once for it and can end the training; an agent that was
-    loaded goes on from its weights, not from zero; and its schedules go on as well.
+    loaded goes on from its weights, where ``zero_policy`` is off too; its schedules go on as well.
     """
 
     _last_dones: Any = None

@@ -11,7 +11,6 @@ import numpy as np
 
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError, one_line
-from pipeline.evaluation.policy_kinds import actor_on
 from pipeline.model_choice import ChosenModel
 
 if TYPE_CHECKING:
@@ -90,15 +89,15 @@ def play_episodes(
     Yields:
         Return and length of each episode as it ends.
     """
-    actor = actor_on(model, env)
+    from pipeline.evaluation.mask_telling import player
+
+    choose = player(model, env).predict
     obs: Any = env.reset()
     state = None
     starts = np.ones(1, dtype=bool)
     steps = finished = 0
     while finished < n_episodes and (n_steps is None or steps < n_steps):
-        actions, state = actor.predict(
-            obs, state=state, episode_start=starts, deterministic=deterministic
-        )
+        actions, state = choose(obs, state=state, episode_start=starts, deterministic=deterministic)
         obs, _, starts, infos = env.step(actions)
         steps += 1
         after_step(bool(starts[0]))

@@ -29,7 +29,8 @@ from mdp import (
 )
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
-from pipeline.evaluation.policy_kinds import has_memory, needs_masks, takes_masks
+from pipeline.evaluation.mask_telling import takes_masks
+from pipeline.evaluation.policy_kinds import has_memory, needs_masks
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec
 

@@ -12,7 +12,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
 from mdp.array_types import Floats
-from pipeline.evaluation.policy_kinds import actor_on
+from pipeline.evaluation.mask_telling import player
 
 
 @dataclass(frozen=True)
@@ -120,7 +120,7 @@ def evaluate(
 
     env.seed(seed)
     returns, lengths = evaluate_policy(
-        actor_on(model, env),
+        player(model, env),
         env,
         n_eval_episodes=n_episodes,
         deterministic=deterministic,

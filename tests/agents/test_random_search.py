@@ -64,21 +64,19 @@ def test_a_callback_ends_the_training(n_envs):
     assert model.num_timesteps == watch.steps[-1]
 
 
-def test_what_was_loaded_goes_on_from_its_weights(tmp_path):
-    """Its search is around them; in the library it begins again at zero."""
-    model = make().learn(300)
+@pytest.mark.parametrize("zero_policy", [True, False])
+def test_what_was_loaded_goes_on_from_its_weights(zero_policy, tmp_path):
+    """In the library the search begins at new random ones where zero_policy is off."""
+    model = make(zero_policy=zero_policy).learn(300)
     learnt = parameters_to_vector(model.policy.parameters())
     assert learnt.abs().max() > 0
     assert th.equal(model.weights, learnt)
     model.save(tmp_path / "ars")
     env = make_vec_env("CartPole-v1", 1, seed=0)
-    loaded = ARS.load(tmp_path / "ars", env=env)
+    loaded = ARS.load(tmp_path / "ars", env=env, seed=1, learning_rate=0.0)
     assert th.equal(loaded.weights, learnt)
-    loaded.learning_rate = 0.0
-    loaded._setup_lr_schedule()
     loaded.learn(50, reset_num_timesteps=False)
     assert th.equal(parameters_to_vector(loaded.policy.parameters()), learnt)
-    assert "_last_dones" not in loaded.__dict__ or model._last_dones is not loaded._last_dones
 
 
 def test_schedules_follow_a_budget_of_episodes():

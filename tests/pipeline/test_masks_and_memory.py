@@ -14,7 +14,8 @@ from agents import load_algorithm
 from pipeline.agent_checks import check_fit
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator, policy_matrix
-from pipeline.evaluation.policy_kinds import actor_on, has_memory, takes_masks
+from pipeline.evaluation.mask_telling import player, takes_masks
+from pipeline.evaluation.policy_kinds import has_memory
 from pipeline.evaluation.sampled import evaluate
 from pipeline.playing import play_episodes
 from pipeline.settings.hyperparams import split
@@ -84,7 +85,7 @@ def test_nothing_invalid_is_done_in_training_and_evaluation(corridor, tmp_path):
 def test_masks_are_heeded_by_the_sampled_evaluation(corridor, deterministic, n_envs):
     agent = load_algorithm("ppo_mask")("MlpPolicy", Corridor(), seed=0, device="cpu", **SMALL)
     env = make_vec_env(lambda: gym.make(corridor), n_envs, seed=0)
-    assert isinstance(actor_on(agent, env).predict(env.reset())[0], np.ndarray)
+    assert isinstance(player(agent, env).predict(env.reset())[0], np.ndarray)
     evaluation = evaluate(agent, env, 6, 0, deterministic)
     # A move costs 1, and five are needed.
     assert (evaluation.returns == -evaluation.lengths).all()
@@ -102,11 +103,11 @@ def test_masks_are_heeded_in_play(corridor):
 def test_an_agent_that_does_not_listen_is_asked_as_ever(corridor):
     agent = load_algorithm("random")("RandomPolicy", Corridor(), seed=0)
     env = make_vec_env(lambda: gym.make(corridor), 1)
-    assert actor_on(agent, env) is agent
+    assert player(agent, env) is agent
     assert not takes_masks(agent)
     # Nor is one told anything where the environments say nothing.
     agent = load_algorithm("ppo_mask")("MlpPolicy", Corridor(), device="cpu", **SMALL)
-    assert actor_on(agent, make_vec_env("FrozenLake-v1", 1)) is agent
+    assert player(agent, make_vec_env("FrozenLake-v1", 1)) is agent
 
 
 def test_an_environment_without_masks_is_refused():
