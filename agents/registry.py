@@ -19,6 +19,8 @@ DISCRETE = ("Discrete",)
 LINEAR_INPUTS = ("Box", "Discrete")
 NETWORK_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict")
 POLICY_GRADIENT_OUTPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
+CONTINUOUS = ("Box",)
+VECTOR_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class AlgorithmEntry:
         actions: names of the Gymnasium spaces that it can act in, likewise.
         observation_shape: the one observation shape that it understands, or None for any.
         for_bandits: whether it looks no further than the next reward.
+        has_memory: whether it acts by what it saw before, not by the observation alone.
+        needs_masks: whether the environment must say which actions are valid (``action_masks()``).
         package: the import name of an optional package that it needs, or None.
         extra: the extra of this distribution that installs that package.
     """
@@ -43,6 +47,8 @@ class AlgorithmEntry:
     actions: tuple[str, ...] = ()
     observation_shape: tuple[int, ...] | None = None
     for_bandits: bool = False
+    has_memory: bool = False
+    needs_masks: bool = False
     package: str | None = None
     extra: str | None = None
 
@@ -85,6 +91,8 @@ class AlgorithmEntry:
         """Say why the agent cannot work with the environment; empty where it can."""
         if self.for_bandits and not is_bandit(env):
             return "it is for bandits, where a pull changes nothing but its own reward"
+        if self.needs_masks and not has_masks(env):
+            return "it needs to be told which actions are valid, by a method action_masks()"
         return self.misfit(env.observation_space, env.action_space)
 
 
@@ -95,12 +103,38 @@ def is_bandit(env: gym.Env[Any, Any]) -> bool:
     return isinstance(env.unwrapped, Bandit)
 
 
+def has_masks(env: gym.Env[Any, Any]) -> bool:
+    """Whether the environment, or a wrapper of it, says which actions are valid."""
+    return env.has_wrapper_attr("action_masks")
+
+
 def _tabular(entry_point: str, summary: str) -> AlgorithmEntry:
     return AlgorithmEntry(f"agents.tabular.{entry_point}", summary, DISCRETE, DISCRETE)
 
 
 def _deep(entry_point: str, summary: str, actions: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
     return AlgorithmEntry(entry_point, summary, NETWORK_INPUTS, actions)
+
+
+def _contrib(
+    entry_point: str,
+    summary: str,
+    actions: tuple[str, ...],
+    observations: tuple[str, ...] = NETWORK_INPUTS,
+    *,
+    has_memory: bool = False,
+    needs_masks: bool = False,
+) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        entry_point,
+        f"{summary} (sb3-contrib)",
+        observations,
+        actions,
+        has_memory=has_memory,
+        needs_masks=needs_masks,
+        package="sb3_contrib",
+        extra="contrib",
+    )
 
 
 def _bandit(entry_point: str, summary: str) -> AlgorithmEntry:
@@ -148,13 +182,42 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         "advantage actor-critic (Stable-Baselines3)",
         POLICY_GRADIENT_OUTPUTS,
     ),
-    "qrdqn": AlgorithmEntry(
-        "sb3_contrib:QRDQN",
-        "quantile-regression DQN (sb3-contrib)",
-        NETWORK_INPUTS,
-        DISCRETE,
-        package="sb3_contrib",
-        extra="contrib",
+    "sac": _deep("stable_baselines3:SAC", "soft actor-critic (Stable-Baselines3)", CONTINUOUS),
+    "td3": _deep(
+        "stable_baselines3:TD3", "twin delayed policy gradient (Stable-Baselines3)", CONTINUOUS
+    ),
+    "ddpg": _deep(
+        "stable_baselines3:DDPG",
+        "deep deterministic policy gradient (Stable-Baselines3)",
+        CONTINUOUS,
+    ),
+    "qrdqn": _contrib("sb3_contrib:QRDQN", "quantile-regression DQN", DISCRETE),
+    "tqc": _contrib("sb3_contrib:TQC", "truncated quantile critics", CONTINUOUS),
+    "crossq": _contrib(
+        "sb3_contrib:CrossQ", "SAC without target networks", CONTINUOUS, VECTOR_INPUTS
+    ),
+    "trpo": _contrib(
+        "sb3_contrib:TRPO", "trust-region policy optimisation", POLICY_GRADIENT_OUTPUTS
+    ),
+    "ars": _contrib(
+        "agents.random_search:ARS",
+        "augmented random search",
+        (*CONTINUOUS, *DISCRETE),
+        VECTOR_INPUTS,
+    ),
+    "ppo_lstm": _contrib(
+        "sb3_contrib:RecurrentPPO",
+        "PPO with a memory",
+        # As it is in sb3-contrib 2.9, which fails on the other spaces.
+        ("Box", "Discrete", "MultiDiscrete"),
+        ("Box", "Discrete", "MultiBinary", "Dict"),
+        has_memory=True,
+    ),
+    "ppo_mask": _contrib(
+        "sb3_contrib:MaskablePPO",
+        "PPO that is told which actions are valid",
+        ("Discrete", "MultiDiscrete", "MultiBinary"),
+        needs_masks=True,
     ),
     "value_iteration": AlgorithmEntry(
         "agents.planning:ValueIteration",
@@ -264,7 +327,10 @@ def load_algorithm(name: str) -> type[BaseAlgorithm]:
 
 
 def fitting_algorithms(
-    observation_space: spaces.Space[Any], action_space: spaces.Space[Any], bandit: bool = False
+    observation_space: spaces.Space[Any],
+    action_space: spaces.Space[Any],
+    bandit: bool = False,
+    masks: bool = False,
 ) -> list[str]:
     """Names of the agents that can work with these spaces, in the order of the table.
 
@@ -272,9 +338,12 @@ def fitting_algorithms(
         observation_space: what is observed.
         action_space: what can be done.
         bandit: whether the environment is a bandit.
+        masks: whether the environment says which actions are valid.
     """
     return [
         name
         for name, entry in ALGORITHMS.items()
-        if bandit >= entry.for_bandits and not entry.misfit(observation_space, action_space)
+        if bandit >= entry.for_bandits
+        and masks >= entry.needs_masks
+        and not entry.misfit(observation_space, action_space)
     ]

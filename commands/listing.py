@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
-from agents.registry import is_bandit
+from agents.registry import has_masks, is_bandit
 from pipeline.environments import make_env
 from pipeline.settings.hyperparam_entries import entry_names
 
@@ -41,7 +41,9 @@ def _print_environments(console: Console) -> None:
     for env_id in sorted(set().union(*tuned.values()) & set(gym.registry)):
         env = make_env(env_id, {})
         with_entry = [name for name in ALGORITHMS if env_id in tuned[name]]
-        fitting = fitting_algorithms(env.observation_space, env.action_space, is_bandit(env))
+        fitting = fitting_algorithms(
+            env.observation_space, env.action_space, is_bandit(env), has_masks(env)
+        )
         others = [name for name in fitting if name not in with_entry]
         env.close()
         table.add_row(env_id, " ".join(with_entry), " ".join(others))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from agents import ALGORITHMS, fitting_algorithms
-from agents.registry import is_bandit
+from agents.registry import has_masks, is_bandit
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError, unknown
 from pipeline.train_spec import TrainSpec
@@ -32,7 +32,9 @@ def check_fit(spec: TrainSpec) -> None:
     """
     env = make_single_env(spec, training=True)
     misfit = ALGORITHMS[spec.algo].env_misfit(env)
-    fitting = fitting_algorithms(env.observation_space, env.action_space, is_bandit(env))
+    fitting = fitting_algorithms(
+        env.observation_space, env.action_space, is_bandit(env), has_masks(env)
+    )
     env.close()
     if misfit:
         others = f"fitting agents: {', '.join(fitting)}" if fitting else "no agent here fits"

@@ -42,6 +42,7 @@ from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.run_folder import Run, environment_name
 from pipeline.settings import components
+from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import (
     build_algorithm_kwargs,
     default_policy,
@@ -87,6 +88,7 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
         UserError: if one is unknown or has a wrong type or range.
     """
     algorithm, kwargs = agent_class(spec.algo), spec.hyperparams.algorithm
+    check_action_noise(spec.hyperparams, algorithm, spec.algo)
     if needs_policy(algorithm, kwargs):
         env = make_single_env(spec, training=True)
         is_dict = isinstance(env.observation_space, spaces.Dict)
@@ -130,7 +132,9 @@ def _exact_evaluator(
 ) -> ExactEvaluator | None:
     """What computes evaluations where the environment's model is known and the agent lets it."""
     exact = exact_evaluator(spec)
-    reason = "" if exact is None else why_not_exact(model, exact.observations)
+    reason = (
+        "" if exact is None else exact.obstacle(model) or why_not_exact(model, exact.observations)
+    )
     if reason:
         console.print(f"[dim]evaluations are sampled, not exact: {escape(reason)}[/]")
     return None if reason else exact
@@ -221,6 +225,7 @@ def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlg
         "seed": spec.seed,
         "verbose": max(spec.verbose - 1, 0),
         "tensorboard_log": None if folder is None else str(folder / environment_name(spec.env_id)),
+        **action_noise(spec.hyperparams, env.action_space),
     }
     if spec.trained_agent is None:
         return _new_model(agent_class(spec.algo), env, spec.device, common, kwargs)

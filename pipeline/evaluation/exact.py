@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
-from stable_baselines3 import A2C, PPO
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
@@ -38,6 +37,7 @@ from mdp import (
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.mask_telling import takes_masks
+from pipeline.evaluation.policy_kinds import has_memory, needs_masks
 from pipeline.evaluation.sampled import KNOWN_LIBRARIES, Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec
 
@@ -92,6 +92,10 @@ class ExactEvaluator:
             steps = np.arange(self.horizon)[:, None]
             return agent.policy.actions_after(self.observations[None], steps)
         return policy_matrix(agent, self.observations, deterministic, self.masks)
+
+    def obstacle(self, agent: BaseAlgorithm) -> str:
+        """Why the agent's policy cannot be had by asking it for every state; empty where it can."""
+        return _obstacle(agent, self.masks)
 
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
@@ -181,8 +185,11 @@ def policy_matrix(
         masks: what may be done in each state, bool of shape (S, A), for agents that are told.
 
     Raises:
-        TypeError: if the probabilities that the agent samples from are not known.
+        TypeError: if the probabilities that the agent acts with are not known.
     """
+    obstacle = _obstacle(agent, masks)
+    if obstacle:
+        raise TypeError(f"{type(agent).__name__}: {obstacle}")
     n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
     if isinstance(agent, RandomAgent):
@@ -192,11 +199,9 @@ def policy_matrix(
         return np.eye(n_actions)[np.asarray(actions, dtype=np.int64)]
     if isinstance(agent, TabularAlgorithm):
         return np.asarray(agent.action_probabilities()[observations])
-    if isinstance(agent, PPO | A2C):
-        with th.no_grad():
-            tensor, _ = agent.policy.obs_to_tensor(observations)
-            distribution: Any = agent.policy.get_distribution(tensor).distribution
-        return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
+    policy = getattr(agent, "policy", None)
+    if hasattr(policy, "get_distribution"):
+        return _actor_probabilities(policy, observations, told)
     if _is_epsilon_greedy(agent):
         epsilon = float(vars(agent)["exploration_rate"])
         greedy = policy_matrix(agent, observations, masks=masks)
@@ -210,3 +215,19 @@ def _is_epsilon_greedy(agent: BaseAlgorithm) -> bool:
     """Whether it is DQN or QR-DQN, which may not be installed and is no subclass of it."""
     homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
     return any(base.__module__.startswith(homes) for base in type(agent).__mro__)
+
+
+def _obstacle(agent: BaseAlgorithm, masks: Bools | None) -> str:
+    if has_memory(agent):
+        return "it acts by what it remembers, not by the state alone"
+    if masks is None and needs_masks(agent):
+        return "which actions are valid in each state is not known"
+    return ""
+
+
+def _actor_probabilities(policy: Any, observations: NDArray[Any], told: dict[str, Any]) -> Floats:
+    """The probabilities of an actor with a softmax over its actions, shape (S, A)."""
+    with th.no_grad():
+        tensor, _ = policy.obs_to_tensor(observations)
+        distribution = policy.get_distribution(tensor, **told).distribution
+    return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)

@@ -16,8 +16,9 @@ from pipeline.settings.coercion import coerce
 from pipeline.settings.constructor_arguments import check_arguments, check_range
 from pipeline.settings.literals import contains_name
 
-# Constructor arguments that the command line sets, and how.
-_COMMAND_LINE = {
+# Constructor arguments that are set elsewhere, and how.
+_SET_ELSEWHERE = {
+    "action_noise": "noise_type and noise_std",
     "env": "--env",
     "seed": "--seed",
     "device": "--device",
@@ -79,7 +80,8 @@ class Hyperparams:
         frame_stack: how many observations to stack, or None.
         monitor_kwargs: arguments of Monitor.
         noise_type: action noise, for algorithms that take an ``action_noise``.
-        noise_std: its standard deviation.
+        noise_std: its standard deviation. Without a ``noise_type`` the key is an argument of the
+            algorithm like any other.
         algorithm: everything else: arguments of the algorithm's constructor, not checked yet.
     """
 
@@ -115,8 +117,9 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
     Raises:
         UserError: if a special key has a wrong type or range, or contradicts another.
     """
-    algorithm = {key: value for key, value in entry.items() if key not in SPECIAL_KEYS}
-    special = {key: value for key in SPECIAL_KEYS if (value := entry.get(key)) is not None}
+    special_keys = _special_keys(entry)
+    algorithm = {key: value for key, value in entry.items() if key not in special_keys}
+    special = {key: value for key in special_keys if (value := entry.get(key)) is not None}
     if isinstance(special.get("normalize"), bool):
         special["normalize"] = {} if special["normalize"] else None
     hints = get_type_hints(Hyperparams)
@@ -130,11 +133,19 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
             special[key] = _checked_keywords(key, special[key], where)
     if "n_timesteps" in special and "n_episodes" in special:
         raise UserError(f"{where}: give n_timesteps or n_episodes, not both")
+    if "noise_type" in special and "noise_std" not in special:
+        raise UserError(f"{where}: noise_type needs noise_std, the standard deviation of the noise")
     if special.get("normalize") is not None and "gamma" in algorithm:
         # As rl_zoo3 has it: rewards are normalised under the discount that the agent uses.
         gamma = coerce(algorithm["gamma"], float, f"{where}: gamma")
         special["normalize"].setdefault("gamma", gamma)
     return Hyperparams(**special, algorithm=algorithm)
+
+
+def _special_keys(entry: Mapping[str, Any]) -> list[str]:
+    # Some agents have a noise_std of their own, on what they learn rather than on actions.
+    is_action_noise = entry.get("noise_type") is not None
+    return [key for key in SPECIAL_KEYS if key != "noise_std" or is_action_noise]
 
 
 def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
@@ -199,13 +210,15 @@ def check_algorithm_kwargs(
         UserError: naming the argument, and what it must be.
     """
     for name in kwargs:
-        if name in _COMMAND_LINE and name in parameters:
-            raise UserError(f"{where}: {name} is set by {_COMMAND_LINE[name]}, not here")
+        if name in _SET_ELSEWHERE and name in parameters:
+            raise UserError(f"{where}: {name} is set by {_SET_ELSEWHERE[name]}, not here")
     known = {
         name: parameter
         for name, parameter in parameters.items()
-        if name not in _COMMAND_LINE and name not in _INTERNAL
+        if name not in _SET_ELSEWHERE and name not in _INTERNAL
     }
+    if "noise_std" in kwargs and "noise_std" not in known:
+        raise UserError(f"{where}: noise_std needs noise_type: normal or ornstein-uhlenbeck")
     result = check_arguments(kwargs, known, where, "hyperparameter", SPECIAL_KEYS)
     for name, value in result.items():
         check_range(name, value, where)

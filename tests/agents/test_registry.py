@@ -4,6 +4,7 @@ import importlib.util
 import sys
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -15,6 +16,10 @@ BOX = spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "optimal"]
 TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
 DEEP_Q = ["dqn", "double_dqn", "deep_qlearning"]
+CONTRIB = ["qrdqn", "tqc", "crossq", "trpo", "ars", "ppo_lstm", "ppo_mask"]
+# What learns on any observation and acts in Discrete spaces, in the order of the table.
+NETWORKS = [*DEEP_Q, "ppo", "a2c", "qrdqn", "trpo", "ars", "ppo_lstm"]
+CONTINUOUS = ["ppo", "a2c", "sac", "td3", "ddpg", "tqc", "crossq", "trpo", "ars", "ppo_lstm"]
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -42,15 +47,15 @@ def test_an_unknown_name():
     [
         (
             "CartPole-v1",
-            [*DEEP_Q, "ppo", "a2c", "qrdqn", "random", "angle"],
+            [*NETWORKS, "random", "angle"],
         ),
         (
             "FrozenLake-v1",
-            [*TABULAR, *DEEP_Q, "ppo", "a2c", "qrdqn", *PLANNING, "random"],
+            [*TABULAR, *NETWORKS, *PLANNING, "random"],
         ),
-        ("MountainCarContinuous-v0", ["ppo", "a2c", "random"]),
+        ("MountainCarContinuous-v0", [*CONTINUOUS, "random"]),
         # Four numbers are observed in CartPole, two here.
-        ("MountainCar-v0", [*DEEP_Q, "ppo", "a2c", "qrdqn", "random"]),
+        ("MountainCar-v0", [*NETWORKS, "random"]),
         ("Blackjack-v1", []),
     ],
 )
@@ -60,11 +65,30 @@ def test_which_agents_fit(env_id, names):
     env.close()
 
 
+def test_masks_make_one_more_fit():
+    assert fitting_algorithms(DISCRETE, DISCRETE, masks=True) == [
+        *TABULAR,
+        *NETWORKS,
+        "ppo_mask",
+        *PLANNING,
+        "random",
+    ]
+    env = OneStep(DISCRETE, DISCRETE)
+    assert ALGORITHMS["ppo_mask"].env_misfit(env) == ""
+    # A method of the environment serves through wrappers as well.
+    assert ALGORITHMS["ppo_mask"].env_misfit(gym.wrappers.TimeLimit(env, 5)) == ""
+    assert ALGORITHMS["ppo_mask"].env_misfit(gym.make("CartPole-v1")) == (
+        "it needs to be told which actions are valid, by a method action_masks()"
+    )
+
+
 @pytest.mark.parametrize(
     ("name", "observations", "actions", "misfit"),
     [
         ("qlearning", DISCRETE, DISCRETE, ""),
         ("ppo", BOX, BOX, ""),
+        ("sac", BOX, BOX, ""),
+        ("td3", BOX, DISCRETE, "it acts in Box spaces, not Discrete(4)"),
         ("ppo", spaces.Dict({"a": BOX}), DISCRETE, ""),
         ("angle", BOX, spaces.Discrete(2), ""),
         ("qlearning", BOX, DISCRETE, f"it observes Discrete spaces, not {BOX}"),
@@ -127,6 +151,12 @@ class OneStep(gym.Env):
         assert self.action_space.contains(action)
         return self.observation_space.sample(), 0.0, True, False, {}
 
+    def action_masks(self):
+        space = self.action_space
+        n_choices = {"Discrete": lambda: space.n, "MultiDiscrete": lambda: sum(space.nvec)}
+        # Of a MultiBinary action each part can be 0 or 1.
+        return np.ones(n_choices.get(type(space).__name__, lambda: 2 * space.n)(), dtype=bool)
+
 
 SPACES = {
     "Box": spaces.Box(-1, 1, (4,)),
@@ -135,7 +165,15 @@ SPACES = {
     "MultiBinary": spaces.MultiBinary(3),
     "Dict": spaces.Dict({"a": spaces.Box(-1, 1, (2,)), "b": spaces.Discrete(3)}),
 }
-SMALL = {"ppo": {"n_steps": 4, "batch_size": 4}}
+ON_POLICY = {"n_steps": 4, "batch_size": 4}
+SMALL = {
+    **dict.fromkeys(["ppo", "ppo_mask"], ON_POLICY),
+    # Two of each of their networks, and a memory: smaller, as time goes with their size.
+    "ppo_lstm": {**ON_POLICY, "n_epochs": 1, "policy_kwargs": {"lstm_hidden_size": 4}},
+    "crossq": {"policy_kwargs": {"net_arch": [8]}},
+    "trpo": {"n_steps": 4, "batch_size": 4},
+    "ars": {"n_delta": 2},
+}
 
 
 @pytest.mark.parametrize("name", ALGORITHMS)
@@ -145,8 +183,8 @@ def test_the_table_tells_the_truth(name):
     for kind in entry.observations:
         for acts in entry.actions:
             policy = next(iter(algorithm.policy_aliases))
-            if policy == "MlpPolicy" and kind == "Dict":
-                policy = "MultiInputPolicy"
+            if kind == "Dict":
+                policy = policy.replace("Mlp", "MultiInput")
             env = OneStep(SPACES[kind], SPACES[acts])
             assert entry.misfit(env.observation_space, env.action_space) == ""
             model = algorithm(policy, env, seed=0, **SMALL.get(name, {}))
@@ -164,8 +202,8 @@ def test_an_optional_package_that_is_missing(monkeypatch):
     monkeypatch.setattr(
         importlib.util, "find_spec", lambda name: None if name == "sb3_contrib" else find_spec(name)
     )
-    assert [name for name, entry in ALGORITHMS.items() if not entry.is_installed] == ["qrdqn"]
-    assert ALGORITHMS["qrdqn"].extra == "contrib"
+    assert [name for name, entry in ALGORITHMS.items() if not entry.is_installed] == CONTRIB
+    assert {ALGORITHMS[name].extra for name in CONTRIB} == {"contrib"}
     # What fits does not depend on what is installed.
     assert "qrdqn" in fitting_algorithms(BOX, DISCRETE)
     monkeypatch.setitem(sys.modules, "sb3_contrib", None)

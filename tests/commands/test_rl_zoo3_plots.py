@@ -21,6 +21,19 @@ LIBRARY = {
     "a2c": {},
     "dqn": {"learning_starts": 10, "buffer_size": 100},
     "qrdqn": {"learning_starts": 10, "buffer_size": 100},
+    "trpo": {"n_steps": 32, "batch_size": 32},
+    "ppo_lstm": {"policy": "MlpLstmPolicy", "n_steps": 32, "batch_size": 32, "n_epochs": 1},
+}
+OFF_POLICY = {"learning_starts": 90, "buffer_size": 200, "policy_kwargs": {"net_arch": [8]}}
+NOISE = {"noise_type": "normal", "noise_std": 0.1}
+CONTINUOUS = {
+    "sac": {**OFF_POLICY, "use_sde": True},
+    "td3": {**OFF_POLICY, **NOISE, "train_freq": [1, "episode"]},
+    "ddpg": {**OFF_POLICY, **NOISE, "noise_type": "ornstein-uhlenbeck"},
+    "tqc": OFF_POLICY,
+    "crossq": {**OFF_POLICY, "normalize": True},
+    # All candidates' episodes are of 30 steps, so that its two runs are equally long.
+    "ars": {"n_delta": 2},
 }
 AGENTS = ["qlearning", *LIBRARY]
 
@@ -69,7 +82,7 @@ def call(main, *words):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Two seeds of five agents as a study, and two of them by train.py as well."""
+    """Two seeds of all agents as a study, and two of them by train.py as well."""
     folder = tmp_path_factory.mktemp("zoo")
     shared = {"n_timesteps": 120, "n_envs": 1, "eval_env_kwargs": {"max_episode_steps": 20}}
     agents = {"qlearning": {}} | {
@@ -141,3 +154,30 @@ def test_enjoy_plays_the_runs_of_a_study(folder, tmp_path):
     for algo, out in zip(LIBRARY, zoo(*commands, cwd=tmp_path), strict=True):
         assert f"{algo}/{ENV_ID}_2" in out
         assert "pisode" in out
+
+
+def test_agents_of_continuous_actions(tmp_path):
+    """The same for those that act in Box spaces: compared here, plotted and played there."""
+    study = {
+        "seeds": 2,
+        "eval_freq": 40,
+        "settings": {"n_timesteps": 120, "env_kwargs": {"max_episode_steps": 30}},
+        "agents": {
+            name: {"tuned": False, "policy": "MlpPolicy", **own} for name, own in CONTINUOUS.items()
+        },
+        "environments": ["Pendulum-v1"],
+    }
+    (tmp_path / "robots.yml").write_text(yaml.safe_dump(study))
+    call(compare.main, "compare.py", tmp_path / "robots.yml", "--no-report", "-f", tmp_path)
+    where = ["-f", tmp_path / "robots" / "runs"]
+    words = ["--env", "Pendulum-v1", *where, "--no-render", "-n", 60, "--device", "cpu"]
+    labelled = ["-l", "ours", "--no-display", "-print"]
+    plots, *played = zoo(
+        ["rl_zoo3.plots.all_plots", "-a", *CONTINUOUS, "-e", "Pendulum-v1", *where, *labelled],
+        *(["rl_zoo3.enjoy", "--algo", algo, *words] for algo in CONTINUOUS),
+        cwd=tmp_path,
+    )
+    for algo, out in zip(CONTINUOUS, played, strict=True):
+        assert f"Pendulum-v1-{algo.upper()}-ours: 2" in plots
+        assert f"{algo}/Pendulum-v1_2" in out
+        assert out.count("Episode Length 30") == 2

@@ -29,10 +29,11 @@ AGENTS = {
     "qlearning": {"learning_rate": 0.5, "exploration_final_eps": 0.3},
     "ppo": {**SMALL, "n_steps": 64, "batch_size": 64, "n_epochs": 2},
     "a2c": SMALL,
+    "trpo": {**SMALL, "n_steps": 64, "batch_size": 64},
     "dqn": {**SMALL, "buffer_size": 500, "learning_starts": 50, "exploration_final_eps": 0.2},
     "random": {},
 }
-BRIEFLY = {"qlearning": 5000, "ppo": 256, "a2c": 100, "dqn": 300, "random": 0}
+BRIEFLY = {"qlearning": 5000, "ppo": 256, "a2c": 100, "trpo": 128, "dqn": 300, "random": 0}
 
 
 def spec_of(env, **entry):

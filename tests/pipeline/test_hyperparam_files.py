@@ -24,6 +24,30 @@ ENTRIES = [(path.stem, key) for path in FILES for key in read_yaml(path)]
 SPECIALISTS = {"angle"}
 
 
+class Valid(gym.Env):
+    """A step long, of two actions; the second is valid."""
+
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def action_masks(self):
+        return [False, True]
+
+    def step(self, action):
+        return 1, float(action), True, False, {}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def masked_env():
+    gym.register("Valid-v0", Valid)
+    yield
+    del gym.registry["Valid-v0"]
+
+
 def spec_of(algo, env_id, **changes):
     raw = override(read_hyperparams(algo, env_id), changes)
     return TrainSpec(algo, env_id, split(raw), raw, seed=0)
@@ -31,7 +55,14 @@ def spec_of(algo, env_id, **changes):
 
 def environment_for(algo):
     """One that the agent's file names, or any that fits where the file has a default alone."""
-    for env_id in [*entry_names(algo), "FrozenLake-v1", "CartPole-v1", "GaussianBandit-v0"]:
+    for env_id in [
+        *entry_names(algo),
+        "FrozenLake-v1",
+        "CartPole-v1",
+        "GaussianBandit-v0",
+        "Pendulum-v1",
+        "Valid-v0",
+    ]:
         env = gym.make(env_id)
         fits = ALGORITHMS[algo].env_misfit(env) == ""
         env.close()

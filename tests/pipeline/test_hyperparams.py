@@ -10,16 +10,18 @@ from typing import Any, Literal
 import pytest
 import stable_baselines3 as sb3
 import yaml
+from gymnasium.spaces import Box
 from hypothesis import given
 from hypothesis import strategies as st
-from sb3_contrib import QRDQN
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.type_aliases import Schedule
 
-from agents import load_algorithm
+from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError
+from pipeline.settings.action_noise import action_noise, check_action_noise
+from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.settings.coercion import ScheduleSpec, coerce, parse_schedule
-from pipeline.settings.components import build_value
 from pipeline.settings.constructor_arguments import RANGES, constructor_parameters
 from pipeline.settings.hyperparam_entries import (
     NoEntryError,
@@ -28,6 +30,7 @@ from pipeline.settings.hyperparam_entries import (
     read_hyperparams,
 )
 from pipeline.settings.hyperparams import (
+    SPECIAL_KEYS,
     ComponentSpec,
     Hyperparams,
     check_algorithm_kwargs,
@@ -46,19 +49,20 @@ def rl_zoo3_folder() -> Path:
 
 
 ZOO = rl_zoo3_folder()
+# her.yml says of itself that it is no longer used: it is of an algorithm that there is no more.
 ZOO_ALGORITHMS: Mapping[str, type[BaseAlgorithm]] = {
-    "ppo": sb3.PPO,
-    "dqn": sb3.DQN,
-    "a2c": sb3.A2C,
-    "qrdqn": QRDQN,
+    path.stem: load_algorithm(path.stem) for path in sorted(ZOO.glob("*.yml")) if path.stem != "her"
 }
 ZOO_ENTRIES = [
     (algo, env_id)
     for algo in ZOO_ALGORITHMS
     for env_id in yaml.safe_load((ZOO / f"{algo}.yml").read_text())
+    # A slip that rl_zoo3 stumbles over itself; see below.
+    if (algo, env_id) != ("ppo_lstm", "default")
 ]
 PPO = constructor_parameters(sb3.PPO)
 DQN = constructor_parameters(sb3.DQN)
+TD3 = constructor_parameters(sb3.TD3)
 QLEARNING = constructor_parameters(load_algorithm("qlearning"))
 
 
@@ -87,9 +91,18 @@ def test_rl_zoo3_entries_load_unchanged(algo: str, env_id: str) -> None:
     assert raw == yaml.safe_load((ZOO / f"{algo}.yml").read_text())[env_id]
     hyperparams = split(raw)
     assert hyperparams.n_timesteps == int(float(raw["n_timesteps"]))
-    parameters = constructor_parameters(ZOO_ALGORITHMS[algo])
-    checked = check_algorithm_kwargs(hyperparams.algorithm, parameters, algo)
-    assert build_value(checked).keys() <= parameters.keys()
+    built = build_algorithm_kwargs(ZOO_ALGORITHMS[algo], hyperparams.algorithm, algo)
+    # Nothing is left over, and nothing is lost.
+    assert built.keys() == raw.keys() - set(SPECIAL_KEYS)
+    noise = action_noise(hyperparams, Box(-1, 1, (3,)))
+    assert noise.keys() == ({"action_noise"} if "noise_type" in raw else set())
+
+
+def test_the_one_entry_that_rl_zoo3_cannot_use_is_refused_with_the_right_word() -> None:
+    """RecurrentPPO of sb3-contrib knows no MlpPolicy."""
+    raw = read_hyperparams("ppo_lstm", "NoOther-v0", ZOO / "ppo_lstm.yml")
+    with pytest.raises(UserError, match="'MlpPolicy': did you mean 'MlpLstmPolicy'"):
+        build_algorithm_kwargs(load_algorithm("ppo_lstm"), split(raw).algorithm, "here")
 
 
 @pytest.mark.parametrize("path", sorted(ZOO.glob("*.yml")), ids=lambda path: path.stem)
@@ -348,7 +361,9 @@ def test_splitting_leaves_the_entry_alone() -> None:
         ({"env_kwargs": "dict(a=nn.Tanh)"}, "env_kwargs takes plain values, not names"),
         ({"monitor_kwargs": {"info_keywords": [1]}}, "info_keywords[0] must be a text, not 1"),
         ({"noise_type": "norml"}, "not 'norml': did you mean 'normal'?"),
-        ({"noise_std": -1}, "noise_std must be at least 0, not -1"),
+        ({"noise_type": "normal", "noise_std": -1}, "noise_std must be at least 0, not -1"),
+        ({"noise_type": "normal"}, "noise_type needs noise_std, the standard deviation"),
+        ({"noise_type": "normal", "noise_std": None}, "noise_type needs noise_std"),
         ({"env_wrapper": 5}, "env_wrapper must be the dotted name of a class"),
         ({"env_wrapper": [{"a.B": {}, "a.C": {}}]}, "must be the dotted name of a class"),
         ({"callback": [{"a.B": [1]}]}, "callback must be the dotted name of a class"),
@@ -367,6 +382,39 @@ def test_one_budget_replaces_the_other() -> None:
     assert override(entry, {"n_episodes": 5}) == {"gamma": 0.9, "n_episodes": 5}
     assert override(entry, {"gamma": 0.8}) == {"n_timesteps": 100, "gamma": 0.8}
     assert entry == {"n_timesteps": 100, "gamma": 0.9}
+
+
+# --- action noise --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("kind", "noise"),
+    [("normal", NormalActionNoise), ("ornstein-uhlenbeck", OrnsteinUhlenbeckActionNoise)],
+)
+def test_action_noise_has_the_shape_of_an_action(kind: str, noise: type) -> None:
+    hyperparams = split({"noise_type": kind, "noise_std": "0.5"})
+    assert hyperparams.algorithm == {}
+    built = action_noise(hyperparams, Box(-2, 2, (3,)))["action_noise"]
+    assert type(built) is noise
+    assert built._mu.tolist() == [0, 0, 0]
+    assert built._sigma.tolist() == [0.5, 0.5, 0.5]
+    assert built().shape == (3,)
+
+
+def test_noise_on_actions_is_for_agents_that_take_it() -> None:
+    noisy = split({"noise_type": "normal", "noise_std": 0.1})
+    check_action_noise(noisy, sb3.TD3, "td3")
+    check_action_noise(split({}), sb3.PPO, "ppo")
+    with pytest.raises(UserError, match=r"^ppo: noise_type is for agents that add noise to"):
+        check_action_noise(noisy, sb3.PPO, "ppo")
+
+
+def test_an_agents_own_noise_is_its_own() -> None:
+    """Gaussian noise on the values of a table, which no key of the file format may swallow."""
+    hyperparams = split({"exploration": "gaussian_noise", "noise_std": 0.25})
+    assert hyperparams.noise_std is None
+    kwargs = build_algorithm_kwargs(load_algorithm("qlearning"), hyperparams.algorithm, "here")
+    assert kwargs["noise_std"] == 0.25
 
 
 # --- an algorithm's arguments --------------------------------------------------------------------
@@ -417,6 +465,8 @@ def test_arguments_are_read_as_their_annotations_ask(
         (PPO, {"_init_setup_model": False}, "unknown hyperparameter '_init_setup_model'"),
         (PPO, {"seed": 1}, "seed is set by --seed, not here"),
         (PPO, {"env": "CartPole-v1"}, "env is set by --env, not here"),
+        (PPO, {"noise_std": 0.1}, "noise_std needs noise_type: normal or ornstein-uhlenbeck"),
+        (TD3, {"action_noise": 0.1}, "action_noise is set by noise_type and noise_std, not here"),
         (PPO, {"gamma": 1.5}, "gamma must be between 0 and 1, not 1.5"),
         (PPO, {"gamma": "much"}, "gamma must be a number, not 'much'"),
         (PPO, {"gamma": True}, "gamma must be a number, not True"),
@@ -460,13 +510,14 @@ def test_a_wrong_argument_is_told(
     assert len(str(caught.value)) < 400
 
 
-@pytest.mark.parametrize("algorithm", [*ZOO_ALGORITHMS.values(), load_algorithm("qlearning")])
+@pytest.mark.parametrize("algorithm", [load_algorithm(name) for name in ALGORITHMS])
 def test_an_algorithms_own_defaults_pass(algorithm: type[BaseAlgorithm]) -> None:
     parameters = constructor_parameters(algorithm)
     defaults = {
         name: parameter.default
         for name, parameter in parameters.items()
-        if name not in {"policy", "env", "seed", "device", "verbose", "tensorboard_log"}
+        if name
+        not in {"policy", "env", "seed", "device", "verbose", "tensorboard_log", "action_noise"}
         and not name.startswith("_")
     }
     assert check_algorithm_kwargs(defaults, parameters, "here") == defaults
@@ -474,7 +525,7 @@ def test_an_algorithms_own_defaults_pass(algorithm: type[BaseAlgorithm]) -> None
 
 def test_every_range_is_that_of_some_known_name() -> None:
     known = set(Hyperparams.__dataclass_fields__)
-    for algorithm in (*ZOO_ALGORITHMS.values(), load_algorithm("qlearning")):
+    for algorithm in map(load_algorithm, ALGORITHMS):
         known |= constructor_parameters(algorithm).keys()
     assert RANGES.keys() <= known
 
