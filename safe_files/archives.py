@@ -12,6 +12,17 @@ from pathlib import Path
 from safe_files.errors import UnsafeFileError, shown
 from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_MEMBERS, MAX_TENSOR_RECORDS
 
+# What the library raises at zips that are damaged, encrypted, or of a kind that it does not know.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    OSError,
+    ValueError,
+    EOFError,
+    NotImplementedError,
+    RuntimeError,
+)
+
 
 def read_file(path: Path, limit: int = MAX_ARCHIVE_BYTES) -> bytes:
     """All of a regular file, read once: what is checked is what is used.
@@ -54,9 +65,9 @@ def read_members(content: bytes, expected: frozenset[str]) -> Mapping[str, bytes
             _check_sizes(infos)
             # A member that unpacks to more than it says fails its own check.
             return {name: archive.read(name) for name in names}
-    except (zipfile.BadZipFile, OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zlib.error) as error:
-        if isinstance(error, UnsafeFileError):
-            raise
+    except UnsafeFileError:
+        raise
+    except _DAMAGE as error:
         raise UnsafeFileError(f"is no whole zip: {error}") from error
 
 
@@ -71,7 +82,7 @@ def check_tensors(content: bytes) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
-    except (zipfile.BadZipFile, OSError, ValueError, EOFError, NotImplementedError) as error:
+    except _DAMAGE as error:
         raise UnsafeFileError(f"holds tensors that are no whole zip: {error}") from error
     if len(infos) > MAX_TENSOR_RECORDS:
         raise UnsafeFileError(f"holds more than {MAX_TENSOR_RECORDS:,} tensors")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 from stable_baselines3.common import buffers, torch_layers
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -21,7 +23,7 @@ def _by_name(classes: Iterable[type]) -> dict[str, type]:
     return {full_name(cls): cls for cls in classes}
 
 
-def _subclasses_in(module: object, base: type) -> Iterable[type]:
+def _subclasses_in(module: object, base: type) -> Iterable[Any]:
     return (cls for cls in vars(module).values() if isinstance(cls, type) and issubclass(cls, base))
 
 
@@ -45,6 +47,19 @@ def _contrib_classes() -> Mapping[str, type]:
         return {}
     found = (*_subclasses_in(maskable, buffers.BaseBuffer),)
     return _by_name((*found, *_subclasses_in(recurrent, buffers.BaseBuffer)))
+
+
+def all_policy_classes() -> Mapping[str, type]:
+    """The policies of all algorithms of Stable-Baselines3 and sb3-contrib, by their full names."""
+    import stable_baselines3 as sb3
+
+    libraries: list[object] = [sb3]
+    with contextlib.suppress(ImportError):
+        import sb3_contrib
+
+        libraries.append(sb3_contrib)
+    algorithms = (one for library in libraries for one in _subclasses_in(library, BaseAlgorithm))
+    return {name: cls for one in algorithms for name, cls in policy_classes(one).items()}
 
 
 def policy_classes(algorithm: type[BaseAlgorithm]) -> Mapping[str, type]:

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from safe_files.pickle_trees import Made
-from safe_files.rebuilding import Build, Maker, fields, wrong
+from safe_files.rebuilding import Build, Maker, fields
 
 # Beyond this no table or network has an input.
 _MAX_SIZE = 10_000_000
@@ -57,10 +57,7 @@ def _dict(state: Mapping[str, Any]) -> _Space:
 def _maker(make: Callable[[Mapping[str, Any]], _Space]) -> Maker:
     def maker(made: Made, build: Build) -> _Space:
         state = fields(made, build)
-        try:
-            space = make(state)
-        except (LookupError, TypeError, ValueError, AttributeError, AssertionError) as error:
-            raise wrong(made) from error
+        space = make(state)
         generator = state.get("_np_random")
         if isinstance(generator, np.random.Generator):
             # Whoever goes on with the model draws on from where it was.

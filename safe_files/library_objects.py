@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections import OrderedDict, deque
 from collections.abc import Mapping
 from typing import Any
@@ -18,9 +17,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
-from safe_files.archives import check_tensors
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, Maker, arguments, fields, wrong
+from safe_files.tensors import load_tensors
 
 _COMMON = "stable_baselines3.common"
 _NUMBERS = (int, float, np.number, np.ndarray)
@@ -98,6 +97,7 @@ def _vectorized_noise(made: Made, build: Build) -> VectorizedActionNoise:
     fits = isinstance(noises, list) and all(isinstance(noise, kinds) for noise in noises)
     if not fits or not isinstance(state.get("_base_noise"), kinds):
         raise wrong(made)
+    assert noises is not None
     vectorized = VectorizedActionNoise(state["_base_noise"], len(noises))
     vectorized.noises = noises
     return vectorized
@@ -111,19 +111,15 @@ def _device(made: Made, build: Build) -> th.device:
 
 def _storage(made: Made, build: Build) -> Any:
     (data,) = arguments(made, build, bytes)
-    check_tensors(data)
-    return th.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    return load_tensors(data)
 
 
 def _tensor(made: Made, build: Build) -> th.Tensor:
     storage, offset, size, stride, requires_grad = (build(arg) for arg in made.args[:5])
     if made.state is not None or len(made.args) > 7:
         raise wrong(made)
-    try:
-        flat = th.tensor([], dtype=storage.dtype).set_(storage.untyped())  # type: ignore[call-overload]
-        tensor: th.Tensor = flat.as_strided(size, stride, offset).clone()
-    except (AttributeError, TypeError, ValueError, RuntimeError) as error:
-        raise wrong(made) from error
+    flat = th.tensor([], dtype=storage.dtype).set_(storage._untyped_storage)
+    tensor: th.Tensor = flat.as_strided(size, stride, offset).clone()
     return tensor.requires_grad_(bool(requires_grad))
 
 

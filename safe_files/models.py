@@ -36,15 +36,17 @@ TENSORS = frozenset(
         "tensors",
     )
 )
+# What is trained and part of no network: the entropy coefficient of SAC and its kin.
+VARIABLES = frozenset({"log_ent_coef", "ent_coef_tensor"})
 MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
 
 # What the reader's own side decides.
-_NOT_READ = frozenset(
+NOT_READ = frozenset(
     {"env", "device", "policy", "rollout_buffer", "replay_buffer", "tensorboard_log"}
     | {"_logger", "_custom_logger", "_vec_normalize_env", "_episode_storage"}
 )
 # Made anew from the learning rate and the shares of exploration.
-_DERIVED = frozenset({"lr_schedule", "exploration_schedule"})
+DERIVED = frozenset({"lr_schedule", "exploration_schedule"})
 SERIALIZED = ":serialized:"
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
@@ -95,6 +97,7 @@ def load_model(
         raise UnsafeFileError("does not say its policy's class", "policy_class")
     tensors = {name: load_tensors(members[name]) for name in sorted(TENSORS & set(members))}
     check_values(tensors)
+    _check_variables(tensors)
     check_sizes({**settings.plain, **objects, **replaced}, tensors)
     checked = _zipped({**members, SETTINGS: _data(settings, objects)})
     return algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
@@ -110,7 +113,7 @@ def read_settings(members: Mapping[str, bytes], algorithm: type[BaseAlgorithm]) 
     plain: dict[str, Any] = {}
     pickled: dict[str, bytes] = {}
     for key, value in data.items():
-        if key in _NOT_READ or key in _DERIVED:
+        if key in NOT_READ or key in DERIVED:
             continue
         if not key.isidentifier() or key.startswith("__") or hasattr(algorithm, key):
             raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
@@ -171,6 +174,17 @@ def _objects(
         except UnsafeFileError as error:
             raise UnsafeFileError(f"{key} {error}", key) from error
     return objects
+
+
+def _check_variables(tensors: Mapping[str, Any]) -> None:
+    """The library sets each of these by the way to it: let there be no other than it writes."""
+    for name in ("pytorch_variables.pth", "tensors.pth"):
+        variables = tensors.get(name)
+        if not (variables is None or isinstance(variables, dict)):
+            raise UnsafeFileError(f"holds {name} that is not as the library writes it")
+        strange = sorted(map(str, set(variables or ()) - VARIABLES))
+        if strange:
+            raise UnsafeFileError(f"sets {shown(strange[0])}, which is no variable of a model")
 
 
 def _data(settings: Settings, objects: Mapping[str, Any]) -> bytes:

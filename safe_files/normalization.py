@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from gymnasium import spaces
@@ -57,7 +57,7 @@ def load_vec_normalize(path: Path | str, venv: VecEnv) -> VecNormalize:
     _check_fit(found, venv.observation_space)
     normalized = VecNormalize(venv, **found.settings)
     if found.obs_rms is not None:
-        normalized.obs_rms = found.obs_rms
+        normalized.obs_rms = cast(Any, found.obs_rms)
     normalized.ret_rms = found.ret_rms
     return normalized
 
@@ -114,7 +114,8 @@ def _check_fit(found: Normalization, space: spaces.Space[Any]) -> None:
         raise UnsafeFileError(f"holds statistics of {found.observation_space}, not of {space}")
     if found.obs_rms is None:
         return
-    parts = found.obs_rms if isinstance(found.obs_rms, dict) else {None: found.obs_rms}
+    rms = found.obs_rms
+    parts: dict[Any, Any] = dict(rms) if isinstance(rms, dict) else {None: rms}
     for key, statistics in parts.items():
         part = space[key] if isinstance(space, spaces.Dict) and key in space.spaces else space
         if np.shape(statistics.mean) != part.shape or np.shape(statistics.var) != part.shape:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,7 @@ def _array(data: Any, dtype: Any, shape: Any, order: Any) -> NDArray[Any]:
     if not fits:
         raise UnsafeFileError("holds an array that is not as NumPy writes it")
     count = math.prod(shape)
-    if dtype == object:
+    if dtype.hasobject:
         return _object_array(data, count, shape, order)
     if not isinstance(data, bytes) or len(data) != count * dtype.itemsize:
         raise UnsafeFileError("holds an array whose size does not match its data")
@@ -106,7 +106,7 @@ def _bit_generator(made: Made, build: Build) -> np.random.PCG64:
         raise wrong(made)
     generator = np.random.PCG64(seeds)
     if state is not None:
-        generator.state = state
+        generator.state = cast(Any, state)
     return generator
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from safe_files.errors import UnsafeFileError, shown
+from safe_files.errors import UnsafeFileError
 from safe_files.limits import MAX_INSTRUCTIONS, MAX_INTEGER_BITS
 
 
@@ -66,16 +66,15 @@ class Made:
     pairs: list[tuple[Any, Any]] = field(default_factory=list)
 
 
-Tree = (
-    None | bool | int | float | str | bytes | list[Any] | tuple[Any, ...] | Name | Mapped | Grouped | Made
-)
+Plain = None | bool | int | float | str | bytes
+Tree = Plain | list[Any] | tuple[Any, ...] | Name | Mapped | Grouped | Made
 
 
 def read_tree(pickled: bytes) -> Tree:
     """Read one pickle.
 
     Args:
-        pickled: a pickle of protocol 2 or later.
+        pickled: a pickle of protocol 4 or 5.
 
     Returns:
         What it says: numbers, texts and bytes as they are, lists and tuples of trees, and the
@@ -163,7 +162,9 @@ class _Machine:
 
     def refer(self) -> None:
         module, qualname = self.take(2)
-        self.push(_name(module, qualname))
+        if not (isinstance(module, str) and isinstance(qualname, str)):
+            raise UnsafeFileError("a pickle that refers to what is no name")
+        self.push(Name(module, qualname))
 
     def call(self) -> None:
         maker, args = self.take(2)
@@ -184,12 +185,6 @@ class _Machine:
             raise ValueError("a mark is left over")
 
 
-def _name(module: Any, qualname: Any) -> Name:
-    if not (isinstance(module, str) and isinstance(qualname, str)):
-        raise UnsafeFileError("a pickle that refers to what is no name")
-    return Name(module, qualname)
-
-
 _Instruction = Callable[[_Machine, Any], object]
 
 
@@ -197,8 +192,8 @@ def _each(names: str, instruction: _Instruction) -> dict[str, _Instruction]:
     return dict.fromkeys(names.split(), instruction)
 
 
-# What protocols 2 to 5 write. Left out are persistent ids, extension codes, buffers out of band,
-# keyword arguments, and what only older protocols have.
+# What protocols 4 and 5 write, which the library has used throughout its second version. Left out
+# are persistent ids, extension codes, buffers out of band, and keyword arguments.
 _INSTRUCTIONS: Mapping[str, _Instruction] = {
     **_each("PROTO FRAME", lambda m, arg: None),
     **_each("BININT BININT1 BININT2 LONG1 LONG4", _Machine.push_number),
@@ -224,9 +219,7 @@ _INSTRUCTIONS: Mapping[str, _Instruction] = {
     "SETITEM": lambda m, arg: m.set_items(m.take(2)),
     "SETITEMS": lambda m, arg: m.set_items(m.since_mark()),
     "MEMOIZE": lambda m, arg: m.memo.__setitem__(len(m.memo), m.stack[-1]),
-    **_each("BINPUT LONG_BINPUT", lambda m, arg: m.memo.__setitem__(arg, m.stack[-1])),
     **_each("BINGET LONG_BINGET", lambda m, arg: m.push(m.memo[arg])),
-    "GLOBAL": lambda m, arg: m.push(_name(*arg.split(" ", 1))),
     "STACK_GLOBAL": lambda m, arg: m.refer(),
     **_each("REDUCE NEWOBJ", lambda m, arg: m.call()),
     "BUILD": lambda m, arg: m.build(),

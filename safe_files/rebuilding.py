@@ -15,6 +15,7 @@ Maker = Callable[[Made, Build], Any]
 
 # What dictionaries may be keyed by: the hash of a nested tuple can take for ever.
 KEYS = (str, int, float, bytes, type(None))
+_REFUSED = "which may not stand in such a file"
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,13 @@ class _Rebuilding:
             case Made():
                 maker = self.admitted.makers.get(canonical(tree.maker))
                 if maker is None:
-                    raise UnsafeFileError(f"holds {_what(tree.maker)}, which may not stand in such a file")
-                return maker(tree, self.build)
+                    raise UnsafeFileError(f"holds {_what(tree.maker)}, {_REFUSED}")
+                try:
+                    return maker(tree, self.build)
+                except UnsafeFileError:
+                    raise
+                except Exception as error:  # the libraries' constructors can fail in any way
+                    raise wrong(tree) from error
         raise UnsafeFileError("holds what is no data")
 
     def _key(self, tree: Tree) -> Any:
@@ -109,21 +115,23 @@ class _Rebuilding:
     def _named(self, name: Name) -> type:
         found = self.admitted.classes.get(canonical(name))
         if found is None:
-            raise UnsafeFileError(f"refers to {_what(name)}, which may not stand in such a file")
+            raise UnsafeFileError(f"refers to {_what(name)}, {_REFUSED}")
         return found
 
 
-def canonical(name: Name) -> str:
+def canonical(name: Name | Made) -> str:
     """The full name, as the present versions of the libraries have it."""
     # NumPy 2 renamed its inner package.
     return str(name).replace("numpy.core.", "numpy._core.", 1)
 
 
-def _what(name: Name) -> str:
+def _what(name: Name | Made) -> str:
+    if isinstance(name, Made):
+        return "a call of what a call returns"
     return shown(str(name)).strip("'")
 
 
-# --- what makers are written with -------------------------------------------------------------------
+# --- what makers are written with ----------------------------------------------------------------
 
 
 def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
@@ -160,10 +168,9 @@ def chosen_fields(made: Made, build: Build, names: Iterable[str]) -> dict[str, A
     """
     pairs = made.state.pairs if isinstance(made.state, Mapped) else []
     trees = {key: value for key, value in pairs if isinstance(key, str)}
-    try:
-        return {name: build(trees[name]) for name in names}
-    except KeyError as error:
-        raise wrong(made) from error
+    if not trees.keys() >= set(names):
+        raise wrong(made)
+    return {name: build(trees[name]) for name in names}
 
 
 def wrong(made: Made) -> UnsafeFileError:

@@ -81,16 +81,10 @@ def _number(value: Any, made: Made) -> float:
 
 # Functions that made schedules, by module and qualified name: how what they enclosed makes one.
 _ENCLOSING: Mapping[tuple[str, str], Callable[..., _Schedule]] = {
-    (_UTILS, "constant_fn.<locals>.func"): lambda val: ConstantSchedule(val),
-    (_UTILS, "get_linear_fn.<locals>.func"): lambda start, end, end_fraction: LinearSchedule(
-        start, end, end_fraction
-    ),
-    (_UTILS, "get_schedule_fn.<locals>.<lambda>"): lambda value_schedule: FloatSchedule(
-        value_schedule
-    ),
-    ("rl_zoo3.utils", "linear_schedule.<locals>.func"): lambda initial_value: proportional(
-        initial_value
-    ),
+    (_UTILS, "constant_fn.<locals>.func"): ConstantSchedule,
+    (_UTILS, "get_linear_fn.<locals>.func"): LinearSchedule,
+    (_UTILS, "get_schedule_fn.<locals>.<lambda>"): FloatSchedule,
+    ("rl_zoo3.utils", "linear_schedule.<locals>.func"): proportional,
 }
 
 
@@ -104,10 +98,7 @@ def _function(made: Made, build: Build) -> _Schedule:
     for value in values.values():
         if not callable(value):
             _number(value, made)
-    try:
-        return make(**values)
-    except TypeError as error:
-        raise wrong(made) from error
+    return make(**values)
 
 
 def _enclosed(made: Made) -> tuple[str, str, dict[str, Any]]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator, Mapping
+from itertools import pairwise
 from typing import Any
 
 from gymnasium import spaces
@@ -22,6 +23,7 @@ from safe_files.tensors import tensors_in
 _BUFFER = ("buffer_size",)
 _ROLLOUT = ("n_steps", "n_envs")
 _FLAT_BYTES = 4
+_NETWORKS = "asks for networks that are out of proportion to its weights"
 
 
 def check_sizes(settings: Mapping[str, Any], tensors: Mapping[str, Any]) -> None:
@@ -51,11 +53,11 @@ def _check_networks(settings: Mapping[str, Any], n_weights: int, n_inputs: int) 
         raise UnsafeFileError("has spaces that are out of proportion to its weights")
     policy_kwargs = settings.get("policy_kwargs")
     numbers = list(_numbers(policy_kwargs, 0))
-    products = (a * b for a, b in zip(numbers, numbers[1:], strict=False))
+    products = (a * b for a, b in pairwise(numbers))
     if max(products, default=0) > largest or max(numbers, default=0) > largest:
-        raise UnsafeFileError("asks for networks that are out of proportion to its weights", "policy_kwargs")
+        raise UnsafeFileError(_NETWORKS, "policy_kwargs")
     if len(numbers) > MAX_WIDTH:
-        raise UnsafeFileError("asks for networks of too many layers", "policy_kwargs")
+        raise UnsafeFileError(_NETWORKS, "policy_kwargs")
 
 
 def _numbers(value: Any, depth: int) -> Iterator[int]:
@@ -74,7 +76,7 @@ def _check_buffers(settings: Mapping[str, Any], n_inputs: int) -> None:
     for names in (_BUFFER, _ROLLOUT):
         values = [settings.get(name, 1) for name in names]
         if not all(isinstance(value, int) and 0 < value <= MAX_ROWS for value in values):
-            raise UnsafeFileError(f"has a {' or '.join(names)} that is out of all proportion", names[0])
+            raise UnsafeFileError(f"has {' and '.join(names)} out of all proportion", names[0])
         size = math.prod(values) * n_inputs * _FLAT_BYTES
         if size > memory_bytes():
             raise UnsafeFileError(
