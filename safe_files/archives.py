@@ -77,9 +77,9 @@ def check_tensors(content: bytes) -> None:
     Raises:
         UnsafeFileError: if it unpacks to too much.
     """
-    if not zipfile.is_zipfile(io.BytesIO(content)):
-        return
     try:
+        if not zipfile.is_zipfile(io.BytesIO(content)):
+            return
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
     except _DAMAGE as error:

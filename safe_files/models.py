@@ -21,7 +21,7 @@ from safe_files.class_names import policy_classes
 from safe_files.errors import UnsafeFileError, shown
 from safe_files.limits import MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
 from safe_files.sizes import check_sizes
-from safe_files.tensors import check_values, load_tensors
+from safe_files.tensors import check_values, first_line, load_tensors
 
 SETTINGS = "data"
 TENSORS = frozenset(
@@ -100,7 +100,12 @@ def load_model(
     _check_variables(tensors)
     check_sizes({**settings.plain, **objects, **replaced}, tensors)
     checked = _zipped({**members, SETTINGS: _data(settings, objects)})
-    return algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+    try:
+        return algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+    except ValueError:
+        raise  # it does not fit the environment
+    except Exception as error:  # settings and weights that do not go together can fail anywhere
+        raise UnsafeFileError(f"holds no such model: {first_line(error)}") from error
 
 
 def read_settings(members: Mapping[str, bytes], algorithm: type[BaseAlgorithm]) -> Settings:

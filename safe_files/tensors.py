@@ -22,7 +22,7 @@ def load_tensors(content: bytes) -> Any:
     try:
         return th.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file can fail anywhere in the library
-        raise UnsafeFileError(f"holds tensors that cannot be read: {_first_line(error)}") from error
+        raise UnsafeFileError(f"holds tensors that cannot be read: {first_line(error)}") from error
 
 
 def check_values(files: Mapping[str, Any]) -> None:
@@ -57,6 +57,7 @@ def tensors_in(content: Any, path: str = "") -> Iterator[tuple[str, th.Tensor]]:
         yield from tensors_in(value, f"{path}.{key}" if path else str(key))
 
 
-def _first_line(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
+    """The message of a foreign exception, or its kind where it has none."""
     lines = str(error).strip().splitlines()
     return lines[0] if lines else type(error).__name__
