@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import io
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
-from pathlib import Path
 
 from safe_files.errors import UnsafeFileError, shown
 from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_MEMBERS, MAX_TENSOR_RECORDS
@@ -22,25 +20,6 @@ _DAMAGE = (
     NotImplementedError,
     RuntimeError,
 )
-
-
-def read_file(path: Path, limit: int = MAX_ARCHIVE_BYTES) -> bytes:
-    """All of a regular file, read once: what is checked is what is used.
-
-    Raises:
-        UnsafeFileError: if it is no regular file, or larger than ``limit`` bytes.
-        OSError: if it cannot be read.
-    """
-    if not path.is_file():
-        if not path.exists():
-            raise FileNotFoundError(2, "No such file or directory", str(path))
-        raise UnsafeFileError(f"{path} is no regular file")
-    with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        if size > limit:
-            raise UnsafeFileError(f"{path} is larger than {limit:,} bytes")
-        # It may grow meanwhile: what is read is no more than was there.
-        return file.read(size)
 
 
 def read_members(content: bytes, expected: frozenset[str]) -> Mapping[str, bytes]:

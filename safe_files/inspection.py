@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from safe_files.admission import read_pickle
-from safe_files.archives import read_file, read_members
+from safe_files.archives import read_members
 from safe_files.class_names import all_policy_classes
 from safe_files.errors import UnsafeFileError, shown
+from safe_files.limits import MAX_ARCHIVE_BYTES
 from safe_files.models import MEMBERS, NOT_READ, SERIALIZED, TENSORS, decoded, parse_settings
 from safe_files.pickle_trees import Grouped, Made, Mapped, Name, read_tree
+from safe_files.regular_files import read_file
 from safe_files.tensors import check_values, load_tensors, tensors_in
 
 
@@ -43,7 +45,7 @@ def inspect_model(path: Path | str) -> Report:
         UnsafeFileError: if it is no zip of a model at all.
         OSError: if it cannot be read.
     """
-    members = read_members(read_file(Path(path)), MEMBERS)
+    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS)
     settings: dict[str, str] = {}
     suspicious: list[str] = []
     for key, value in parse_settings(members).items():

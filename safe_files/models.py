@@ -16,10 +16,11 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from safe_files.admission import read_pickle
-from safe_files.archives import read_file, read_members
+from safe_files.archives import read_members
 from safe_files.class_names import policy_classes
 from safe_files.errors import UnsafeFileError, shown
-from safe_files.limits import MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
+from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
+from safe_files.regular_files import read_file
 from safe_files.sizes import check_sizes
 from safe_files.tensors import check_values, first_line, load_tensors
 
@@ -89,7 +90,7 @@ def load_model(
         OSError: if it cannot be read.
         ValueError: if the model does not fit ``env``, as the library says it.
     """
-    members = read_members(read_file(Path(path)), MEMBERS)
+    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS)
     settings = read_settings(members, algorithm)
     known = {**policy_classes(algorithm), **(classes or {})}
     objects = _objects(settings, known, replaced)
