@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import BinaryIO
 
 from safe_files.errors import UnsafeFileError
 
 
-def read_file(path: Path, limit: int) -> bytes:
-    """All of a regular file: what is checked is what is used.
+@contextmanager
+def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
+    """A regular file, open for reading: what is checked is what is used.
 
     Args:
         path: the file.
@@ -25,10 +29,15 @@ def read_file(path: Path, limit: int) -> bytes:
     # since another may lie there by then.
     _check(path.stat(), path, limit)
     with path.open("rb") as file:
-        status = os.fstat(file.fileno())
-        _check(status, path, limit)
+        _check(os.fstat(file.fileno()), path, limit)
+        yield file
+
+
+def read_file(path: Path, limit: int) -> bytes:
+    """All of a regular file; see `opened`."""
+    with opened(path, limit) as file:
         # It may grow meanwhile: what is read is no more than was there.
-        return file.read(status.st_size)
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
 def _check(status: os.stat_result, path: Path, limit: int) -> None:
