@@ -12,11 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.array_types import Bools
+from safe_files.errors import UnsafeFileError
+from safe_files.regular_files import read_file
 
 START = "S"
 GOAL = "G"
 # 4096 x 4096 cells: a Q-table of four actions then fills half a gigabyte.
 MAX_STATES = 2**24
+# A letter and maybe a line break for each cell.
+MAX_MAP_BYTES = 3 * MAX_STATES
 UNREACHED = -1
 
 Description = Sequence[str] | str | os.PathLike[str]
@@ -147,9 +151,11 @@ def _read_rows(desc: object) -> tuple[tuple[str, ...], str]:
 
 def _read_file(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")
+        return read_file(path, MAX_MAP_BYTES).decode("utf-8")
     except OSError as error:
-        reason = error.strerror
+        reason = str(error.strerror)
+    except UnsafeFileError as error:
+        raise ValueError(f"desc: {error}") from error
     except UnicodeDecodeError:
         reason = "it is not a text file"
     raise ValueError(f"desc: cannot read the map file {path}: {reason}")

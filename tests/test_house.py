@@ -18,6 +18,7 @@ from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = (
+    "safe_files",
     "mdp",
     "verdicts",
     "envs",

@@ -11,7 +11,17 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
-PACKAGES = ["mdp", "verdicts", "envs", "agents", "pipeline", "experiments", "report", "commands"]
+PACKAGES = [
+    "safe_files",
+    "mdp",
+    "verdicts",
+    "envs",
+    "agents",
+    "pipeline",
+    "experiments",
+    "report",
+    "commands",
+]
 
 # What each of them does on Windows.
 ELSEWHERE = {

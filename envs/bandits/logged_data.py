@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from io import TextIOWrapper
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,10 +22,17 @@ from numpy.typing import NDArray
 
 from envs.bandits.bandit import MAX_ARMS
 from mdp.array_types import Bools, Floats, Ints
+from safe_files.errors import UnsafeFileError
+from safe_files.regular_files import opened
 
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
 
-NUMBER = "a finite number"
+MAX_BYTES = 1 << 30
+# An arm's linear model of the context takes its square in numbers.
+MAX_COLUMNS = 1000
+# Squares of numbers beyond these no longer are numbers, nor are the weights of rarer pulls.
+MAX_NUMBER, MIN_PROPENSITY = 1e15, 1e-9
+NUMBER = "a finite number of no more than 1e15"
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,8 +133,8 @@ def read_log(path: str | Path) -> LoggedData:
 
     Raises:
         ValueError: if it cannot be read, a column is missing or there twice, a row is too short or
-            too long, an arm is not a whole number from 0, a number not finite, or a propensity not
-            above 0 and at most 1. The message names file and line.
+            too long, an arm is not a whole number from 0, a number not finite or beyond 1e15, or a
+            propensity not from 1e-9 to 1. The message names file and line.
     """
     table = _Table.read(Path(path))
     names = tuple(name for name in table.columns if name not in {ARM, REWARD, PROPENSITY})
@@ -142,8 +151,8 @@ def read_log(path: str | Path) -> LoggedData:
     arms = table.numbers(ARM, whole, lambda v: (v >= 0) & (v < MAX_ARMS) & (v == np.floor(v)))
     propensities = None
     if PROPENSITY in table.columns:
-        above = "a probability above 0 and at most 1"
-        propensities = table.numbers(PROPENSITY, above, lambda v: (v > 0) & (v <= 1))
+        above = f"a probability from {MIN_PROPENSITY} to 1"
+        propensities = table.numbers(PROPENSITY, above, lambda v: (v >= MIN_PROPENSITY) & (v <= 1))
     return LoggedData(
         source=str(path),
         context_names=names,
@@ -199,38 +208,53 @@ class _Table:
     def read(cls, path: Path) -> _Table:
         """Split a file into cells, and check that it has the columns it must have."""
         try:
-            with path.open(encoding="utf-8-sig", newline="") as file:
+            with opened(path, MAX_BYTES) as binary:
+                file = TextIOWrapper(binary, encoding="utf-8-sig", newline="")
                 reader = csv.reader(file, strict=True)
-                numbered = [(reader.line_num, row) for row in reader if row]
-        except (OSError, UnicodeDecodeError, csv.Error) as error:
+                numbered = ((reader.line_num, row) for row in reader if row)
+                return cls._of_rows(path, numbered)
+        except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
             raise ValueError(f"cannot read {path}: {reason}") from error
-        if len(numbered) < 2:
-            raise ValueError(f"{path} holds no pulls: a header and a row for each are needed")
-        header = [name.strip() for name in numbered[0][1]]
-        for name in (ARM, REWARD):
-            if name not in header:
-                raise ValueError(f"{path} has no column {name!r}, only {', '.join(header)}")
-        twice = next((name for name in header if header.count(name) > 1), None)
-        if twice is not None:
-            raise ValueError(f"{path} has two columns {twice!r}")
+
+    @classmethod
+    def _of_rows(cls, path: Path, numbered: Iterator[tuple[int, list[str]]]) -> _Table:
+        """The table of a header and the rows below it, each with its line."""
+        header = [name.strip() for _, row in islice(numbered, 1) for name in row]
+        _check_header(header, path)
+        lines: list[int] = []
+        columns: list[list[str]] = [[] for _ in header]
         for line, row in numbered:
             if len(row) != len(header):
                 raise ValueError(f"{path}, line {line} has {len(row)} values, not {len(header)}")
-        lines, rows = zip(*numbered[1:], strict=True)
-        columns = zip(*([cell.strip() for cell in row] for row in rows), strict=True)
-        return cls(path, list(lines), dict(zip(header, columns, strict=True)))
+            lines.append(line)
+            for column, cell in zip(columns, row, strict=True):
+                column.append(cell.strip())
+        if not lines:
+            raise ValueError(f"{path} holds no pulls: a header and a row for each are needed")
+        return cls(path, lines, dict(zip(header, map(tuple, columns), strict=True)))
 
     def numbers(
         self, name: str, wanted: str, valid: Callable[[Floats], Bools] = np.isfinite
     ) -> Floats:
-        """A column as numbers, all of them finite and valid."""
+        """A column as numbers, all of them of a size to reckon with and valid."""
         values = _as_floats(self.columns[name])
-        wrong = np.flatnonzero(~(np.isfinite(values) & valid(values)))
+        wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
         if len(wrong):
             line, value = self.lines[wrong[0]], self.columns[name][wrong[0]]
             raise ValueError(f"{self.path}, line {line}: {name} is {value!r}, it must be {wanted}")
         return values
+
+
+def _check_header(header: list[str], path: Path) -> None:
+    if len(header) > MAX_COLUMNS:
+        raise ValueError(f"{path} has {len(header):,} columns, more than {MAX_COLUMNS:,}")
+    for name in (ARM, REWARD) if header else ():
+        if name not in header:
+            raise ValueError(f"{path} has no column {name!r}, only {', '.join(header)}")
+    twice = next((name for name in header if header.count(name) > 1), None)
+    if twice is not None:
+        raise ValueError(f"{path} has two columns {twice!r}")
 
 
 def _as_floats(texts: Iterable[str]) -> Floats:

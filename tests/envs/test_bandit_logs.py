@@ -1,5 +1,6 @@
 """Logged pulls: reading, writing, and trying a policy on them by replay."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -153,13 +154,13 @@ def test_an_agent_with_contexts_on_a_log_with_none(write: Any) -> None:
         ("arm,reward\nA,1\n", ", line 2: arm is 'A', it must be a whole number from 0"),
         (
             "arm,reward,propensity\n0,1,0.5\n0,1,0\n",
-            ", line 3: propensity is '0', it must be a probability above 0 and at most 1",
+            ", line 3: propensity is '0', it must be a probability from 1e-09 to 1",
         ),
         ("arm,reward,propensity\n0,1,1.01\n", ", line 2: propensity is '1.01', it must be"),
         ("arm,reward,propensity\n0,1,-0.5\n", ", line 2: propensity is '-0.5', it must be"),
         (
             "arm,reward,x\n0,1,3\n0,1,core\n",
-            ", line 3: x is 'core', it must be a finite number: text can only be all of the",
+            ", line 3: x is 'core', it must be a finite number of no more than 1e15: text",
         ),
         ("arm,reward,x,y\n0,1,3,core\n", ", line 2: y is 'core', it must be a finite number"),
         ('arm,reward\n0,"1\n', "cannot read .*: unexpected end of data"),
@@ -177,13 +178,13 @@ def test_mistakes_in_a_log_are_named_with_their_line(write: Any, text: str, mess
     ("column", "accepted", "refused"),
     [
         ("arm", ["0", "1", "9999", "1e3", "2.0"], ["-1", "-0.5", "10000", "9999.5", "nan", "inf"]),
-        ("reward", ["0", "-1e308", "1e308", "5e-324"], ["nan", "inf", "-inf", "1e309"]),
+        ("reward", ["0", "-1e15", "1e15", "5e-324"], ["nan", "inf", "-inf", "1.1e15", "-1e308"]),
         (
             "propensity",
-            ["5e-324", "0.5", "0.9999999999999999", "1"],
-            ["0", "-5e-324", "-1", "1.0000000000000002", "2", "nan", "inf"],
+            ["1e-9", "0.5", "0.9999999999999999", "1"],
+            ["0", "9e-10", "1e-300", "-5e-324", "-1", "1.0000000000000002", "2", "nan", "inf"],
         ),
-        ("age", ["0", "-1e308", "1e308"], ["nan", "inf", "-inf"]),
+        ("age", ["0", "-1e15", "1e15"], ["nan", "inf", "-inf", "1.1e15"]),
     ],
 )
 def test_the_limits_of_each_column_from_both_sides(
@@ -239,7 +240,22 @@ def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
         read_log(tmp_path / "binary.csv")
 
 
-FINITE = st.floats(allow_nan=False, allow_infinity=False, width=64)
+def test_too_many_columns_are_refused_at_the_header(tmp_path: Path) -> None:
+    path = tmp_path / "wide.csv"
+    names = [f"x{i}" for i in range(5000)]
+    path.write_text(",".join(["arm", "reward", *names]) + "\n" + "not a row\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="has 5,002 columns, more than 1,000"):
+        read_log(path)
+
+
+def test_what_is_no_regular_file_is_not_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.csv")
+    for path in (tmp_path / "pipe.csv", Path("/dev/zero"), tmp_path):
+        with pytest.raises(ValueError, match="no regular file"):
+            read_log(path)
+
+
+FINITE = st.floats(-1e15, 1e15)
 
 
 @given(rows=st.lists(st.tuples(FINITE, FINITE, st.integers(0, 9), FINITE), min_size=1))

@@ -1,0 +1,21 @@
+"""The one error that refusing a file raises."""
+
+from __future__ import annotations
+
+
+class UnsafeFileError(ValueError):
+    """A file holds what may not stand in it, is damaged, or is too large: one line that says what.
+
+    Attributes:
+        key: the entry of a model file that is at fault, or None.
+    """
+
+    def __init__(self, message: str, key: str | None = None) -> None:
+        super().__init__(" ".join(message.split()))
+        self.key = key
+
+
+def shown(value: object) -> str:
+    """A name from a file as a message quotes it: short, and nothing in it that a terminal obeys."""
+    text = ascii(value)
+    return text if len(text) <= 80 else f"{text[:76]}...'"

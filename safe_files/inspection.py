@@ -1,0 +1,104 @@
+"""What a model file holds, and what in it is suspicious, said without making a model of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from safe_files.admission import read_pickle
+from safe_files.archives import read_members
+from safe_files.class_names import all_policy_classes
+from safe_files.errors import UnsafeFileError, shown
+from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.models import MEMBERS, NOT_READ, SERIALIZED, TENSORS, decoded, parse_settings
+from safe_files.pickle_trees import Grouped, Made, Mapped, Name, read_tree
+from safe_files.regular_files import read_file
+from safe_files.tensors import check_values, load_tensors, tensors_in
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a file holds.
+
+    Attributes:
+        sizes: bytes of each member of the zip.
+        weights: shapes of the tensors, by member and name.
+        settings: what each attribute is, as a text of one line.
+        suspicious: what should make a reader wary, each in one line; empty where nothing does.
+    """
+
+    sizes: dict[str, int]
+    weights: dict[str, tuple[int, ...]]
+    settings: dict[str, str]
+    suspicious: tuple[str, ...]
+
+
+def inspect_model(path: Path | str) -> Report:
+    """Look into a model's zip; nothing in it is run.
+
+    Args:
+        path: the zip.
+
+    Raises:
+        UnsafeFileError: if it is no zip of a model at all.
+        OSError: if it cannot be read.
+    """
+    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS)
+    settings: dict[str, str] = {}
+    suspicious: list[str] = []
+    for key, value in parse_settings(members).items():
+        settings[shown(key).strip("'")], doubts = _setting(key, value)
+        suspicious += doubts
+    weights: dict[str, tuple[int, ...]] = {}
+    for name in sorted(TENSORS & set(members)):
+        try:
+            tensors = load_tensors(members[name])
+            check_values({name: tensors})
+        except UnsafeFileError as error:
+            suspicious.append(f"{name} {error}")
+        else:
+            found = tensors_in(tensors, name.removesuffix(".pth"))
+            weights |= {where: tuple(tensor.shape) for where, tensor in found}
+    sizes = {name: len(content) for name, content in members.items()}
+    return Report(sizes, weights, settings, tuple(suspicious))
+
+
+def _setting(key: str, value: Any) -> tuple[str, list[str]]:
+    """An attribute in one line, and what is suspicious about it."""
+    doubts = [f"{key} is set, which models do not keep"] if key in NOT_READ and value else []
+    if not (isinstance(value, dict) and SERIALIZED in value):
+        return shown(value), doubts
+    try:
+        pickled = decoded(key, value[SERIALIZED])
+        names = sorted({shown(str(name)).strip("'") for name in names_in(read_tree(pickled))})
+        text = "a pickle of " + (", ".join(names) if names else "plain data")
+    except UnsafeFileError as error:
+        return "a pickle that cannot be read", [*doubts, f"{key} {error}"]
+    try:
+        read_pickle(pickled, all_policy_classes())
+    except UnsafeFileError as error:
+        doubts.append(f"{key} {error}")
+    return text, doubts
+
+
+def names_in(tree: Any) -> Iterator[Name]:
+    """The classes and functions that a tree refers to, each place that it does once."""
+    pending, seen = [tree], set()
+    while pending:
+        part = pending.pop()
+        if id(part) in seen:
+            continue
+        seen.add(id(part))
+        match part:
+            case Name():
+                yield part
+            case Made():
+                pending += [part.maker, part.args, part.state, part.items, part.pairs]
+            case Mapped():
+                pending.append(part.pairs)
+            case Grouped():
+                pending.append(part.items)
+            case list() | tuple():
+                pending.extend(part)

@@ -1,0 +1,207 @@
+"""Models of Stable-Baselines3 and sb3-contrib, loaded from files of unknown origin."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import io
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from safe_files.admission import read_pickle
+from safe_files.archives import read_members
+from safe_files.class_names import policy_classes
+from safe_files.errors import UnsafeFileError, shown
+from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
+from safe_files.regular_files import read_file
+from safe_files.sizes import check_sizes
+from safe_files.tensors import check_values, first_line, load_tensors
+
+SETTINGS = "data"
+TENSORS = frozenset(
+    f"{name}.pth"
+    for name in (
+        "policy",
+        "policy.optimizer",
+        "actor.optimizer",
+        "critic.optimizer",
+        "ent_coef_optimizer",
+        "pytorch_variables",
+        "tensors",
+    )
+)
+# What is trained and part of no network: the entropy coefficient of SAC and its kin.
+VARIABLES = frozenset({"log_ent_coef", "ent_coef_tensor"})
+MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
+
+# What the reader's own side decides.
+NOT_READ = frozenset(
+    {"env", "device", "policy", "rollout_buffer", "replay_buffer", "tensorboard_log"}
+    | {"_logger", "_custom_logger", "_vec_normalize_env", "_episode_storage"}
+)
+# Made anew from the learning rate and the shares of exploration.
+DERIVED = frozenset({"lr_schedule", "exploration_schedule"})
+SERIALIZED = ":serialized:"
+
+Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """A model's attributes.
+
+    Attributes:
+        plain: those that are plain data.
+        pickled: those that the library pickles, as pickles.
+    """
+
+    plain: Mapping[str, Any]
+    pickled: Mapping[str, bytes]
+
+
+def load_model(
+    algorithm: type[Algorithm],
+    path: Path | str,
+    env: Any = None,
+    *,
+    device: th.device | str = "auto",
+    classes: Mapping[str, type] | None = None,
+    **replaced: Any,
+) -> Algorithm:
+    """Load a model as ``algorithm.load`` does, without running anything that the file names.
+
+    Args:
+        algorithm: the class of the model, of Stable-Baselines3 or sb3-contrib.
+        path: the zip.
+        env: the environment to go on with, or None.
+        device: where the tensors go.
+        classes: classes of your own that the file may name, by their full names.
+        replaced: attributes to set instead of those in the file, which are not read then.
+
+    Raises:
+        UnsafeFileError: if the file holds what may not stand in it, is damaged, or too large.
+        OSError: if it cannot be read.
+        ValueError: if the model does not fit ``env``, as the library says it.
+    """
+    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS)
+    settings = read_settings(members, algorithm)
+    known = {**policy_classes(algorithm), **(classes or {})}
+    objects = _objects(settings, known, replaced)
+    if not isinstance(objects.get("policy_class"), type):
+        raise UnsafeFileError("does not say its policy's class", "policy_class")
+    tensors = {name: load_tensors(members[name]) for name in sorted(TENSORS & set(members))}
+    check_values(tensors)
+    _check_variables(tensors)
+    check_sizes({**settings.plain, **objects, **replaced}, tensors)
+    checked = _zipped({**members, SETTINGS: _data(settings, objects)})
+    try:
+        return algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+    except ValueError:
+        raise  # it does not fit the environment
+    except Exception as error:  # settings and weights that do not go together can fail anywhere
+        raise UnsafeFileError(f"holds no such model: {first_line(error)}") from error
+
+
+def read_settings(members: Mapping[str, bytes], algorithm: type[BaseAlgorithm]) -> Settings:
+    """The attributes in a zip, those left out that a reader decides.
+
+    Raises:
+        UnsafeFileError: if they are no attributes of such a model.
+    """
+    data = parse_settings(members)
+    plain: dict[str, Any] = {}
+    pickled: dict[str, bytes] = {}
+    for key, value in data.items():
+        if key in NOT_READ or key in DERIVED:
+            continue
+        if not key.isidentifier() or key.startswith("__") or hasattr(algorithm, key):
+            raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
+        if isinstance(value, dict) and SERIALIZED in value:
+            pickled[key] = decoded(key, value[SERIALIZED])
+        else:
+            plain[key] = value
+    return Settings(plain, pickled)
+
+
+def parse_settings(members: Mapping[str, bytes]) -> dict[str, Any]:
+    """The settings of a model as JSON.
+
+    Raises:
+        UnsafeFileError: if there are none, or they are no JSON, or too large.
+    """
+    if SETTINGS not in members:
+        raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
+    if len(members[SETTINGS]) > MAX_SETTINGS_BYTES:
+        raise UnsafeFileError(f"has more than {MAX_SETTINGS_BYTES:,} bytes of settings")
+    try:
+        data = json.loads(members[SETTINGS], parse_int=_integer)
+    except (ValueError, RecursionError) as error:
+        raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise UnsafeFileError("has settings that do not map names to values")
+    return data
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > MAX_INTEGER_BITS:
+        raise UnsafeFileError("holds an absurdly large number")
+    return int(digits)
+
+
+def decoded(key: str, text: Any) -> bytes:
+    """The pickle that stands in JSON as base64.
+
+    Raises:
+        UnsafeFileError: if it is none.
+    """
+    try:
+        return base64.b64decode(text, validate=True)
+    except (binascii.Error, TypeError, ValueError) as error:
+        raise UnsafeFileError(f"{key} is damaged: {error}", key) from error
+
+
+def _objects(
+    settings: Settings, classes: Mapping[str, type], replaced: Mapping[str, Any]
+) -> dict[str, Any]:
+    """What the pickled attributes stand for."""
+    objects: dict[str, Any] = {}
+    for key, pickled in settings.pickled.items():
+        if key in replaced:
+            continue
+        try:
+            objects[key] = read_pickle(pickled, classes)
+        except UnsafeFileError as error:
+            raise UnsafeFileError(f"{key} {error}", key) from error
+    return objects
+
+
+def _check_variables(tensors: Mapping[str, Any]) -> None:
+    """The library sets each of these by the way to it: let there be no other than it writes."""
+    for name in ("pytorch_variables.pth", "tensors.pth"):
+        variables = tensors.get(name)
+        if not (variables is None or isinstance(variables, dict)):
+            raise UnsafeFileError(f"holds {name} that is not as the library writes it")
+        strange = sorted(map(str, set(variables or ()) - VARIABLES))
+        if strange:
+            raise UnsafeFileError(f"sets {shown(strange[0])}, which is no variable of a model")
+
+
+def _data(settings: Settings, objects: Mapping[str, Any]) -> bytes:
+    # The library looks for the keys of its custom objects among those of the file.
+    return json.dumps({**settings.plain, **dict.fromkeys(objects)}).encode()
+
+
+def _zipped(members: Mapping[str, bytes]) -> io.BytesIO:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        for name, member in members.items():
+            archive.writestr(name, member)
+    content.seek(0)
+    return content

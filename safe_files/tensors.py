@@ -1,0 +1,63 @@
+"""Files of tensors: loaded as tensors alone, and held against what weights can be."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch as th
+
+from safe_files.archives import check_tensors
+from safe_files.errors import UnsafeFileError
+
+
+def load_tensors(content: bytes) -> Any:
+    """What a ``.pth`` file holds: tensors in dictionaries and lists.
+
+    Raises:
+        UnsafeFileError: if it holds anything else, is damaged, or unpacks to too much.
+    """
+    check_tensors(content)
+    try:
+        return th.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file can fail anywhere in the library
+        raise UnsafeFileError(f"holds tensors that cannot be read: {first_line(error)}") from error
+
+
+def check_values(files: Mapping[str, Any]) -> None:
+    """Make sure that all tensors are finite numbers.
+
+    Args:
+        files: what files of tensors hold, by their names.
+
+    Raises:
+        UnsafeFileError: if one is not; it names the tensor.
+    """
+    for name, content in files.items():
+        for path, tensor in tensors_in(content):
+            where = f"{name}: {path}"
+            if tensor.is_complex() or tensor.is_quantized or tensor.layout != th.strided:
+                raise UnsafeFileError(f"{where} is not made of real numbers")
+            if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
+                raise UnsafeFileError(f"{where} holds numbers that are not finite")
+
+
+def tensors_in(content: Any, path: str = "") -> Iterator[tuple[str, th.Tensor]]:
+    """The tensors in nested dictionaries and lists, each with the way to it."""
+    if isinstance(content, th.Tensor):
+        yield path, content
+        return
+    items: Any = ()
+    if isinstance(content, dict):
+        items = content.items()
+    elif isinstance(content, list | tuple):
+        items = enumerate(content)
+    for key, value in items:
+        yield from tensors_in(value, f"{path}.{key}" if path else str(key))
+
+
+def first_line(error: BaseException) -> str:
+    """The message of a foreign exception, or its kind where it has none."""
+    lines = str(error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__

@@ -1,0 +1,243 @@
+"""Pickles and zips that would run code, hide methods, or fill the memory: all are refused."""
+
+import base64
+import io
+import json
+import os
+import pickle
+import tracemalloc
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.utils import ConstantSchedule
+
+from safe_files import UnsafeFileError, load_model
+from safe_files.admission import read_pickle
+
+UTILS = "stable_baselines3.common.utils"
+START = b"\x80\x04"
+
+
+def text(value):
+    return b"\x8c" + bytes([len(value)]) + value.encode()
+
+
+def name(module, qualname):
+    return text(module) + text(qualname) + b"\x93"
+
+
+def shared_tuples(depth):
+    """A tuple of a tuple of ... that has 2**depth leaves, and takes as many bytes as layers."""
+    layers = b"N\x940" + b"".join(b"h%ch%c\x86\x940" % (i, i) for i in range(depth))
+    return layers, b"h%c" % depth
+
+
+LAYERS, TOP = shared_tuples(40)
+ATTACKS = {
+    "a call of the system": START + name("os", "system") + text("true") + b"\x85R.",
+    "the same in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
+    "getattr": START + name("builtins", "getattr") + b".",
+    "a partial": START + name("functools", "partial") + name("os", "system") + b"\x85R.",
+    "a tensor's loader": START + name("torch.storage", "_load_from_bytes") + b"C\x01x\x85R.",
+    "a way through attributes": START + name(UTILS, "FloatSchedule.__init__.__globals__") + b".",
+    "the state of a class, by slots": START
+    + name(UTILS, "ConstantSchedule")
+    + b"N}"
+    + text("__call__")
+    + name("collections", "deque")
+    + b"s\x86b.",
+    "the state of a class": START
+    + name(UTILS, "ConstantSchedule")
+    + b"}"
+    + text("x")
+    + b"K\x01sb.",
+    "an object that is called": START + name(UTILS, "ConstantSchedule") + b")R)R.",
+    "an attribute that is no setting": START
+    + name(UTILS, "ConstantSchedule")
+    + b")\x81}"
+    + text("__class__")
+    + b"K\x01sb.",
+    "a schedule that is a class": START
+    + name(UTILS, "FloatSchedule")
+    + b")\x81}"
+    + text("value_schedule")
+    + name("torch.nn.modules.activation", "ReLU")
+    + b"sb.",
+    "a class that is called": START + name("torch.nn.modules.activation", "ReLU") + b")R.",
+    "lists in lists": START + b"]" * 5000 + b"a" * 4999 + b".",
+    "a huge index of the memo": START + b"Nr\xff\xff\xff\x0f0h\x01.",
+    "an array of gigabytes": START
+    + name("numpy._core.multiarray", "_reconstruct")
+    + name("numpy", "ndarray")
+    + b"J\xff\xff\xff\x7f\x85C\x01b\x87R.",
+    "an array of objects": pickle.dumps(np.array([print], dtype=object)),
+    "an array of texts": pickle.dumps(np.array(["a"])),
+    "a key whose hash takes for ever": START + LAYERS + b"}" + TOP + b"K\x01s.",
+    "a value that is huge once it is written out": START + LAYERS + TOP + b".",
+    "a whole number of thousands of digits": pickle.dumps(10**5000),
+    "a length that is not there": START + b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
+    "an infinite schedule": pickle.dumps(ConstantSchedule(float("inf"))),
+}
+
+
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_attacks_by_pickle_are_refused(attack):
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnsafeFileError):
+            read_pickle(ATTACKS[attack])
+        assert tracemalloc.get_traced_memory()[1] < 50e6
+    finally:
+        tracemalloc.stop()
+    assert ConstantSchedule(0.5)(1.0) == 0.5
+
+
+@pytest.fixture(scope="module")
+def genuine(tmp_path_factory):
+    """The members of a genuine zip."""
+    path = tmp_path_factory.mktemp("genuine") / "model.zip"
+    PPO("MlpPolicy", "CartPole-v1", policy_kwargs={"net_arch": [4]}, device="cpu").save(path)
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def write(path, members):
+    with zipfile.ZipFile(path, "w") as archive:
+        for member, content in members.items():
+            archive.writestr(member, content)
+    return path
+
+
+def with_settings(genuine, **changes):
+    return {**genuine, "data": json.dumps({**json.loads(genuine["data"]), **changes}).encode()}
+
+
+def pickled(value):
+    return {":type:": "x", ":serialized:": base64.b64encode(pickle.dumps(value)).decode()}
+
+
+class Attack:
+    """Leaves a mark where it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = str(mark)
+
+    def __reduce__(self):
+        return os.mkdir, (self.mark,)
+
+
+def test_a_genuine_zip_is_loaded(genuine, tmp_path):
+    assert isinstance(load_model(PPO, write(tmp_path / "model.zip", genuine)), PPO)
+
+
+@pytest.mark.parametrize(
+    "key", ["policy_class", "invented", "learning_rate", "clip_range", "algorithm"]
+)
+def test_no_pickle_in_the_settings_is_run(genuine, tmp_path, key):
+    mark = tmp_path / "mark"
+    changed = with_settings(genuine, **{key: pickled(Attack(mark))})
+    with pytest.raises(UnsafeFileError, match=key) as refusal:
+        load_model(PPO, write(tmp_path / "model.zip", changed))
+    assert refusal.value.key == key
+    assert not mark.exists()
+
+
+@pytest.mark.parametrize("key", ["env", "_logger", "device", "_vec_normalize_env", "lr_schedule"])
+def test_what_the_reader_decides_is_not_even_read(genuine, tmp_path, key):
+    mark = tmp_path / "mark"
+    path = write(tmp_path / "model.zip", with_settings(genuine, **{key: pickled(Attack(mark))}))
+    assert isinstance(load_model(PPO, path), PPO)
+    assert not mark.exists()
+
+
+def test_an_environment_id_in_the_settings_imports_nothing(genuine, tmp_path):
+    changed = with_settings(genuine, env="this:Zen-v0", tensorboard_log=str(tmp_path / "log"))
+    model = load_model(PPO, write(tmp_path / "model.zip", changed))
+    assert model.env is None
+    assert model.tensorboard_log is None
+
+
+@pytest.mark.parametrize("key", ["predict", "learn", "policy_aliases", "__class__", "not a name"])
+def test_attributes_that_would_hide_a_method_are_refused(genuine, tmp_path, key):
+    with pytest.raises(UnsafeFileError, match="no attribute of a model"):
+        load_model(PPO, write(tmp_path / "model.zip", with_settings(genuine, **{key: 1})))
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("policy_kwargs", {"net_arch": [10**6, 10**6]}),
+        ("policy_kwargs", {"net_arch": {"pi": [10**9], "vf": [4]}}),
+        ("n_steps", 10**15),
+        ("n_steps", -1),
+        ("n_steps", "many"),
+        ("n_envs", 10**9),
+    ],
+)
+def test_settings_out_of_proportion_are_refused(genuine, tmp_path, key, value):
+    path = write(tmp_path / "model.zip", with_settings(genuine, **{key: value}))
+    with pytest.raises(UnsafeFileError) as refusal:
+        load_model(PPO, path)
+    assert refusal.value.key in {key, "n_steps"}
+
+
+def tensors(content):
+    file = io.BytesIO()
+    th.save(content, file)
+    return file.getvalue()
+
+
+def test_weights_that_are_not_finite_are_refused(genuine, tmp_path):
+    weights = th.load(io.BytesIO(genuine["policy.pth"]), weights_only=True)
+    weights["action_net.bias"][0] = th.nan
+    path = write(tmp_path / "model.zip", {**genuine, "policy.pth": tensors(weights)})
+    with pytest.raises(UnsafeFileError, match=r"policy\.pth: action_net\.bias"):
+        load_model(PPO, path)
+
+
+def test_a_pickle_among_the_tensors_is_not_run(genuine, tmp_path):
+    mark = tmp_path / "mark"
+    path = write(tmp_path / "model.zip", {**genuine, "policy.pth": tensors(Attack(mark))})
+    with pytest.raises(UnsafeFileError, match="cannot be read"):
+        load_model(PPO, path)
+    assert not mark.exists()
+
+
+def test_tensors_that_were_deflated_are_refused(genuine, tmp_path):
+    inner = io.BytesIO()
+    with zipfile.ZipFile(inner, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("archive/data/0", bytes(10**6))
+    path = write(tmp_path / "model.zip", {**genuine, "policy.pth": inner.getvalue()})
+    with pytest.raises(UnsafeFileError, match="compressed"):
+        load_model(PPO, path)
+
+
+@pytest.mark.parametrize("member", ["extra.py", "../escaped.pth", "/etc/passwd", "predict.pth"])
+def test_members_that_no_model_has_are_refused(genuine, tmp_path, member):
+    path = write(tmp_path / "model.zip", {**genuine, member: b""})
+    with pytest.raises(UnsafeFileError, match="which no model file has"):
+        load_model(PPO, path)
+
+
+def test_variables_of_other_names_than_the_algorithms_are_refused(genuine, tmp_path):
+    changed = {**genuine, "pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})}
+    with pytest.raises(UnsafeFileError, match=r"policy\.predict"):
+        load_model(PPO, write(tmp_path / "model.zip", changed))
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path):
+    os.mkfifo(tmp_path / "model.zip")
+    for path in (tmp_path / "model.zip", Path("/dev/zero"), tmp_path):
+        with pytest.raises(UnsafeFileError, match="no regular file"):
+            load_model(PPO, path)
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"[" * 100_000, b"{}"])
+def test_settings_that_are_none_are_refused(genuine, tmp_path, content):
+    path = write(tmp_path / "model.zip", {**genuine, "data": content})
+    with pytest.raises(UnsafeFileError):
+        load_model(PPO, path)

@@ -1,0 +1,258 @@
+"""Genuine files of every algorithm: loaded without unpickling, they are what the library loads.
+
+The files are made here by the plain library. From both models training goes on, and ends in the
+same weights, to the last bit.
+"""
+
+import random
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import sb3_contrib as contrib
+import stable_baselines3 as sb3
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from torch import nn, optim
+
+from safe_files import (
+    UnsafeFileError,
+    inspect_model,
+    load_model,
+    load_replay_buffer,
+    load_vec_normalize,
+)
+
+OLD_MODELS = Path(__file__).parent / "old_models"
+
+
+class Masked(gym.Env):
+    """Four actions, of which one is never allowed."""
+
+    observation_space = spaces.Discrete(4)
+    action_space = spaces.Discrete(4)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return 0, {}
+
+    def step(self, action):
+        self.steps += 1
+        return self.steps % 4, float(action == self.steps % 4), False, self.steps == 10, {}
+
+    def action_masks(self):
+        return np.arange(4) != (self.steps + 1) % 4
+
+
+def bits():
+    return BitFlippingEnv(n_bits=3, max_steps=3)
+
+
+TINY = {"net_arch": [4]}
+FEW = {"learning_starts": 10, "buffer_size": 200, "batch_size": 8}
+ROLLOUT = {"n_steps": 32, "batch_size": 16}
+NOISE = np.zeros(1), np.full(1, 0.1)
+
+# Algorithm, policy, environment, environments at once, what is around them, arguments.
+CASES = {
+    "ppo": (sb3.PPO, "MlpPolicy", "CartPole-v1", 2, None, ROLLOUT),
+    "ppo with schedules, normalised": (
+        sb3.PPO,
+        "MlpPolicy",
+        "CartPole-v1",
+        1,
+        "normalize",
+        {
+            **ROLLOUT,
+            "learning_rate": LinearSchedule(1e-3, 0.0, 1.0),
+            "clip_range": LinearSchedule(0.2, 0.1, 0.5),
+            "clip_range_vf": 0.2,
+            "policy_kwargs": {
+                "net_arch": {"pi": [4], "vf": [4]},
+                "activation_fn": nn.ReLU,
+                "optimizer_class": optim.AdamW,
+                "optimizer_kwargs": {"weight_decay": 0.01},
+            },
+        },
+    ),
+    "ppo with sde": (sb3.PPO, "MlpPolicy", "Pendulum-v1", 1, None, {**ROLLOUT, "use_sde": True}),
+    "ppo on dictionaries": (sb3.PPO, "MultiInputPolicy", bits, 1, None, ROLLOUT),
+    "a2c on stacked frames": (
+        sb3.A2C,
+        "MlpPolicy",
+        "CartPole-v1",
+        1,
+        "stack",
+        {"policy_kwargs": {"optimizer_class": RMSpropTFLike, "net_arch": [4]}},
+    ),
+    "dqn": (sb3.DQN, "MlpPolicy", "CartPole-v1", 1, None, FEW),
+    "dqn of several steps": (
+        sb3.DQN,
+        "MlpPolicy",
+        "FrozenLake-v1",
+        1,
+        None,
+        {**FEW, "n_steps": 3, "train_freq": (1, "episode")},
+    ),
+    "dqn with hindsight": (
+        sb3.DQN,
+        "MultiInputPolicy",
+        bits,
+        1,
+        None,
+        {
+            **FEW,
+            "replay_buffer_class": sb3.HerReplayBuffer,
+            "replay_buffer_kwargs": {"n_sampled_goal": 2, "goal_selection_strategy": "future"},
+        },
+    ),
+    "sac with sde and noise": (
+        sb3.SAC,
+        "MlpPolicy",
+        "Pendulum-v1",
+        1,
+        None,
+        {**FEW, "use_sde": True, "action_noise": OrnsteinUhlenbeckActionNoise(*NOISE)},
+    ),
+    "td3 with noise": (
+        sb3.TD3,
+        "MlpPolicy",
+        "Pendulum-v1",
+        2,
+        None,
+        {**FEW, "action_noise": NormalActionNoise(*NOISE)},
+    ),
+    "ddpg": (sb3.DDPG, "MlpPolicy", "Pendulum-v1", 1, None, FEW),
+    "qrdqn": (contrib.QRDQN, "MlpPolicy", "CartPole-v1", 1, None, FEW),
+    "tqc": (contrib.TQC, "MlpPolicy", "Pendulum-v1", 1, None, FEW),
+    "crossq": (contrib.CrossQ, "MlpPolicy", "Pendulum-v1", 1, None, FEW),
+    "trpo": (contrib.TRPO, "MlpPolicy", "CartPole-v1", 1, None, ROLLOUT),
+    "ars": (contrib.ARS, "LinearPolicy", "Pendulum-v1", 1, None, {"n_delta": 1}),
+    "ppo_lstm": (contrib.RecurrentPPO, "MlpLstmPolicy", "CartPole-v1", 1, None, ROLLOUT),
+    "ppo_mask": (contrib.MaskablePPO, "MlpPolicy", Masked, 1, None, ROLLOUT),
+}
+
+
+def make_env(case):
+    _, _, env_id, n_envs, around, _ = CASES[case]
+    env = make_vec_env(env_id, n_envs)
+    if around == "normalize":
+        return VecNormalize(env)
+    return VecFrameStack(env, 2) if around == "stack" else env
+
+
+def make_model(case):
+    algorithm, policy, *_, kwargs = CASES[case]
+    # A copy: the library adds to it.
+    policy_kwargs = dict(TINY) if policy == "MlpPolicy" else {}
+    if algorithm is contrib.RecurrentPPO:
+        policy_kwargs = {"lstm_hidden_size": 4, "net_arch": [4]}
+    kwargs = {"policy_kwargs": policy_kwargs, **kwargs}
+    return algorithm(policy, make_env(case), device="cpu", **kwargs)
+
+
+def reseed():
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002  # the library's noise and buffers draw from it
+    th.manual_seed(0)
+
+
+def weights(model):
+    return th.cat([part.flatten().double() for part in model.policy.state_dict().values()])
+
+
+def go_on(case, folder, load, load_buffer, load_statistics):
+    """Load, seed and train; the model and what it had been at first."""
+    env = make_env(case)
+    if CASES[case][4] == "normalize":
+        env = load_statistics(str(folder / "statistics.pkl"), env.venv)
+    env.seed(1)
+    model = load(CASES[case][0], folder / "model.zip", env)
+    if (folder / "buffer.pkl").exists():
+        load_buffer(model, folder / "buffer.pkl")
+    kinds = {name: type(value) for name, value in vars(model).items()}
+    before = weights(model)
+    reseed()
+    model.learn(60, reset_num_timesteps=False)
+    return model, kinds, before
+
+
+# What the library says when it loads such models, by its own function too.
+@pytest.mark.filterwarnings("ignore:`n_steps=3` is ignored:UserWarning")
+@pytest.mark.filterwarnings("ignore:The last trajectory in the replay buffer:UserWarning")
+@pytest.mark.parametrize("case", CASES)
+def test_a_genuine_model_goes_on_as_the_library_would(case, tmp_path):
+    reseed()
+    model = make_model(case)
+    model.learn(60)
+    model.save(tmp_path / "model")
+    if CASES[case][4] == "normalize":
+        model.get_vec_normalize_env().save(str(tmp_path / "statistics.pkl"))
+    if isinstance(model, sb3.common.off_policy_algorithm.OffPolicyAlgorithm):
+        model.save_replay_buffer(tmp_path / "buffer.pkl")
+
+    library, its_kinds, its_weights = go_on(
+        case,
+        tmp_path,
+        lambda algorithm, path, env: algorithm.load(path, env),
+        lambda model, path: model.load_replay_buffer(path),
+        VecNormalize.load,
+    )
+    ours, our_kinds, our_weights = go_on(
+        case, tmp_path, load_model, load_replay_buffer, load_vec_normalize
+    )
+    assert our_kinds == its_kinds
+    assert th.equal(our_weights, its_weights)
+    assert th.equal(our_weights, weights(model))
+    assert th.equal(weights(ours), weights(library))
+    assert not th.equal(weights(ours), our_weights)
+    assert ours.num_timesteps == library.num_timesteps
+    assert inspect_model(tmp_path / "model.zip").suspicious == ()
+
+
+@pytest.mark.filterwarnings("ignore:You are probably loading a DQN model saved with:UserWarning")
+@pytest.mark.parametrize("path", sorted(OLD_MODELS.iterdir()), ids=lambda path: path.stem)
+def test_models_of_older_versions_have_the_schedules_that_they_had(path):
+    """Made by versions 2.0 and later of the library, whose schedules were functions with code."""
+    algorithm = sb3.DQN if path.name.startswith("dqn") else sb3.PPO
+    library, ours = algorithm.load(path), load_model(algorithm, path)
+    assert th.equal(weights(ours), weights(library))
+    names = ("lr_schedule", "clip_range", "exploration_schedule")
+    found = [name for name in names if hasattr(library, name)]
+    assert len(found) == 2
+    for name in found:
+        for progress in np.linspace(0, 1, 11):
+            assert getattr(ours, name)(progress) == getattr(library, name)(progress)
+    assert inspect_model(path).suspicious == ()
+
+
+def test_a_schedule_of_ones_own_is_refused_and_can_be_replaced(tmp_path):
+    schedule = lambda progress: 1e-3 * progress  # noqa: E731
+    model = sb3.PPO("MlpPolicy", "CartPole-v1", learning_rate=schedule, device="cpu")
+    model.save(tmp_path / "model")
+    with pytest.raises(UnsafeFileError, match="function with its code") as refusal:
+        load_model(sb3.PPO, tmp_path / "model.zip")
+    assert refusal.value.key == "learning_rate"
+    ours = load_model(sb3.PPO, tmp_path / "model.zip", learning_rate=2e-3)
+    assert ours.lr_schedule(0.5) == 2e-3
+    assert th.equal(weights(ours), weights(model))
+
+
+class OwnPolicy(sb3.ppo.MlpPolicy):
+    """A policy that the library does not know."""
+
+
+def test_a_policy_of_ones_own_is_admitted_by_name_alone(tmp_path):
+    sb3.PPO(OwnPolicy, "CartPole-v1", device="cpu").save(tmp_path / "model")
+    with pytest.raises(UnsafeFileError, match="OwnPolicy"):
+        load_model(sb3.PPO, tmp_path / "model.zip")
+    own = {f"{OwnPolicy.__module__}.OwnPolicy": OwnPolicy}
+    assert isinstance(load_model(sb3.PPO, tmp_path / "model.zip", classes=own).policy, OwnPolicy)

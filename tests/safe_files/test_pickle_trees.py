@@ -1,0 +1,100 @@
+"""Pickles as data: the tree is what Python's own unpickler makes, where that is harmless."""
+
+import contextlib
+import pickle
+import pickletools
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from safe_files.admission import read_pickle
+from safe_files.errors import UnsafeFileError
+from safe_files.pickle_trees import Made, Name, read_tree
+
+KEYS = st.text(max_size=5) | st.integers(-(2**60), 2**60) | st.binary(max_size=5) | st.none()
+VALUES = st.recursive(
+    KEYS | st.booleans() | st.floats(allow_nan=False),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.lists(inner, max_size=4).map(tuple)
+        | st.dictionaries(KEYS, inner, max_size=4)
+        | st.sets(KEYS, max_size=4)
+    ),
+    max_leaves=20,
+)
+
+
+@given(VALUES, st.integers(4, 5))
+def test_plain_data_comes_out_as_it_went_in(value, protocol):
+    assert read_pickle(pickle.dumps(value, protocol)) == value
+
+
+@given(VALUES, st.data())
+def test_cut_off_pickles_are_refused(value, data):
+    whole = pickle.dumps(value)
+    length = data.draw(st.integers(0, len(whole) - 1))
+    with pytest.raises(UnsafeFileError):
+        read_pickle(whole[:length])
+
+
+@given(st.binary(max_size=40))
+def test_any_bytes_are_data_or_refused(content):
+    with contextlib.suppress(UnsafeFileError):
+        read_pickle(content)
+
+
+def test_calls_and_names_are_written_down_and_not_made():
+    class Loud:
+        def __reduce__(self):
+            return print, ("called",)
+
+    tree = read_tree(pickle.dumps([Loud(), int]))
+    call, name = tree
+    assert isinstance(call, Made)
+    assert call.maker == Name("builtins", "print")
+    assert call.args == ("called",)
+    assert name == Name("builtins", "int")
+
+
+def test_nothing_is_printed_when_it_is_rebuilt_either(capsys):
+    class Loud:
+        def __reduce__(self):
+            return print, ("called",)
+
+    with pytest.raises(UnsafeFileError, match=r"builtins\.print"):
+        read_pickle(pickle.dumps(Loud()))
+    assert capsys.readouterr().out == ""
+
+
+def test_shared_parts_stay_shared():
+    part = [1]
+    first, second = read_pickle(pickle.dumps([part, part]))
+    assert first is second
+
+
+def test_what_refers_to_itself_is_refused():
+    value = []
+    value.append(value)
+    with pytest.raises(UnsafeFileError, match="refers to itself"):
+        read_pickle(pickle.dumps(value))
+
+
+@pytest.mark.parametrize(
+    ("opcode", "argument"),
+    [
+        ("INST", b"os\nsystem\n"),
+        ("GLOBAL", b"os\nsystem\n"),
+        ("STRING", b"'x'\n"),
+        ("PERSID", b"x\n"),
+        ("EXT1", b"\x01"),
+        ("OBJ", b""),
+        ("NEWOBJ_EX", b""),
+        ("NEXT_BUFFER", b""),
+        ("DUP", b""),
+    ],
+)
+def test_instructions_that_no_model_needs_are_refused(opcode, argument):
+    code = next(o.code for o in pickletools.opcodes if o.name == opcode).encode("latin1")
+    with pytest.raises(UnsafeFileError, match=opcode):
+        read_tree(b"\x80\x04" + code + argument + b".")
