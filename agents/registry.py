@@ -32,7 +32,6 @@ class AlgorithmEntry:
         actions: names of the Gymnasium spaces that it can act in.
         observation_shape: the one observation shape that it understands, or None for any.
         for_bandits: whether it looks no further than the next reward.
-        has_memory: whether it acts by what it saw before, not by the observation alone.
         needs_masks: whether the environment must say which actions are valid (``action_masks()``).
         package: the import name of an optional package that it needs, or None.
         extra: the extra of this distribution that installs that package.
@@ -44,7 +43,6 @@ class AlgorithmEntry:
     actions: tuple[str, ...]
     observation_shape: tuple[int, ...] | None = None
     for_bandits: bool = False
-    has_memory: bool = False
     needs_masks: bool = False
     package: str | None = None
     extra: str | None = None
@@ -111,7 +109,6 @@ def _contrib(
     actions: tuple[str, ...],
     observations: tuple[str, ...] = NETWORK_INPUTS,
     *,
-    has_memory: bool = False,
     needs_masks: bool = False,
 ) -> AlgorithmEntry:
     return AlgorithmEntry(
@@ -119,7 +116,6 @@ def _contrib(
         f"{summary} (sb3-contrib)",
         observations,
         actions,
-        has_memory=has_memory,
         needs_masks=needs_masks,
         package="sb3_contrib",
         extra="contrib",
@@ -200,7 +196,6 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         # As it is in sb3-contrib 2.9, which fails on the other spaces.
         ("Box", "Discrete", "MultiDiscrete"),
         ("Box", "Discrete", "MultiBinary", "Dict"),
-        has_memory=True,
     ),
     "ppo_mask": _contrib(
         "sb3_contrib:MaskablePPO",

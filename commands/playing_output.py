@@ -136,6 +136,10 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
     evaluator = exact_evaluator(spec)
     if evaluator is None:
         return
+    obstacle = evaluator.obstacle(model)
+    if obstacle:
+        console.print(f"[dim]sampled, not exact: {spec.algo}: {obstacle}[/]")
+        return
     try:
         evaluation = evaluator(model, deterministic)
     except (TypeError, ValueError):
