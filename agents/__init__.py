@@ -4,10 +4,10 @@ Importing this package loads neither torch nor Stable-Baselines3: names can be l
 compared, before anything heavy is paid for.
 """
 
+from agents.algorithm_entries import AlgorithmEntry
 from agents.old_names import install
 from agents.registry import (
     ALGORITHMS,
-    AlgorithmEntry,
     fitting_algorithms,
     load_algorithm,
     register,

@@ -1,4 +1,4 @@
-"""The table of agents: a name, where the class lives, and what it can work with."""
+"""The table of agents, by their names."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import dataclasses
 import importlib
 import importlib.util
 import re
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 from gymnasium import spaces
+
+from agents.algorithm_entries import AlgorithmEntry
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -21,91 +21,6 @@ NETWORK_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict")
 POLICY_GRADIENT_OUTPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 CONTINUOUS = ("Box",)
 VECTOR_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
-
-
-@dataclass(frozen=True)
-class AlgorithmEntry:
-    """One agent that can be trained.
-
-    Attributes:
-        entry_point: where the class lives, as ``"module:Class"``; imported only when needed.
-        summary: what the agent is, in a few words.
-        observations: names of the Gymnasium spaces that it can observe; none for any space, and
-            the class itself says what it cannot do.
-        actions: names of the Gymnasium spaces that it can act in, likewise.
-        observation_shape: the one observation shape that it understands, or None for any.
-        for_bandits: whether it looks no further than the next reward.
-        has_memory: whether it acts by what it saw before, not by the observation alone.
-        needs_masks: whether the environment must say which actions are valid (``action_masks()``).
-        package: the import name of an optional package that it needs, or None.
-        extra: the extra of this distribution that installs that package.
-    """
-
-    entry_point: str
-    summary: str
-    observations: tuple[str, ...] = ()
-    actions: tuple[str, ...] = ()
-    observation_shape: tuple[int, ...] | None = None
-    for_bandits: bool = False
-    has_memory: bool = False
-    needs_masks: bool = False
-    package: str | None = None
-    extra: str | None = None
-
-    @property
-    def family(self) -> str:
-        """The folder of `agents` that the class lives in; empty where it is in none."""
-        package, *folders = self.entry_point.partition(":")[0].split(".")
-        return folders[0] if package == "agents" and len(folders) > 1 else ""
-
-    @property
-    def is_installed(self) -> bool:
-        """Whether the package that the agent needs is there."""
-        return self.package is None or importlib.util.find_spec(self.package) is not None
-
-    @property
-    def install_command(self) -> str:
-        """What to type where that package is missing."""
-        what = f"'rl-yardstick[{self.extra}]'" if self.extra else self.package
-        return f"pip install {what}"
-
-    def misfit(self, observation_space: spaces.Space[Any], action_space: spaces.Space[Any]) -> str:
-        """Say why the agent cannot work with these spaces; empty where it can."""
-        for space, known, role in (
-            (observation_space, self.observations, "observes"),
-            (action_space, self.actions, "acts in"),
-        ):
-            if not known:
-                continue
-            if type(space).__name__ not in known:
-                return f"it {role} {' or '.join(known)} spaces, not {space}"
-            # The one-hot encoding of Stable-Baselines3 and every table count from zero.
-            if isinstance(space, spaces.Discrete) and space.start != 0:
-                return f"it needs Discrete spaces that start at 0, not {space}"
-        shape = self.observation_shape
-        if shape is not None and observation_space.shape != shape:
-            return f"it needs observations of shape {shape}, not {observation_space.shape}"
-        return ""
-
-    def env_misfit(self, env: gym.Env[Any, Any]) -> str:
-        """Say why the agent cannot work with the environment; empty where it can."""
-        if self.for_bandits and not is_bandit(env):
-            return "it is for bandits, where a pull changes nothing but its own reward"
-        if self.needs_masks and not has_masks(env):
-            return "it needs to be told which actions are valid, by a method action_masks()"
-        return self.misfit(env.observation_space, env.action_space)
-
-
-def is_bandit(env: gym.Env[Any, Any]) -> bool:
-    """Whether the environment is one of `envs.bandits`."""
-    from envs.bandits import Bandit
-
-    return isinstance(env.unwrapped, Bandit)
-
-
-def has_masks(env: gym.Env[Any, Any]) -> bool:
-    """Whether the environment, or a wrapper of it, says which actions are valid."""
-    return env.has_wrapper_attr("action_masks")
 
 
 def _tabular(entry_point: str, summary: str) -> AlgorithmEntry:
@@ -122,7 +37,6 @@ def _contrib(
     actions: tuple[str, ...],
     observations: tuple[str, ...] = NETWORK_INPUTS,
     *,
-    has_memory: bool = False,
     needs_masks: bool = False,
 ) -> AlgorithmEntry:
     return AlgorithmEntry(
@@ -130,7 +44,6 @@ def _contrib(
         f"{summary} (sb3-contrib)",
         observations,
         actions,
-        has_memory=has_memory,
         needs_masks=needs_masks,
         package="sb3_contrib",
         extra="contrib",
@@ -211,7 +124,6 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         # As it is in sb3-contrib 2.9, which fails on the other spaces.
         ("Box", "Discrete", "MultiDiscrete"),
         ("Box", "Discrete", "MultiBinary", "Dict"),
-        has_memory=True,
     ),
     "ppo_mask": _contrib(
         "sb3_contrib:MaskablePPO",

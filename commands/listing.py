@@ -8,7 +8,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
-from agents.registry import has_masks, is_bandit
+from agents.algorithm_entries import has_masks, is_bandit
 from pipeline.environments import make_env
 from pipeline.settings.hyperparam_entries import entry_names
 

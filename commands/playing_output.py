@@ -160,6 +160,10 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
         if evaluator is None:
             print_refusal(console, model_refusal(spec))
             return
+        obstacle = evaluator.obstacle(model)
+        if obstacle:
+            console.print(f"[dim]sampled, not exact: {spec.algo}: {obstacle}[/]")
+            return
         if why_not_exact(model, evaluator.observations):
             return
         try:

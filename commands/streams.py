@@ -101,4 +101,5 @@ def _open_closed_ones() -> None:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115, PTH123  # until the exit
+            nowhere = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123  # until the exit
+            setattr(sys, name, nowhere)

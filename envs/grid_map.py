@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.array_types import Bools
-from safe_files.errors import UnsafeFileError
+from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import read_file
 
 START = "S"

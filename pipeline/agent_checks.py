@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from agents import ALGORITHMS, fitting_algorithms
-from agents.registry import has_masks, is_bandit
+from agents.algorithm_entries import has_masks, is_bandit
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError, unknown
 from pipeline.train_spec import TrainSpec

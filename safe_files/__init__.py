@@ -8,13 +8,13 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from safe_files.errors import UnsafeFileError
+from safe_files.refusals import UnsafeFileError
 
 if TYPE_CHECKING:
     from safe_files.inspection import Report, inspect_model
     from safe_files.models import load_model
-    from safe_files.normalization import load_vec_normalize
     from safe_files.replay_buffers import load_replay_buffer
+    from safe_files.vec_normalize import load_vec_normalize
 
 __all__ = [
     "Report",
@@ -31,7 +31,7 @@ _MODULES = {
     "inspect_model": "inspection",
     "load_model": "models",
     "load_replay_buffer": "replay_buffers",
-    "load_vec_normalize": "normalization",
+    "load_vec_normalize": "vec_normalize",
 }
 
 

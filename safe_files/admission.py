@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from safe_files import gymnasium_spaces, library_objects, numpy_objects, schedules
-from safe_files.class_names import library_classes
+from safe_files import gymnasium_spaces, library_objects, library_schedules, numpy_objects
+from safe_files.library_classes import library_classes
 from safe_files.pickle_trees import read_tree
 from safe_files.rebuilding import Admitted, Maker, rebuild
 
@@ -19,7 +19,7 @@ def admitted() -> Admitted:
         **numpy_objects.MAKERS,
         **gymnasium_spaces.MAKERS,
         **library_objects.MAKERS,
-        **schedules.MAKERS,
+        **library_schedules.MAKERS,
     }
     return Admitted(makers, {**numpy_objects.CLASSES, **library_classes()})
 

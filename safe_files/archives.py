@@ -7,8 +7,8 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 
-from safe_files.errors import UnsafeFileError, shown
 from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_MEMBERS, MAX_TENSOR_RECORDS
+from safe_files.refusals import UnsafeFileError, shown
 
 # What the library raises at zips that are damaged, encrypted, or of a kind that it does not know.
 _DAMAGE = (

@@ -9,11 +9,11 @@ from typing import Any
 
 from safe_files.admission import read_pickle
 from safe_files.archives import read_members
-from safe_files.class_names import all_policy_classes
-from safe_files.errors import UnsafeFileError, shown
+from safe_files.library_classes import all_policy_classes
 from safe_files.limits import MAX_ARCHIVE_BYTES
 from safe_files.models import MEMBERS, NOT_READ, SERIALIZED, TENSORS, decoded, parse_settings
 from safe_files.pickle_trees import Grouped, Made, Mapped, Name, read_tree
+from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import read_file
 from safe_files.tensors import check_values, load_tensors, tensors_in
 

@@ -17,9 +17,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from safe_files.admission import read_pickle
 from safe_files.archives import read_members
-from safe_files.class_names import policy_classes
-from safe_files.errors import UnsafeFileError, shown
+from safe_files.library_classes import policy_classes
 from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
+from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import read_file
 from safe_files.sizes import check_sizes
 from safe_files.tensors import check_values, first_line, load_tensors

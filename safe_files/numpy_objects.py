@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from safe_files.errors import UnsafeFileError
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, Maker, arguments, wrong
+from safe_files.refusals import UnsafeFileError
 
 # Booleans, whole numbers, floats; no texts, records, dates, and no Python objects.
 _TYPES = frozenset({"b1", *(f"{kind}{size}" for kind in "iu" for size in (1, 2, 4, 8))}) | {

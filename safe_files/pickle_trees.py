@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from safe_files.errors import UnsafeFileError
 from safe_files.limits import MAX_INSTRUCTIONS, MAX_INTEGER_BITS
+from safe_files.refusals import UnsafeFileError
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,9 +6,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from safe_files.errors import UnsafeFileError, shown
 from safe_files.limits import MAX_DEPTH, MAX_VALUES
 from safe_files.pickle_trees import Grouped, Made, Mapped, Name, Tree
+from safe_files.refusals import UnsafeFileError, shown
 
 Build = Callable[[Tree], Any]
 Maker = Callable[[Made, Build], Any]

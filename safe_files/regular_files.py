@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-from safe_files.errors import UnsafeFileError
+from safe_files.refusals import UnsafeFileError
 
 
 @contextmanager

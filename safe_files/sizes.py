@@ -15,8 +15,8 @@ from typing import Any
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 
-from safe_files.errors import UnsafeFileError
 from safe_files.limits import MAX_ROWS, MAX_WIDTH
+from safe_files.refusals import UnsafeFileError
 from safe_files.tensors import tensors_in
 
 # Attributes that say how many rows a buffer has; they multiply where there are several.

@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 
 from safe_files.archives import check_tensors
-from safe_files.errors import UnsafeFileError
+from safe_files.refusals import UnsafeFileError
 
 
 def load_tensors(content: bytes) -> Any:

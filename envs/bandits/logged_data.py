@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from envs.bandits.bandit import MAX_ARMS
 from mdp.array_types import Bools, Floats, Ints
-from safe_files.errors import UnsafeFileError
+from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import opened
 
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"

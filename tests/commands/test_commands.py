@@ -205,7 +205,7 @@ MISTAKES = {
     "choice": (["-params", "exploration:greedy"], "exploration"),
     "spaces": (
         ["--algo", "qlearning", "--env", "MountainCarContinuous-v0"],
-        "fitting agents: ppo, a2c, random",
+        "fitting agents: ppo, a2c, sac, td3, ddpg, tqc, crossq, trpo, ars, ppo_lstm, random",
     ),
     "missing file": (["--conf-file", "nowhere.yml"], "nowhere.yml"),
     "environment argument": (["--env-kwargs", "slipery:True"], "slipery"),

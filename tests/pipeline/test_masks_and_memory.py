@@ -1,6 +1,7 @@
 """Agents that are told what is valid, or that remember: evaluated and played as they act."""
 
 import io
+import sys
 
 import gymnasium as gym
 import numpy as np
@@ -10,6 +11,7 @@ from gymnasium import spaces
 from rich.console import Console
 from stable_baselines3.common.env_util import make_vec_env
 
+import enjoy
 from agents import load_algorithm
 from pipeline.agent_checks import check_fit
 from pipeline.errors import UserError
@@ -105,9 +107,6 @@ def test_an_agent_that_does_not_listen_is_asked_as_ever(corridor):
     env = make_vec_env(lambda: gym.make(corridor), 1)
     assert player(agent, env) is agent
     assert not takes_masks(agent)
-    # Nor is one told anything where the environments say nothing.
-    agent = load_algorithm("ppo_mask")("MlpPolicy", Corridor(), device="cpu", **SMALL)
-    assert player(agent, make_vec_env("FrozenLake-v1", 1)) is agent
 
 
 def test_an_environment_without_masks_is_refused():
@@ -190,11 +189,17 @@ def test_play_hands_the_state_on():
     assert list(play_episodes(Counter(), uneven(1), 3)) == [(4, 4)] * 3
 
 
-def test_an_agent_with_a_memory_is_judged_by_episodes_and_says_so(tmp_path):
+def test_an_agent_with_a_memory_is_judged_by_episodes_and_says_so(tmp_path, monkeypatch, capsys):
     outcome, printed = train_to(spec_of("ppo_lstm", "FrozenLake-v1", tmp_path))
     assert not outcome.final.is_exact
     assert len(outcome.final.returns) == 100
     assert printed.count("evaluation: sampled, not exact: ppo_lstm: it acts by what it rem") == 1
+    words = ["enjoy.py", "--algo", "ppo_lstm", "--env", "FrozenLake-v1", "-f", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", [*words, "--no-render", "--n-episodes", "2"])
+    assert enjoy.main() == 0
+    printed = capsys.readouterr().out
+    assert "sampled, not exact: ppo_lstm" in printed
+    assert "(exact)" not in printed
     # Asked for every state at once, it would take them for one after another.
     algorithm = load_algorithm("ppo_lstm")
     agent = algorithm("MlpLstmPolicy", "FrozenLake-v1", device="cpu", **SMALL)

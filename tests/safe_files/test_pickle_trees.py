@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from safe_files.admission import read_pickle
-from safe_files.errors import UnsafeFileError
 from safe_files.pickle_trees import Made, Name, read_tree
+from safe_files.refusals import UnsafeFileError
 
 KEYS = st.text(max_size=5) | st.integers(-(2**60), 2**60) | st.binary(max_size=5) | st.none()
 VALUES = st.recursive(

@@ -15,9 +15,9 @@ from typing import Any
 
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
-from safe_files.errors import UnsafeFileError, shown
 from safe_files.pickle_trees import Made, Name
 from safe_files.rebuilding import Build, Maker, fields, wrong
+from safe_files.refusals import UnsafeFileError, shown
 
 _UTILS = "stable_baselines3.common.utils"
 _Schedule = Callable[[float], float]

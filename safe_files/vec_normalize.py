@@ -12,10 +12,10 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from safe_files.admission import read_pickle
-from safe_files.errors import UnsafeFileError
 from safe_files.limits import MAX_STATISTICS_BYTES
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, chosen_fields, wrong
+from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import read_file
 
 _CLASS = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
