@@ -193,7 +193,7 @@ def test_an_agent_with_a_memory_is_judged_by_episodes_and_says_so(tmp_path, monk
     outcome, printed = train_to(spec_of("ppo_lstm", "FrozenLake-v1", tmp_path))
     assert not outcome.final.is_exact
     assert len(outcome.final.returns) == 100
-    assert printed.count("evaluation: sampled, not exact: ppo_lstm: it acts by what it rem") == 1
+    assert printed.count("evaluations are sampled, not exact: it acts by what it remembers") == 1
     words = ["enjoy.py", "--algo", "ppo_lstm", "--env", "FrozenLake-v1", "-f", str(tmp_path)]
     monkeypatch.setattr(sys, "argv", [*words, "--no-render", "--n-episodes", "2"])
     assert enjoy.main() == 0
