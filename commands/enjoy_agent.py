@@ -18,7 +18,7 @@ from commands.flag_values import (
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
 
 if TYPE_CHECKING:
-    from pipeline.model_choice import ChosenModel
+    from pipeline.model_choice import ChosenModel, ModelRequest
 
 STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
 RUN_NUMBER = whole_number(0, besides={-1: "the run without a number"})
@@ -135,24 +135,27 @@ def _add_flags_of_rl_zoo3(parser: argparse.ArgumentParser) -> None:
 def main() -> int:
     """Parse the arguments and play; the exit code."""
     args = build_parser().parse_args()
-    from commands.enjoy_request import check_playing
+    from commands.enjoy_request import check_playing, model_request
     from pipeline.filming import check_film_path
 
     check_playing(args)
     film = None if args.record is None else Path(args.record)
     if film is not None:
         check_film_path(film)
-    chosen = _chosen_model(args)
+    wanted = model_request(args)
+    found = _found_model(wanted)
     from rich.console import Console
 
     from pipeline.signs_of_life import doing
 
     console = Console(highlight=False, quiet=args.verbose < 1)
-    about = f"{chosen.spec.algo} on {chosen.spec.env_id}: {chosen.path}"
+    about = f"{found.spec.algo} on {found.spec.env_id}: {found.path}"
     console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries"):
         from commands.playing_output import PlayingRequest, play
+        from pipeline.model_choice import with_statistics
 
+        chosen = with_statistics(found, wanted)
     n_steps = args.n_timesteps if args.n_timesteps >= 0 else None
     request = PlayingRequest(
         n_episodes=10 if args.n_episodes is None and n_steps is None else args.n_episodes,
@@ -168,14 +171,13 @@ def main() -> int:
     return 0
 
 
-def _chosen_model(args: argparse.Namespace) -> ChosenModel:
-    from commands.enjoy_request import model_request
+def _found_model(wanted: ModelRequest) -> ChosenModel:
     from pipeline.errors import UserError
-    from pipeline.model_choice import choose_model
+    from pipeline.model_choice import find_model
     from pipeline.run_folder import NoRunError
 
     try:
-        return choose_model(model_request(args))
+        return find_model(wanted)
     except NoRunError as error:
         flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
         raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error

@@ -48,8 +48,6 @@ def check_playing(args: argparse.Namespace) -> None:
         raise UserError("--norm-reward: returns are those of the environment, never normalised")
     if args.progress:
         raise UserError("-P: there is no bar; each episode is printed as it ends")
-    if args.n_envs < 1:
-        raise UserError(f"--n-envs must be at least 1, not {args.n_envs}")
     if args.n_envs > 1 and (args.record is not None or args.render in ("human", "ansi")):
         flag = "--record" if args.record is not None else f"--render {args.render}"
         raise UserError(f"{flag} shows one environment: leave out --n-envs")

@@ -64,7 +64,7 @@ HYPERPARAMETERS = {
     *("action_noise", "policy_delay", "target_policy_noise", "target_noise_clip", "zero_policy"),
     *("use_sde_at_warmup", "top_quantiles_to_drop_per_net", "n_critic_updates", "cg_max_steps"),
     *("cg_damping", "line_search_shrinking_factor", "line_search_max_iter", "sub_sampling_factor"),
-    *("n_delta", "n_top", "delta_std", "alive_bonus_offset", "n_eval_episodes"),
+    *("mask_actions", "n_delta", "n_top", "delta_std", "alive_bonus_offset", "n_eval_episodes"),
 }
 
 # What people type for flags of ours; the first of the flags that the command has is named.

@@ -94,16 +94,21 @@ class ChosenModel:
 
 
 def choose_model(request: ModelRequest) -> ChosenModel:
-    """Find the model that is asked for.
+    """The model that is asked for, ready to be played: `find_model`, then `with_statistics`."""
+    return with_statistics(find_model(request), request)
+
+
+def find_model(request: ModelRequest) -> ChosenModel:
+    """Find the model that is asked for, without loading a library that takes long.
 
     Raises:
         UserError: if there is no such model, or it may not be loaded.
     """
+    if request.statistics is not None and not request.statistics.is_file():
+        raise UserError(f"no such file of statistics: {request.statistics}")
     if request.path is None:
-        chosen = _newest(request)
-    else:
-        chosen = _model_at(model_at(request.path, request.which), request)
-    return _checked_statistics(chosen, request)
+        return _newest(request)
+    return _model_at(model_at(request.path, request.which), request)
 
 
 def _newest(request: ModelRequest) -> ChosenModel:
@@ -182,12 +187,13 @@ def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if key != "normalize"}
 
 
-def _checked_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
-    """The model with the statistics that it is played with, which are there and may be read."""
-    path, normalize = request.statistics, chosen.spec.hyperparams.normalize
-    if path is not None and not path.is_file():
-        raise UserError(f"no such file of statistics: {path}")
-    path = path or chosen.statistics
+def with_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
+    """The model with the statistics that it is played with, which are there and may be read.
+
+    Raises:
+        UserError: if they are not.
+    """
+    path, normalize = request.statistics or chosen.statistics, chosen.spec.hyperparams.normalize
     if path is None:
         if normalize is not None and normalize.get("norm_obs", True):
             raise UserError(

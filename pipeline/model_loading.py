@@ -23,6 +23,9 @@ LIBRARY_ZIP = "loading a zip of a library agent"
 STATISTICS = "reading statistics of VecNormalize"
 REPLAY_BUFFER = "reading a replay buffer"
 
+# Folders of `agents` in which no agent has a zip with a pickle: known before any is imported.
+_JSON_FAMILIES = {"tabular", "bandits", "mabwiser"}
+
 
 def check_model_file(path: Path) -> None:
     """Make sure that ``path`` is a whole zip of an agent, without reading any agent from it.
@@ -249,6 +252,8 @@ def hand_written_algorithm(path: Path) -> str | None:
 
 def _holds_no_pickle(algo: str) -> bool:
     """Whether zips of the agent are JSON; where its class is not to be had, they are not loaded."""
+    if ALGORITHMS[algo].family in _JSON_FAMILIES:
+        return True
     from agents.common.model_files import JsonAlgorithm
 
     try:

@@ -84,7 +84,7 @@ def test_nothing_is_said_with_verbose_0(type_command, lake):
     [
         (["--norm-reward"], "--norm-reward: returns are those of the environment, never norm"),
         (["-P"], "-P: there is no bar; each episode is printed as it ends"),
-        (["--n-envs", "0"], "--n-envs must be at least 1, not 0"),
+        (["--n-envs", "0"], "--n-envs: must be a whole number of at least 1, not '0'"),
         (["--n-envs", "2", "--render", "ansi"], "--render ansi shows one environment"),
         (["--n-envs", "2", "--record", "film.gif"], "--record shows one environment"),
         (["--exp-id", "-1"], "holds no FrozenLake-v1.zip"),

@@ -4,6 +4,7 @@ import json
 import sys
 from types import SimpleNamespace
 
+import gymnasium as gym
 import pytest
 from rich.console import Console
 
@@ -52,6 +53,9 @@ def type_command(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "windy_of_mine.py").write_text(WINDY)
     monkeypatch.syspath_prepend(tmp_path)
+    # What another test imported and registered.
+    monkeypatch.delitem(sys.modules, "windy_of_mine", raising=False)
+    monkeypatch.delitem(gym.registry, "Windy-v0", raising=False)
 
     def run(main, *words):
         monkeypatch.setattr(sys, "argv", ["it", *ENV, *words])

@@ -24,6 +24,7 @@ from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import UserModule
 
 
 @pytest.fixture(autouse=True)
@@ -218,9 +219,10 @@ def test_the_command_to_watch_with_names_this_run(tmp_path, typed, others, choic
 
 
 def test_the_command_to_watch_with_names_modules():
-    spec = replace(spec_of(), gym_packages=("one", "two"))
+    modules = (UserModule("one", "one"), UserModule("./my two.py", "two", "/x/my two.py"))
+    spec = replace(spec_of(), user_modules=modules)
     command = watch_command(spec, outcome_of().run)
-    assert command.endswith(" --env Lake-v1 --gym-packages one two")
+    assert command.endswith(" --env Lake-v1 --gym-packages one './my two.py'")
 
 
 def test_a_long_setting_is_cut_short_in_the_header():

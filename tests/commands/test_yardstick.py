@@ -74,7 +74,7 @@ def test_the_command_line_can_be_typed_again(monkeypatch, words, typed):
 def test_training_and_playing_by_the_installed_name(type_command, tmp_path, program):
     code, out, err = type_command(program, "train", *QUICK)
     assert (code, err) == (0, "")
-    assert "watch    yardstick enjoy --algo qlearning --env FrozenLake-v1 " in out
+    assert "watch    yardstick enjoy --algo qlearning --env FrozenLake-v1\n" in out
     run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
     written = (run / "FrozenLake-v1" / "command.txt").read_text()
     assert written == f"yardstick train {shlex.join(QUICK)}\n"

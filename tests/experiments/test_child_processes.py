@@ -6,6 +6,7 @@ import runpy
 import signal
 import subprocess
 import sys
+import threading
 import time
 from functools import partial
 
@@ -65,6 +66,8 @@ def method(request, monkeypatch):
     """Children of Linux, and those of Windows and macOS."""
     context = multiprocessing.get_context(request.param)
     monkeypatch.setattr(child_processes, "_context", context)
+    # Another test may have stopped everything.
+    monkeypatch.setattr(child_processes, "_stopping", threading.Event())
     return request.param
 
 

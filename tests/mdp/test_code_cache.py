@@ -42,7 +42,7 @@ print([name for name in names if not name.startswith("compiling")], file=sys.std
 def checkout(tmp_path_factory):
     """A copy of what trains, and nothing compiled in it."""
     root = tmp_path_factory.mktemp("checkout")
-    for package in ("mdp", "agents", "envs"):
+    for package in ("safe_files", "mdp", "agents", "envs"):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / package, root / package, ignore=ignored)
     return root

@@ -15,11 +15,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 import agents
+from agents.common.model_files import JsonAlgorithm
 from pipeline import training
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
 from pipeline.model_choice import ModelRequest, choose_model
-from pipeline.model_loading import hand_written_algorithm, load_model
+from pipeline.model_loading import _JSON_FAMILIES, hand_written_algorithm, load_model
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy, needs_policy
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.settings.hyperparams import split
@@ -254,6 +255,13 @@ def test_any_space_may_be_refused_by_the_class(tmp_path):
     with pytest.raises(UserError, match="Discrete"):
         train(spec)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_agents_that_are_taken_to_hold_no_pickle_do_not():
+    entries = agents.ALGORITHMS.items()
+    known = [name for name, entry in entries if entry.family in _JSON_FAMILIES]
+    assert {"qlearning", "ucb", "mabwiser_ucb1"} <= set(known)
+    assert all(issubclass(agents.load_algorithm(name), JsonAlgorithm) for name in known)
 
 
 @pytest.mark.parametrize(
