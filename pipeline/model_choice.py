@@ -23,7 +23,7 @@ from pipeline.companions import statistics_of
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.model_finding import Which, model_at, model_of
-from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm
+from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm, telling_masks
 from pipeline.module_records import check_recorded
 from pipeline.normalization import normalising, read_statistics
 from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
@@ -103,6 +103,7 @@ def choose_model(request: ModelRequest) -> ChosenModel:
         chosen = _newest(request)
     else:
         chosen = _model_at(model_at(request.path, request.which), request)
+    chosen = replace(chosen, spec=telling_masks(chosen.spec, chosen.path))
     return _checked_statistics(chosen, request)
 
 
@@ -198,4 +199,4 @@ def _checked_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenMod
     if not request.is_trusted:
         check_origin(path, request.log_folder, what=STATISTICS)
     spec = normalising(chosen.spec, read_statistics(path).settings)
-    return ChosenModel(chosen.path, spec, chosen.run, path)
+    return replace(chosen, spec=spec, named_statistics=path)

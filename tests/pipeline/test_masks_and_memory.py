@@ -115,7 +115,7 @@ def test_an_environment_without_masks_is_refused():
     (line,) = str(caught.value).splitlines()
     assert line.startswith(
         "ppo_mask does not fit CartPole-v1: it needs to be told which actions are valid, by a "
-        "method action_masks(); fitting agents: dqn, "
+        "method action_masks() or by info['action_mask']; fitting agents: dqn, "
     )
     assert "ppo_mask" not in line.partition("fitting agents")[2]
 
