@@ -199,4 +199,4 @@ def _checked_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenMod
     if not request.is_trusted:
         check_origin(path, request.log_folder, what=STATISTICS)
     spec = normalising(chosen.spec, read_statistics(path).settings)
-    return replace(chosen, spec=spec, named_statistics=path)
+    return ChosenModel(chosen.path, spec, chosen.run, path)
