@@ -243,11 +243,11 @@ def test_modules_are_not_imported_because_a_folder_asks(zoo, tmp_path):
     folder = hub(zoo, tmp_path)
     (tmp_path / "config.yml").write_text("{}")
     args = tmp_path / "args.yml"
-    args.write_text("{algo: a2c, env: 'antigravity_module:Fly-v0', gym_packages: [fly]}")
-    with pytest.raises(UserError, match="imported only where you name them, with --env antigrav"):
+    args.write_text("{algo: a2c, env: 'antigravity_module:Fly-v0'}")
+    with pytest.raises(UserError, match="not imported because a file asks: add --gym-packages ant"):
         choose_model(ModelRequest(folder, is_trusted=True))
     args.write_text("{algo: a2c, env: Fly-v0, gym_packages: [antigravity_module]}")
-    with pytest.raises(UserError, match="trained with --gym-packages antigravity_module"):
+    with pytest.raises(UserError, match=r"modules of yours \(antigravity_module\), and no module"):
         choose_model(ModelRequest(folder, is_trusted=True))
 
 
