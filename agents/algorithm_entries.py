@@ -22,7 +22,7 @@ class AlgorithmEntry:
         actions: names of the Gymnasium spaces that it can act in, likewise.
         observation_shape: the one observation shape that it understands, or None for any.
         for_bandits: whether it looks no further than the next reward.
-        needs_masks: whether the environment must say which actions are valid (``action_masks()``).
+        needs_masks: whether the environment must say which actions are valid.
         package: the import name of an optional package that it needs, or None.
         extra: the extra of this distribution that installs that package.
     """
@@ -74,10 +74,15 @@ class AlgorithmEntry:
 
     def env_misfit(self, env: gym.Env[Any, Any]) -> str:
         """Say why the agent cannot work with the environment; empty where it can."""
+        from envs.action_masks import has_masks
+
         if self.for_bandits and not is_bandit(env):
             return "it is for bandits, where a pull changes nothing but its own reward"
         if self.needs_masks and not has_masks(env):
-            return "it needs to be told which actions are valid, by a method action_masks()"
+            return (
+                "it needs to be told which actions are valid, by a method action_masks() or by "
+                "info['action_mask']"
+            )
         return self.misfit(env.observation_space, env.action_space)
 
 
@@ -86,8 +91,3 @@ def is_bandit(env: gym.Env[Any, Any]) -> bool:
     from envs.bandits import Bandit
 
     return isinstance(env.unwrapped, Bandit)
-
-
-def has_masks(env: gym.Env[Any, Any]) -> bool:
-    """Whether the environment, or a wrapper of it, says which actions are valid."""
-    return env.has_wrapper_attr("action_masks")

@@ -8,7 +8,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
-from agents.algorithm_entries import has_masks, is_bandit
+from agents.algorithm_entries import is_bandit
+from envs.action_masks import has_masks
 from pipeline.environments import make_env
 from pipeline.settings.hyperparam_entries import entry_names
 

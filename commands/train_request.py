@@ -12,7 +12,7 @@ from commands.parsing import check_device, check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
-from pipeline.map_contents import with_maps_read
+from pipeline.map_contents import with_logs_located, with_maps_read
 from pipeline.settings.hyperparam_entries import NoEntryError, override, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.settings.literals import parse_assignments
@@ -31,7 +31,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     check_env_id(args.env)
     check_tensorboard(args.tensorboard_log)
     check_device(args.device)
-    raw = with_maps_read(args.env, _raw_hyperparams(args))
+    raw = with_logs_located(args.env, with_maps_read(args.env, _raw_hyperparams(args)))
     trained_agent = None
     if args.trained_agent:
         from pipeline.continuation import agent_to_continue

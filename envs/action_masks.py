@@ -33,6 +33,11 @@ def mask_source(env: Env) -> Callable[[], Any] | None:
     return None
 
 
+def has_masks(env: Env) -> bool:
+    """Whether the environment says what it allows, in whichever way; one may have to be begun."""
+    return mask_source(env) is not None or INFO_KEY in env.reset()[1]
+
+
 def action_masks(env: Env) -> Bools | None:
     """What may be done now, bool of shape (n_actions,), or None where the environment has no say.
 

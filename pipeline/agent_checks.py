@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from agents import ALGORITHMS, fitting_algorithms
-from agents.algorithm_entries import has_masks, is_bandit
+from agents.algorithm_entries import is_bandit
+from envs.action_masks import has_masks
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError, unknown
 from pipeline.train_spec import TrainSpec

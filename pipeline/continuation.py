@@ -56,12 +56,14 @@ def agent_to_continue(path: Path, log_folder: Path, is_trusted: bool) -> Path:
 
 
 def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
-    """The statistics that go on with the agent, or None.
+    """The statistics that go on with the agent; None where there are none, or none are wanted.
 
     Raises:
         UserError: if they cannot be read.
     """
-    path = None if spec.trained_agent is None else _statistics_path(spec.trained_agent)
+    if spec.trained_agent is None or spec.saved_hyperparams.get("normalize") is False:
+        return None
+    path = _statistics_path(spec.trained_agent)
     return None if path is None else read_statistics(path)
 
 

@@ -14,6 +14,8 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
 import envs  # noqa: F401  # registers the project's environments
+from agents import ALGORITHMS
+from envs.action_masks import has_masks
 from envs.wrappers import ActionMasks
 from pipeline.environment_mistakes import environment_mistake
 from pipeline.errors import UserError, one_line, shown, unknown
@@ -119,7 +121,7 @@ def _usual_kwargs(env_id: str) -> dict[str, Any]:
 def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
     """The wrappers that the hyperparameters name, as one function, or None for none.
 
-    Where the agent is to hold to action masks, the outermost tells them.
+    Where the agent goes by action masks, the outermost tells them.
     """
     from pipeline.settings.components import wrapper_factory
 
@@ -132,6 +134,9 @@ def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
     wraps = [wrap for wrap in (inner, outer) if wrap is not None]
     if spec.hyperparams.algorithm.get("mask_actions", False):
         wraps.append(_with_masks)
+    elif spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks:
+        # Where there are none, `pipeline.agent_checks` names the agents that would fit.
+        wraps.append(lambda env: ActionMasks(env) if has_masks(env) else env)
     if not wraps:
         return None
     return lambda env: reduce(lambda wrapped, wrap: wrap(wrapped), wraps, env)

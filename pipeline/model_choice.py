@@ -23,7 +23,7 @@ from pipeline.companions import statistics_of
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.model_finding import Which, model_at, model_of
-from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm
+from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm, telling_masks
 from pipeline.module_records import check_recorded
 from pipeline.normalization import normalising, read_statistics
 from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
@@ -107,8 +107,10 @@ def find_model(request: ModelRequest) -> ChosenModel:
     if request.statistics is not None and not request.statistics.is_file():
         raise UserError(f"no such file of statistics: {request.statistics}")
     if request.path is None:
-        return _newest(request)
-    return _model_at(model_at(request.path, request.which), request)
+        chosen = _newest(request)
+    else:
+        chosen = _model_at(model_at(request.path, request.which), request)
+    return replace(chosen, spec=telling_masks(chosen.spec, chosen.path))
 
 
 def _newest(request: ModelRequest) -> ChosenModel:

@@ -6,6 +6,7 @@ import json
 import warnings
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,6 +14,7 @@ from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.run_folder import Run
 from pipeline.settings.constructor_arguments import algorithm_parameters
+from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -248,6 +250,23 @@ def hand_written_algorithm(path: Path) -> str | None:
         ):
             return name
     return None
+
+
+def telling_masks(spec: TrainSpec, model: Path) -> TrainSpec:
+    """The spec with environments that tell action masks, where the agent in a zip goes by them.
+
+    What the spec says of ``mask_actions`` itself holds. Reads plain JSON and nothing else.
+
+    Raises:
+        UserError: if the zip is damaged.
+    """
+    check_model_file(model)
+    algorithm, name = spec.hyperparams.algorithm, "mask_actions"
+    if name in algorithm or _plain_data(model).get(name) is not True:
+        return spec
+    hyperparams = replace(spec.hyperparams, algorithm={**algorithm, name: True})
+    saved = {**spec.saved_hyperparams, name: True}
+    return replace(spec, hyperparams=hyperparams, saved_hyperparams=saved)
 
 
 def _holds_no_pickle(algo: str) -> bool:

@@ -36,7 +36,7 @@ from pipeline.evaluation.exact import (
 from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
-from pipeline.model_loading import agent_class
+from pipeline.model_loading import agent_class, telling_masks
 from pipeline.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
@@ -142,6 +142,8 @@ def _exact_evaluator(
 
 def _training_env(spec: TrainSpec, run: Run, undo: ExitStack) -> tuple[TrainSpec, VecEnv]:
     """What the agent is trained on; and the spec, which follows one that goes on."""
+    if spec.trained_agent is not None:
+        spec = telling_masks(spec, spec.trained_agent)
     statistics = statistics_to_continue(spec)
     if statistics is not None:
         spec = continuing(spec, statistics)

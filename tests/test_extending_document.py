@@ -8,6 +8,7 @@ import gymnasium as gym
 
 DOCUMENT = (Path(__file__).parents[1] / "docs" / "extending.md").read_text()
 FILES = re.findall(r"^`(\w+\.\w+)`[^\n]*(?:\n[^\n]+)*\n\n```\w+\n(.*?)```", DOCUMENT, re.M | re.S)
+CHECK = re.findall(r"```python\n((?:(?!```).)*check_transition_model.*?)```", DOCUMENT, re.S)
 COMMANDS = re.findall(r"^python ~/yardstick/(.*)$", DOCUMENT, re.M)
 
 
@@ -23,3 +24,21 @@ def test_the_document_can_be_followed(type_in_own_folder, own_folder):
     logs = own_folder / "logs"
     assert (logs / "qlearning" / "my-Corridor-v0_1" / "modules" / "my_corridor.py").is_file()
     assert len(list(logs.glob("studies/*/runs/*/my-Corridor-v0_*/run.json"))) == 8
+
+
+def test_a_model_can_be_checked_as_written(own_folder, monkeypatch, capsys):
+    for name, text in FILES:
+        (own_folder / name).write_text(text)
+    monkeypatch.syspath_prepend(own_folder)
+    (code,) = CHECK
+    exec(code, {})  # noqa: S102  # a page of this project
+    assert capsys.readouterr().out.split() == ["None", "True"]
+    # The page's table with an error in it: the slip is not in the model.
+    changed = code.replace("check = ", "my_known_corridor.KnownCorridor.step = slipping\ncheck = ")
+
+    def slipping(self, action):
+        self.s = min(self.s + int(action), self.observation_space.n - 1)
+        return self.s, -1.0, self.s == self.observation_space.n - 1, False, {}
+
+    exec(changed, {"slipping": slipping})  # noqa: S102
+    assert capsys.readouterr().out.startswith("the environment's P is not what step does: state ")

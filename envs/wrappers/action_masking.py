@@ -8,7 +8,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import RecordConstructorArgs
 
-from envs.action_masks import INFO_KEY, mask_source
+from envs.action_masks import INFO_KEY, has_masks, mask_source
 from mdp.array_types import Bools
 
 
@@ -29,7 +29,7 @@ class ActionMasks(gym.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
         self._told: Any = None
-        if mask_source(env) is None and INFO_KEY not in env.reset()[1]:
+        if not has_masks(env):
             name = env.unwrapped if env.spec is None else env.spec.id
             raise ValueError(
                 f"{name} has no action masks: neither a method action_masks() nor "

@@ -37,7 +37,7 @@ from mdp import (
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.mask_telling import takes_masks
-from pipeline.evaluation.policy_kinds import has_memory, needs_masks
+from pipeline.evaluation.policy_kinds import has_memory
 from pipeline.evaluation.sampled import KNOWN_LIBRARIES, Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec
 
@@ -111,8 +111,6 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         if model.n_states > MAX_STATES:
             return None
         masks = action_masks_of_states(env)
-        if masks is None and spec.hyperparams.algorithm.get("mask_actions", False):
-            return None
         success, layout = success_outcomes(env), grid_layout(env)
     finally:
         env.close()
@@ -220,7 +218,7 @@ def _is_epsilon_greedy(agent: BaseAlgorithm) -> bool:
 def _obstacle(agent: BaseAlgorithm, masks: Bools | None) -> str:
     if has_memory(agent):
         return "it acts by what it remembers, not by the state alone"
-    if masks is None and needs_masks(agent):
+    if masks is None and takes_masks(agent):
         return "which actions are valid in each state is not known"
     return ""
 

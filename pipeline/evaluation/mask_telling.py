@@ -8,7 +8,8 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.common.mask_reading import present_masks
+from agents.common.mask_reading import check_masks_exist, present_masks
+from pipeline.errors import UserError
 
 
 def takes_masks(model: Any) -> bool:
@@ -18,8 +19,21 @@ def takes_masks(model: Any) -> bool:
 
 
 def player(model: BaseAlgorithm, env: VecEnv) -> Any:
-    """What to ask by ``predict`` on ``env``: the agent, told the masks where it takes them."""
-    return MaskTold(model, env) if takes_masks(model) else model
+    """What to ask by ``predict`` on ``env``: the agent, told the masks where it takes them.
+
+    Raises:
+        UserError: if it takes them and the environment has none.
+    """
+    if not takes_masks(model):
+        return model
+    try:
+        check_masks_exist(env)
+    except ValueError as error:
+        raise UserError(
+            f"{type(model).__name__} has to be told which actions are valid, and the environment "
+            "has no action masks"
+        ) from error
+    return MaskTold(model, env)
 
 
 class MaskTold:

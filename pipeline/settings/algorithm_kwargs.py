@@ -86,9 +86,10 @@ def default_policy(algorithm: type[BaseAlgorithm], is_dict: bool) -> str:
         algorithm: the agent's class.
         is_dict: whether it observes a dictionary.
     """
-    usual = "MultiInputPolicy" if is_dict else "MlpPolicy"
+    prefix = "MultiInput" if is_dict else "Mlp"
     known = algorithm.policy_aliases
-    return usual if usual in known or not known else next(iter(known))
+    fitting = (name for name in known if name.startswith(prefix))
+    return next(fitting, next(iter(known), f"{prefix}Policy"))
 
 
 def _policy_class(

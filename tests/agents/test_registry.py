@@ -78,7 +78,8 @@ def test_masks_make_one_more_fit():
     # A method of the environment serves through wrappers as well.
     assert ALGORITHMS["ppo_mask"].env_misfit(gym.wrappers.TimeLimit(env, 5)) == ""
     assert ALGORITHMS["ppo_mask"].env_misfit(gym.make("CartPole-v1")) == (
-        "it needs to be told which actions are valid, by a method action_masks()"
+        "it needs to be told which actions are valid, by a method action_masks() or by "
+        "info['action_mask']"
     )
 
 

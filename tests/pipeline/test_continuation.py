@@ -115,6 +115,14 @@ def test_what_the_new_entry_says_of_normalisation_wins(normalised, tmp_path):
     assert (statistics.clip_obs, statistics.gamma, seen(run.vecnormalize_path)) == (4.0, 0.5, 244)
 
 
+def test_normalisation_can_be_turned_off(normalised, tmp_path):
+    entry = {**A2C, "normalize": False}
+    run = train_to(tmp_path, "a2c", entry, 40, trained_agent=normalised.model_path, eval_freq=-1)
+    assert not run.vecnormalize_path.exists()
+    request = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=tmp_path)
+    assert choose_model(request).statistics is None
+
+
 def test_the_end_is_judged_on_the_statistics_of_the_end(tmp_path, monkeypatch):
     judged = []
 

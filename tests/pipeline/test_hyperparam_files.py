@@ -8,8 +8,9 @@ import pytest
 from agents import ALGORITHMS, load_algorithm
 from pipeline.agent_checks import check_fit
 from pipeline.environments import make_single_env, make_training_env
+from pipeline.preparation import algorithm_kwargs
 from pipeline.settings import hyperparams
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
 from pipeline.settings.components import callbacks, vec_wrapper_factory
 from pipeline.settings.hyperparam_entries import entry_names, override, read_hyperparams
 from pipeline.settings.hyperparams import split
@@ -89,9 +90,11 @@ def test_every_entry_says_how_long_to_train_and_builds_its_agents_arguments(algo
     entry = read_yaml(FOLDER / f"{algo}.yml")[key]
     spec = split(entry)
     assert [spec.n_timesteps, spec.n_episodes].count(None) == 1
-    kwargs = build_algorithm_kwargs(load_algorithm(algo), spec.algorithm, algo)
-    assert set(kwargs) == set(spec.algorithm)
-    assert kwargs["policy"] in load_algorithm(algo).policy_aliases
+    algorithm = load_algorithm(algo)
+    given = {"policy": default_policy(algorithm, is_dict=False), **spec.algorithm}
+    kwargs = build_algorithm_kwargs(algorithm, given, algo)
+    assert set(kwargs) == set(given)
+    assert kwargs["policy"] in algorithm.policy_aliases
     # A budget from the command line replaces the entry's.
     assert split(override(entry, {"n_episodes": 3})).n_timesteps is None
 
@@ -124,7 +127,25 @@ def test_an_agent_takes_its_first_steps(algo):
     spec = spec_of(algo, environment_for(algo))
     algorithm = load_algorithm(algo)
     env = make_training_env(spec, None)
-    kwargs = build_algorithm_kwargs(algorithm, spec.hyperparams.algorithm, algo)
+    kwargs = algorithm_kwargs(spec)
     model = algorithm(env=env, device="cpu", seed=0, **kwargs).learn(2 * env.num_envs)
     assert model.num_timesteps >= 2 * env.num_envs
     env.close()
+
+
+class Pair(Valid):
+    """As before, shown as a dictionary."""
+
+    observation_space = gym.spaces.Dict(a=Valid.observation_space, b=Valid.observation_space)
+
+    def reset(self, *, seed=None, options=None):
+        return dict.fromkeys("ab", 0), {}
+
+
+@pytest.mark.parametrize("algo", ["dqn", "ppo", "a2c", "ppo_lstm", "trpo"])
+def test_a_default_serves_dictionaries(algo, monkeypatch):
+    monkeypatch.setitem(
+        gym.registry, "Pair-v0", gym.envs.registration.EnvSpec("Pair-v0", Pair, max_episode_steps=3)
+    )
+    policy = algorithm_kwargs(spec_of(algo, "Pair-v0"))["policy"]
+    assert policy == ("MultiInputLstmPolicy" if algo == "ppo_lstm" else "MultiInputPolicy")

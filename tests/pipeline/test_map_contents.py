@@ -4,7 +4,7 @@ import gymnasium as gym
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.map_contents import with_maps_read
+from pipeline.map_contents import with_logs_located, with_maps_read
 
 ROWS = ["S..", ".#.", "..G"]
 
@@ -47,3 +47,19 @@ def test_what_is_no_file_is_left_alone(monkeypatch):
 def test_a_missing_file_is_named():
     with pytest.raises(UserError, match=r"Warehouse-v0: desc: cannot read the map file no\.txt"):
         with_maps_read("Warehouse-v0", {"env_kwargs": {"desc": "no.txt"}})
+
+
+def test_a_log_is_found_from_other_folders(tmp_path):
+    settings = {
+        "gamma": 0.9,
+        "env_kwargs": {"log": "pulls.csv"},
+        "eval_env_kwargs": {"log": "/a.csv"},
+    }
+    assert with_logs_located("ReplayBandit-v0", settings) == {
+        "gamma": 0.9,
+        "env_kwargs": {"log": str(tmp_path / "pulls.csv")},
+        "eval_env_kwargs": {"log": "/a.csv"},
+    }
+    assert settings["env_kwargs"]["log"] == "pulls.csv"
+    assert with_logs_located("FrozenLake-v1", settings) == settings
+    assert with_logs_located("ReplayBandit-v0", {"env_kwargs": None}) == {"env_kwargs": None}

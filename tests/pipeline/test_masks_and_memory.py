@@ -102,6 +102,12 @@ def test_masks_are_heeded_in_play(corridor):
     assert len(played) == 3
 
 
+def test_masks_that_are_not_there_are_missed_in_one_line():
+    agent = load_algorithm("ppo_mask")("MlpPolicy", Corridor(), seed=0, device="cpu", **SMALL)
+    with pytest.raises(UserError, match="MaskablePPO has to be told which actions are valid, and"):
+        next(play_episodes(agent, make_vec_env("FrozenLake-v1", 1), 1))
+
+
 def test_an_agent_that_does_not_listen_is_asked_as_ever(corridor):
     agent = load_algorithm("random")("RandomPolicy", Corridor(), seed=0)
     env = make_vec_env(lambda: gym.make(corridor), 1)
@@ -115,7 +121,7 @@ def test_an_environment_without_masks_is_refused():
     (line,) = str(caught.value).splitlines()
     assert line.startswith(
         "ppo_mask does not fit CartPole-v1: it needs to be told which actions are valid, by a "
-        "method action_masks(); fitting agents: dqn, "
+        "method action_masks() or by info['action_mask']; fitting agents: dqn, "
     )
     assert "ppo_mask" not in line.partition("fitting agents")[2]
 
