@@ -16,6 +16,7 @@ from commands.flag_values import (
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
+from commands.streams import go_on_unread
 
 if TYPE_CHECKING:
     from pipeline.model_choice import ChosenModel, ModelRequest
@@ -156,6 +157,8 @@ def main() -> int:
         from pipeline.model_choice import with_statistics
 
         chosen = with_statistics(found, wanted)
+    if film is not None or args.reward_log:
+        go_on_unread()
     n_steps = args.n_timesteps if args.n_timesteps >= 0 else None
     request = PlayingRequest(
         n_episodes=10 if args.n_episodes is None and n_steps is None else args.n_episodes,

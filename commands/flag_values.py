@@ -9,8 +9,10 @@ from collections.abc import Callable, Mapping
 from decimal import Decimal
 
 from pipeline.errors import shown
+from pipeline.files import portable_name
 
 LARGEST = 10**12
+LONGEST_FOLDER_NAME = 200  # bytes
 _NO_FOLDER_NAME = {"", ".", ".."}
 _NOT_IN_FOLDER_NAMES = set("/\\\0\n")
 
@@ -94,6 +96,10 @@ def folder_name(text: str) -> str:
     """
     if text.strip() in _NO_FOLDER_NAME or not _NOT_IN_FOLDER_NAMES.isdisjoint(text):
         raise argparse.ArgumentTypeError(f"must be the name of one folder, not {shown(text)}")
+    if portable_name(text, LONGEST_FOLDER_NAME) != text:
+        raise argparse.ArgumentTypeError(
+            f"must be a name that every system takes, not {shown(text)}"
+        )
     return text
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
+from commands.flag_values import LONGEST_FOLDER_NAME
 from commands.parsing import check_tensorboard
 from experiments.study_files import find_study, read_study
 from experiments.study_spec import (
@@ -24,8 +25,6 @@ from pipeline.errors import UserError, unknown
 from pipeline.run_folder import environment_name
 from pipeline.settings.literals import parse_assignments
 from pipeline.user_modules import import_typed
-
-LONGEST_STUDY_NAME = 200  # bytes
 
 
 def study_spec(args: argparse.Namespace) -> StudySpec:
@@ -72,7 +71,7 @@ def _study_of_flags(args: argparse.Namespace) -> StudySpec:
     agents, environments = ", ".join(args.algos), ", ".join(args.env)
     folders = "-".join(map(environment_name, args.env))
     return StudySpec(
-        name=file_name(f"{folders}_{'-'.join(args.algos)}", LONGEST_STUDY_NAME),
+        name=file_name(f"{folders}_{'-'.join(args.algos)}", LONGEST_FOLDER_NAME),
         title=f"{agents} on {environments}",
         agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
         environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),

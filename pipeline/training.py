@@ -154,11 +154,14 @@ def _give_up(training: Training, error: BaseException) -> None:
     """Note the reason; or remove the folder, where the agent failed before its first step.
 
     Raises:
-        UserError: in that case.
+        UserError: in that case, where the agent's settings are at fault.
     """
     run, model = training.run, training.model
-    if isinstance(error, ValueError) and model.num_timesteps == model._num_timesteps_at_start:
+    has_begun = model.num_timesteps > model._num_timesteps_at_start
+    if isinstance(error, ValueError | OSError) and not has_begun:
         run.discard()
+        if isinstance(error, OSError):  # says for itself which file it was
+            return
         message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
         raise UserError(message) from error
     run.update_info(state=FAILED, reason=one_line(error))

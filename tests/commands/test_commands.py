@@ -212,6 +212,7 @@ MISTAKES = {
     "agent to go on with": (["-i", "nowhere.zip"], "no such model file: nowhere.zip"),
     "module": (["--gym-packages", "no_such_module"], "cannot import no_such_module"),
     "form of an assignment": (["-params", "learning_rate"], "learning_rate"),
+    "TensorBoard's folder": (["-tb", "/dev/null/logs"], "Not a directory: /dev/null/logs"),
     "two budgets": (["-params", "n_episodes:5"], "not both"),
 }
 
@@ -226,7 +227,8 @@ def test_a_mistake_ends_in_one_line_and_leaves_nothing(type_command, tmp_path, m
     assert err.startswith("train.py: error: ")
     assert complaint in err
     # What only the libraries can tell comes after the line that is printed before they are loaded.
-    is_late = mistake in ("hyperparameter", "type", "range", "choice")
+    late = ("hyperparameter", "type", "range", "choice", "TensorBoard's folder")
+    is_late = mistake in late
     assert out.partition("\n")[0] == ("qlearning on FrozenLake-v1, seed 0, 500 steps" * is_late)
     assert contents(tmp_path) == []
 

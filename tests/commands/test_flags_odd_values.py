@@ -79,7 +79,7 @@ MEANINGS = [
     (COMPARE, "--margin", {"0": 0.0, "0.5": 0.5}, "-1 nan inf"),
     (COMPARE, "--episodes-table", {"10": 10}, "0"),
     (COMPARE, "--render-every", {"0": 0, "10": 10}, "-1"),
-    (COMPARE, "--name", {"my study": "my study"}, ".. a/b /"),
+    (COMPARE, "--name", {"my study": "my study"}, ".. a/b / CON a:b nul.txt"),
 ]
 
 

@@ -155,6 +155,10 @@ def test_a_training_goes_on_after_its_reader_has_gone_and_playing_ends(
     line, err, code = left_by_its_reader(tmp_path, "enjoy.py", model, *for_ever)
     assert line.startswith("qlearning on FrozenLake-v1")
     assert (err, code) == ("", 0)
+    # Where a film is wanted, that is what the work is for.
+    film = ["--n-episodes", 1, "--record", "film.gif", "--reward-log", "returns"]
+    assert left_by_its_reader(tmp_path, "enjoy.py", model, *film)[1:] == ("", 0)
+    assert (tmp_path / "film.gif").stat().st_size > 0
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device to write to")

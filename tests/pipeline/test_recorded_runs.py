@@ -247,7 +247,7 @@ def test_modules_are_not_imported_because_a_folder_asks(zoo, tmp_path):
     with pytest.raises(UserError, match=r"modules of yours \(fly\).*: add --gym-packages fly$"):
         choose_model(ModelRequest(folder, is_trusted=True))
     args.write_text("{algo: a2c, env: 'antigravity_module:Fly-v0'}")
-    with pytest.raises(UserError, match="'antigravity_module:Fly-v0'.*--gym-packages antigrav"):
+    with pytest.raises(UserError, match=r"'antigravity_module:Fly-v0'.*--gym-packages antigrav"):
         choose_model(ModelRequest(folder, is_trusted=True))
 
 
