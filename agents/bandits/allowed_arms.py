@@ -110,9 +110,7 @@ def choose_allowed_arms(
             return i
         known = allowed_tables(agent.tables, rows[i], masks[i], room)
         numbers = agent.arms[: known.scores.shape[1]]
-        smaller = ScoreAgent(
-            agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng
-        )
+        smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
         chosen = choose_arm(smaller, 0, progress)
         arms[i] = room.arms[chosen]
         probabilities[i] = choice_probability(smaller, 0, chosen)
