@@ -358,8 +358,8 @@ class ToldByInfo(SegmentBandit):
         return obs, {**info, "action_mask": SoldOut.masks[obs].copy()}
 
     def step(self, action):
-        obs, reward, terminated, truncated, info = super().step(action)
-        return obs, reward, terminated, truncated, {**info, "action_mask": SoldOut.masks[obs].copy()}
+        obs, *rest, info = super().step(action)
+        return obs, *rest, {**info, "action_mask": SoldOut.masks[obs].copy()}
 
 
 @pytest.fixture
@@ -421,10 +421,10 @@ def test_an_environment_without_masks(name):
 
 
 def test_agents_that_choose_among_all_arms():
-    with pytest.raises(ValueError, match="^mask_actions: OwnChoice chooses among all arms$"):
+    with pytest.raises(ValueError, match=r"^mask_actions: OwnChoice chooses among all arms$"):
         OwnChoice(env=Shop(), mask_actions=True)
     MABWiserUCB1 = load_algorithm("mabwiser_ucb1")  # noqa: N806
-    with pytest.raises(TypeError, match="^MABWiserUCB1 has no argument 'mask_actions'$"):
+    with pytest.raises(TypeError, match=r"^MABWiserUCB1 has no argument 'mask_actions'$"):
         MABWiserUCB1(env=Shop(), mask_actions=True)
 
 
