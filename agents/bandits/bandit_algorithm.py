@@ -230,7 +230,8 @@ class BanditAlgorithm(LearningAlgorithm):
         if len(masks) != n:
             shape, right = np.shape(told), (n, self.n_arms)
             raise ValueError(f"action_masks must be of shape {right}, not {shape}")
-        return checked_masks(masks, obs.reshape(n, -1), self.n_arms)
+        one_each = obs.reshape(n, *(self.observation_space.shape or ()))
+        return checked_masks(masks, one_each, self.n_arms)
 
     def _record_training(self) -> None:
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -299,7 +299,7 @@ def test_predict_refuses_in_one_line():
         ),
         (
             lambda: model.predict(2, action_masks=[True] * 3),
-            r"the action mask for observation \[2\] has shape \(3,\), it must be \(4,\), a bool .*",
+            r"the action mask for observation 2 has shape \(3,\), it must be \(4,\), a bool .*",
         ),
         (
             lambda: vectors.predict(np.eye(C)[0], deterministic=True),
