@@ -12,12 +12,21 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 
+from agents.bandits.arm_policy import ArmPolicy
 from agents.bandits.reward_checks import ANY, check_kinds, check_reward
+from agents.common.mask_reading import check_masks_exist, checked_masks, present_masks
 from agents.common.online import Transitions
 from agents.common.setting_checks import check_space
 from agents.common.signatures import LearningArguments
+from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from mdp.array_types import Bools, Floats, Ints
+
+
+class BanditArguments(LearningArguments, total=False):
+    """What the constructors of agents hand on that go by masks; see `BanditAlgorithm`."""
+
+    mask_actions: bool
 
 
 class Pull(NamedTuple):
@@ -28,12 +37,14 @@ class Pull(NamedTuple):
         arm: what was pulled.
         reward: what it gave.
         probability: how likely the choice was, for the rules that need to know; else 1.
+        mask: the arms that were allowed, a bool for each; None for agents that do not go by masks.
     """
 
     context: Any
     arm: int
     reward: float
     probability: float
+    mask: list[bool] | None = None
 
 
 class BanditAlgorithm(LearningAlgorithm):
@@ -47,21 +58,29 @@ class BanditAlgorithm(LearningAlgorithm):
         policy: name of the policy.
         env: environment with `Discrete` actions, the arms, or its id.
         learning_rate: step size, for agents that have one.
+        mask_actions: choose among the arms that the environment allows at each pull, and learn as
+            if there were no others. It says so by a method `action_masks()`, which may go by more
+            than the context.
         kwargs: as in `LearningAlgorithm`.
 
     Raises:
-        ValueError: if an argument lies outside its range, or a space or a reward does not fit.
+        ValueError: if an argument lies outside its range, or a space or a reward does not fit; if
+            masks are asked for and the environment or the agent has no use for them, or one is
+            malformed or allows nothing.
     """
 
-    _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities")
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
 
     def __init__(
         self,
         policy: str | type[BasePolicy],
         env: GymEnv | str | None = None,
         learning_rate: StepSize = 0.0,
+        mask_actions: bool = False,
         **kwargs: Unpack[LearningArguments],
     ) -> None:
+        self.mask_actions = mask_actions
+        self._masks: Bools = np.ones((0, 0), dtype=np.bool_)
         self._pending: list[list[Any]] = []
         self._infos: list[dict[str, Any]] = []
         self._probabilities: Floats = np.ones(0)
@@ -69,6 +88,24 @@ class BanditAlgorithm(LearningAlgorithm):
 
     def _check_arguments(self) -> None:
         check_space(self, "actions", self.action_space)
+        if self.mask_actions:
+            self._check_masks()
+
+    def _check_masks(self) -> None:
+        """Refuse masks that the environment does not tell, or the agent does not go by."""
+        if _owner(type(self), "_choose") is not _owner(type(self), "_choose_allowed"):
+            raise ValueError(f"mask_actions: {type(self).__name__} chooses among all arms")
+        if self.env is not None:
+            check_masks_exist(self.env)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.mask_actions and isinstance(self.observation_space, spaces.Discrete):
+            cast(ArmPolicy, self.policy).keep_masks()
+
+    def check_compilable(self) -> None:
+        if self.mask_actions:
+            raise NotCompilable("the environment is asked for its action masks at each pull")
 
     @property
     def n_arms(self) -> int:
@@ -88,6 +125,12 @@ class BanditAlgorithm(LearningAlgorithm):
     def _choose(self, contexts: Any, rng: np.random.Generator) -> tuple[Ints, Floats]:
         """An arm for each context and how likely it was, shapes (n,)."""
 
+    def _choose_allowed(
+        self, contexts: Any, masks: Bools, rng: np.random.Generator
+    ) -> tuple[Ints, Floats]:
+        """As `_choose`, among the arms in ``masks``, of shape (n, arms)."""
+        raise NotImplementedError
+
     @abstractmethod
     def _learn(self, pull: Pull) -> None:
         """Learn from one pull."""
@@ -97,15 +140,30 @@ class BanditAlgorithm(LearningAlgorithm):
     ) -> tuple[int, BaseCallback]:
         assert self.env is not None
         check_kinds(self, self.env)
+        if self.mask_actions:
+            self._check_masks()
         return super()._setup_learn(total_timesteps, callback, *args, **kwargs)
 
     def _begin_episodes(self) -> None:
         self._pending = [[] for _ in range(self.n_envs)]
 
     def _choose_actions(self) -> Ints:
-        contexts = self._contexts(cast(Any, self._last_obs))
-        actions, self._probabilities = self._choose(contexts, self.rng)
+        obs: Any = self._last_obs
+        contexts = self._contexts(obs)
+        if not self.mask_actions:
+            actions, self._probabilities = self._choose(contexts, self.rng)
+            return actions
+        assert self.env is not None
+        self._masks = present_masks(self.env, obs)
+        actions, self._probabilities = self._choose_allowed(contexts, self._masks, self.rng)
+        if len(self._policy_masks):
+            self._policy_masks[obs] = self._masks
         return actions
+
+    @property
+    def _policy_masks(self) -> Bools:
+        """What was allowed last in each context, of no rows where contexts are vectors."""
+        return cast(ArmPolicy, self.policy).masks
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Bools | None = None) -> None:
         super()._update_info_buffer(infos, dones)
@@ -120,7 +178,8 @@ class BanditAlgorithm(LearningAlgorithm):
                 reward = float(transitions.rewards[i])
                 check_reward(self, reward)
                 arm, probability = int(transitions.actions[i]), float(self._probabilities[i])
-                pending.append([contexts[i], arm, reward, probability])
+                told = [self._masks[i].tolist()] if self.mask_actions else []
+                pending.append([contexts[i], arm, reward, probability, *told])
             if info.get("feedback_due", True) or transitions.dones[i]:
                 for pull in pending:
                     self._learn(Pull(*pull))
@@ -133,20 +192,53 @@ class BanditAlgorithm(LearningAlgorithm):
         state: tuple[NDArray[Any], ...] | None = None,
         episode_start: NDArray[Any] | None = None,
         deterministic: bool = False,
+        action_masks: Any = None,
     ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
         """The arm judged best, or an exploring choice unless ``deterministic``.
 
         Takes one observation or an array of n, and returns an action or n of them, and ``state``;
-        ``episode_start`` is not used.
+        ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape (n, arms)
+        say what is allowed; without them it is what was allowed last in the context.
+
+        Raises:
+            ValueError: if there are masks and the agent does not go by them, or none and it does.
         """
-        if deterministic:
+        if action_masks is not None and not self.mask_actions:
+            raise ValueError("action_masks: the agent was made without mask_actions")
+        if deterministic and not self.mask_actions:
             return super().predict(observation, state, episode_start, deterministic)
         obs = np.asarray(observation)
-        actions, _ = self._choose(self._contexts(obs), self.predict_rng)
+        contexts = self._contexts(obs)
+        if not self.mask_actions:
+            actions, _ = self._choose(contexts, self.predict_rng)
+        else:
+            masks = self._masks_at(obs, len(contexts), action_masks)
+            if deterministic:
+                actions = cast(ArmPolicy, self.policy).best_arms(obs, masks)
+            else:
+                actions, _ = self._choose_allowed(contexts, masks, self.predict_rng)
         shape = obs.shape[: obs.ndim - len(self.observation_space.shape or ())]
         return actions.reshape(shape), state
+
+    def _masks_at(self, obs: NDArray[Any], n: int, told: Any) -> Bools:
+        """The arms to choose among at ``n`` observations, told or kept, shape (n, arms)."""
+        if told is None and not len(self._policy_masks):
+            raise ValueError("mask_actions: predict needs action_masks where contexts are vectors")
+        if told is None:
+            return cast(ArmPolicy, self.policy).kept_masks(obs.reshape(-1).astype(np.int64))
+        masks = np.atleast_2d(told)
+        if len(masks) != n:
+            shape, right = np.shape(told), (n, self.n_arms)
+            raise ValueError(f"action_masks must be of shape {right}, not {shape}")
+        one_each = obs.reshape(n, *(self.observation_space.shape or ()))
+        return checked_masks(masks, one_each, self.n_arms)
 
     def _record_training(self) -> None:
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if self.exploration_schedule(1.0) > 0:
             self.logger.record("rollout/exploration_rate", self.exploration_rate)
+
+
+def _owner(cls: type, name: str) -> type:
+    """The class that an attribute of ``cls`` stands in."""
+    return next(base for base in cls.__mro__ if name in vars(base))

@@ -75,6 +75,7 @@ def run_batch(
         check_bandit(env)
         agent: Any = cls(env=env, **(kwargs or {}))
         check_kinds(agent, agent.env)
+        agent.check_compilable()
         runs = Runs(agent, env, np.array(list(seeds), dtype=np.int64), pulls, moments)
         for index in range(len(runs.seeds)):
             runs.run(index)

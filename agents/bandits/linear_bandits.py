@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from agents.bandits.bandit_algorithm import BanditAlgorithm, Pull
+from agents.bandits.allowed_arms import choose_all_allowed_by_model
+from agents.bandits.bandit_algorithm import BanditAlgorithm, BanditArguments, Pull
 from agents.bandits.linear_agent import (
     LinearAgent,
     Regressions,
@@ -32,13 +33,13 @@ from agents.common.setting_checks import (
     check_space,
     settings_of,
 )
-from agents.common.signatures import ExplorationDecay, LearningArguments
+from agents.common.signatures import ExplorationDecay
 from agents.compiled.generators import generator_of, handles_of
-from mdp.array_types import Floats, Ints
+from mdp.array_types import Bools, Floats, Ints
 from mdp.machine_code import inlined
 
 
-class LinearArguments(LearningArguments, total=False):
+class LinearArguments(BanditArguments, total=False):
     """What the constructors of these agents take; see `LinearBanditAgent`."""
 
     ridge: float
@@ -101,7 +102,7 @@ class LinearBanditAgent(BanditAlgorithm):
         policy: str | type[BasePolicy] = "LinearBanditPolicy",
         env: GymEnv | str | None = None,
         ridge: float = 1.0,
-        **kwargs: Unpack[LearningArguments],
+        **kwargs: Unpack[BanditArguments],
     ) -> None:
         self.ridge = ridge
         super().__init__(policy, env, **kwargs)
@@ -161,8 +162,16 @@ class LinearBanditAgent(BanditAlgorithm):
         )
         return arms, np.ones(len(arms))
 
+    def _choose_allowed(
+        self, contexts: Floats, masks: Bools, rng: np.random.Generator
+    ) -> tuple[Ints, Floats]:
+        arms, room = (np.empty(n, dtype=np.int64) for n in (len(contexts), self.n_arms))
+        agent = self._workspace_for(rng, len(contexts))
+        choose_all_allowed_by_model(agent, contexts, masks, room, self.progress()[0], arms)
+        return arms, np.ones(len(arms))
+
     def _learn(self, pull: Pull) -> None:
-        record = np.array([(0, *pull[1:])], dtype=PULL)[0]
+        record = np.array([(0, *pull[1:4])], dtype=PULL)[0]
         learn_one_by_model(self._workspace_for(self.rng, 1), record, np.array(pull.context))
 
 

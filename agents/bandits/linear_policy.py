@@ -10,12 +10,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import Schedule
 
+from agents.bandits.arm_policy import ArmPolicy
 from agents.bandits.linear_agent import Regressions
-from agents.common.table_policy import TablePolicy
 from mdp.array_types import Floats
 
 
-class LinearBanditPolicy(TablePolicy):
+class LinearBanditPolicy(ArmPolicy):
     """Pulls the arm of the highest predicted reward.
 
     Args:
@@ -62,14 +62,9 @@ class LinearBanditPolicy(TablePolicy):
             self.counts.numpy(),
         )
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
-        """The first of the best arms; shapes (n,) or (n, d) to (n,)."""
-        assert isinstance(observation, th.Tensor)
-        contexts = features(self.observation_space, observation.numpy())
-        predicted = contexts @ self.coefficients.numpy().T
-        return th.from_numpy(predicted.argmax(axis=1))
+    def judged(self, observations: NDArray[Any]) -> Floats:
+        contexts = features(self.observation_space, observations)
+        return np.asarray(contexts @ self.coefficients.numpy().T)
 
 
 def number_of_features(space: spaces.Space[Any]) -> int:

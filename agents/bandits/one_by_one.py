@@ -16,6 +16,7 @@ from agents.bandits.linear_bandits import LinearBanditAgent
 from agents.bandits.pull_log import PullLog
 from agents.bandits.table_bandit import TableBandit
 from agents.registry import load_algorithm
+from envs.wrappers import ActionMasks
 
 
 def run_one_by_one(
@@ -58,7 +59,8 @@ def _run(
     pulls: int | None,
 ) -> dict[str, Any]:
     """The arrays of one run, without their first axis."""
-    env = Monitor(gym.make(env_id, **env_kwargs))
+    made = gym.make(env_id, **env_kwargs)
+    env = Monitor(ActionMasks(made) if kwargs.get("mask_actions") else made)
     log = PullLog()
     try:
         n_pulls = checked_pulls(env, pulls)

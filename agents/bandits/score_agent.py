@@ -27,6 +27,18 @@ PULL = np.dtype(
 )
 
 
+@by_type
+def masked_count(tables: Any) -> int:
+    """Number of the rewards of arms in the context that are left out of the tables."""
+    raise CompiledOnlyError
+
+
+@by_type
+def masked_sum(tables: Any) -> float:
+    """Sum of the rewards of arms in the context that are left out of the tables."""
+    raise CompiledOnlyError
+
+
 class ScoreTables(NamedTuple):
     """What an agent knows; each of shape (contexts, arms).
 
@@ -39,6 +51,16 @@ class ScoreTables(NamedTuple):
     scores: Floats
     sums: Floats
     counts: Ints
+
+    @inlined
+    def masked_count(self) -> int:
+        """All arms are in the tables."""
+        return 0
+
+    @inlined
+    def masked_sum(self) -> float:
+        """All arms are in the tables."""
+        return 0.0
 
 
 class Feedback(NamedTuple):
@@ -58,7 +80,7 @@ class ScoreAgent(NamedTuple):
 
     Attributes:
         settings: a record of the type that its class has.
-        tables: what it knows.
+        tables: what it knows, `ScoreTables` or `AllowedTables`.
         feedback: pulls that are not learnt from yet.
         arms: room for a number for each arm, shape (arms,).
         draws: room for the random numbers of a choice, shape (2,).
@@ -66,7 +88,7 @@ class ScoreAgent(NamedTuple):
     """
 
     settings: Any
-    tables: ScoreTables
+    tables: Any
     feedback: Feedback
     arms: Floats
     draws: Floats
@@ -107,18 +129,18 @@ def nothing_before(agent: ScoreAgent, pull: Any, progress: Any) -> None:
 
 
 @inlined
-def total_count(tables: ScoreTables, row: int) -> int:
-    """Rewards seen in a context."""
-    total = 0
+def total_count(tables: Any, row: int) -> int:
+    """Rewards seen in a context, those of masked arms among them."""
+    total = masked_count(tables)
     for arm in range(tables.counts.shape[1]):
         total += tables.counts[row, arm]
     return total
 
 
 @inlined
-def mean_reward(tables: ScoreTables, row: int) -> float:
+def mean_reward(tables: Any, row: int) -> float:
     """Average of all rewards seen in a context, at least one."""
-    total = 0.0
+    total = masked_sum(tables)
     for arm in range(tables.sums.shape[1]):
         total += tables.sums[row, arm]
     return total / total_count(tables, row)

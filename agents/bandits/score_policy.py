@@ -7,14 +7,15 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from numpy.typing import NDArray
 from stable_baselines3.common.type_aliases import Schedule
 
+from agents.bandits.arm_policy import ArmPolicy
 from agents.bandits.score_agent import ScoreTables
-from agents.common.table_policy import TablePolicy
 from mdp.array_types import Floats, Ints
 
 
-class BanditPolicy(TablePolicy):
+class BanditPolicy(ArmPolicy):
     """Pulls the arm of the highest score in the context.
 
     The tables are buffers, so that they travel in the ``policy.pth`` of a model file.
@@ -64,13 +65,10 @@ class BanditPolicy(TablePolicy):
         """Average reward of each arm, nan where there is none, shape (C, A)."""
         return mean_rewards(self.sums.numpy(), self.counts.numpy())
 
-    def _predict(
-        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
-    ) -> th.Tensor:
-        """The first of the best arms; shapes (n,) to (n,)."""
-        assert isinstance(observation, th.Tensor)
-        rows = observation.long().flatten().numpy()
-        return th.from_numpy(self.scores.numpy()[rows % len(self.scores)].argmax(axis=1))
+    def judged(self, observations: NDArray[Any]) -> Floats:
+        rows = observations.astype(np.int64).reshape(-1)
+        scores: Floats = self.scores.numpy()[rows % len(self.scores)]
+        return scores
 
 
 def mean_rewards(sums: Floats, counts: Ints) -> Floats:

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.bandits.bandit_algorithm import BanditAlgorithm, Pull
+from agents.bandits.allowed_arms import allowed_room, choose_allowed_arms, learn_one_allowed
+from agents.bandits.bandit_algorithm import BanditAlgorithm, BanditArguments, Pull
 from agents.bandits.score_agent import (
     PULL,
     Feedback,
@@ -25,13 +26,12 @@ from agents.bandits.score_agent import (
 )
 from agents.bandits.score_policy import BanditPolicy
 from agents.common.setting_checks import check_space
-from agents.common.signatures import LearningArguments
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import StepSize
-from mdp.array_types import Floats, Ints
+from mdp.array_types import Bools, Floats, Ints
 
 
-class TableArguments(LearningArguments, total=False):
+class TableArguments(BanditArguments, total=False):
     """What the constructors of these agents take; see `TableBandit`."""
 
     ignore_context: bool
@@ -64,7 +64,7 @@ class TableBandit(BanditAlgorithm):
         env: GymEnv | str | None = None,
         learning_rate: StepSize = 0.0,
         ignore_context: bool = False,
-        **kwargs: Unpack[LearningArguments],
+        **kwargs: Unpack[BanditArguments],
     ) -> None:
         self.ignore_context = ignore_context
         super().__init__(policy, env, learning_rate, **kwargs)
@@ -125,17 +125,39 @@ class TableBandit(BanditAlgorithm):
             arms,
             probabilities,
         )
+        self._check_context(contexts, outside)
+        return arms, probabilities
+
+    def _choose_allowed(
+        self, contexts: Ints, masks: Bools, rng: np.random.Generator
+    ) -> tuple[Ints, Floats]:
+        arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
+        outside = choose_allowed_arms(
+            self._workspace_for(rng, len(contexts)),
+            contexts,
+            masks,
+            allowed_room(self.n_arms),
+            self.progress()[0],
+            arms,
+            probabilities,
+        )
+        self._check_context(contexts, outside)
+        return arms, probabilities
+
+    def _check_context(self, contexts: Ints, outside: int) -> None:
+        """Refuse the context at ``outside``, unless that is -1."""
         if outside >= 0:
             n_contexts = len(self.policy.scores)
             raise ValueError(f"context {contexts[outside]} is not in Discrete({n_contexts})")
-        return arms, probabilities
 
     def _learn(self, pull: Pull) -> None:
-        learn_one(
-            self._workspace_for(self.rng, 1),
-            np.array([tuple(pull)], dtype=PULL)[0],
-            self.progress()[0],
-        )
+        agent, progress = self._workspace_for(self.rng, 1), self.progress()[0]
+        record = np.array([pull[:4]], dtype=PULL)[0]
+        if pull.mask is None:
+            learn_one(agent, record, progress)
+        else:
+            mask = np.array(pull.mask, dtype=np.bool_)
+            learn_one_allowed(agent, record, mask, allowed_room(self.n_arms), progress)
 
     def estimates(self, tables: ScoreTables) -> Floats:
         """What the agent takes the arms' mean rewards for, shapes (..., contexts, arms)."""

@@ -11,11 +11,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
-from agents.common.table_policy import TablePolicy
+from agents.common.mask_buffers import MaskBufferPolicy
 from mdp.array_types import Bools, Floats, Ints
 
 
-class QTablePolicy(TablePolicy):
+class QTablePolicy(MaskBufferPolicy):
     """Greedy in the mean of one or two tables of action values.
 
     The tables are float64 buffers, so that they travel in the ``policy.pth`` of a model file and
@@ -30,13 +30,10 @@ class QTablePolicy(TablePolicy):
     Attributes:
         q_tables: action values, float64 of shape (T, S, A).
         visit_counts: number of updates of each entry, int64 of shape (T, S, A).
-        allowed_actions: what the environment allows at each observation, bool of shape (S, A), a
-            row of False where that is not known; only there after `keep_masks`.
     """
 
     q_tables: th.Tensor
     visit_counts: th.Tensor
-    allowed_actions: th.Tensor
 
     def __init__(
         self,
@@ -58,25 +55,6 @@ class QTablePolicy(TablePolicy):
     def q_table(self) -> Floats:
         """The action values that the agent acts on, shape (S, A)."""
         return np.asarray(self.q_tables.numpy().mean(axis=0))
-
-    def keep_masks(self) -> None:
-        """Make room for what the environment allows."""
-        self.register_buffer("allowed_actions", th.zeros(self.q_tables.shape[1:], dtype=th.bool))
-
-    @property
-    def masks(self) -> Bools:
-        """`allowed_actions` as an array that shares its memory, of no rows where there are none."""
-        if "allowed_actions" not in self._buffers:
-            return np.zeros((0, self.q_tables.shape[2]), dtype=np.bool_)
-        return np.asarray(self.allowed_actions.numpy())
-
-    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over tables; an agent may go by masks that was saved without them, or no longer."""
-        tables = {name: state_dict[name] for name in state_dict if name != "allowed_actions"}
-        if "allowed_actions" in self._buffers:
-            unknown = th.zeros_like(self.allowed_actions)
-            tables["allowed_actions"] = state_dict.get("allowed_actions", unknown)
-        return super().load_state_dict(tables, strict, assign)
 
     def note_masks(self, obs: Any, masks: Bools) -> None:
         """Keep what may be done at observations, which are of shape (n,); masks of shape (n, A).

@@ -186,7 +186,8 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
     """The probability of each arm before each logged pull, shape (n, arms of the agent).
 
     Raises:
-        UserError: if the agent does not observe what the log has for context.
+        UserError: if the agent does not observe what the log has for context, or has to be told
+            more than that.
     """
     agent: Any = policy.agent
     try:
@@ -196,7 +197,10 @@ def probabilities(policy: LoggedPolicy, data: LoggedData) -> Floats:
     reason = why_not_exact(agent, observations)
     if reason:
         raise UserError(f"{policy.name} cannot be judged on a log: {reason}")
-    return policy_matrix(agent, observations)
+    try:
+        return policy_matrix(agent, observations)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"{policy.name} cannot be judged on a log: {one_line(error)}") from error
 
 
 def n_arms(agent: BaseAlgorithm) -> int:

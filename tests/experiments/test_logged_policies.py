@@ -2,6 +2,7 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from agents import load_algorithm
@@ -152,3 +153,17 @@ def test_agents_that_observe_more_than_a_log_holds(log, tmp_path, key, value):
     folder = saved_agent(tmp_path / "run", log(NUMBERS), hyperparams={key: value})
     with pytest.raises(UserError, match=f"was trained with {key}: it observes more than a log"):
         read_policy(folder)
+
+
+class SomeSoldOut(ReplayBandit):
+    def action_masks(self):
+        return np.array([True, False])
+
+
+def test_an_agent_that_has_to_be_told_what_is_allowed(log):
+    rows = "".join(f"{i % 2},{i % 5},{i % 2},1,0.5\n" for i in range(20))
+    path = log("age,visits,arm,reward,propensity\n" + rows)
+    agent = load_algorithm("linucb")(env=SomeSoldOut(path), mask_actions=True)
+    message = "^runs/linucb cannot be judged on a log: mask_actions: predict needs action_masks"
+    with pytest.raises(UserError, match=message):
+        compare_policies(read_logged(path), [LoggedPolicy("runs/linucb", agent, None)])
