@@ -83,7 +83,10 @@ def decode(data: Any) -> Any:
         raise ValueError(f"damaged {name} in an agent's file: its fields are {', '.join(data)}")
     try:
         return codec.build(**{key: decode(item) for key, item in data.items() if key != TYPE})
-    except (TypeError, LookupError, AttributeError, AssertionError, ArithmeticError) as error:
+    except (
+        *(TypeError, LookupError, AttributeError, AssertionError, ArithmeticError),
+        RecursionError,
+    ) as error:
         raise ValueError(f"damaged {name} in an agent's file: {error}") from error
 
 

@@ -19,11 +19,11 @@ from agents.common.model_files import JsonAlgorithm
 from agents.common.schedules import ExponentialSchedule, library_schedule
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 
-DEEP = ("double_dqn", "deep_qlearning")
+LIBRARY_LIKE = ("dqn", "double_dqn", "deep_qlearning", "ars")
 HAND_WRITTEN = [
     name
     for name, entry in ALGORITHMS.items()
-    if entry.entry_point.startswith("agents.") and entry.is_installed and name not in DEEP
+    if entry.entry_point.startswith("agents.") and entry.is_installed and name not in LIBRARY_LIKE
 ]
 EXPONENTIAL = {
     "ppo": {"learning_rate": "exp_0.1_0.001", "clip_range": "exp_0.4_0.1"},
