@@ -62,7 +62,7 @@ def inspect_model(path: Path | str, makers: Mapping[str, Maker] | None = None) -
             suspicious.append(f"{name} {error}")
         else:
             found = tensors_in(tensors, name.removesuffix(".pth"))
-            weights |= {where: tuple(tensor.shape) for where, tensor in found}
+            weights |= {shown(where).strip("'"): tuple(tensor.shape) for where, tensor in found}
     sizes = {name: len(content) for name, content in members.items()}
     return Report(sizes, weights, settings, tuple(suspicious))
 
@@ -70,19 +70,20 @@ def inspect_model(path: Path | str, makers: Mapping[str, Maker] | None = None) -
 def _setting(key: str, value: Any, makers: Mapping[str, Maker] | None) -> tuple[str, list[str]]:
     """An attribute in one line, and what is suspicious about it."""
     is_odd = key in NOT_READ - {"tensorboard_log"} and value
-    doubts = [f"{key} is set, which models do not keep"] if is_odd else []
+    name = shown(key).strip("'")
+    doubts = [f"{name} is set, which models do not keep"] if is_odd else []
     if not (isinstance(value, dict) and SERIALIZED in value):
         return shown(value), doubts
     try:
         pickled = decoded(key, value[SERIALIZED])
-        names = sorted({shown(str(name)).strip("'") for name in names_in(read_tree(pickled))})
+        names = sorted({shown(str(one)).strip("'") for one in names_in(read_tree(pickled))})
         text = "a pickle of " + (", ".join(names) if names else "plain data")
     except UnsafeFileError as error:
-        return "a pickle that cannot be read", [*doubts, f"{key} {error}"]
+        return "a pickle that cannot be read", [*doubts, f"{name} {error}"]
     try:
         read_pickle(pickled, all_policy_classes(), makers)
     except UnsafeFileError as error:
-        doubts.append(f"{key} {error}")
+        doubts.append(f"{name} {error}")
     return text, doubts
 
 

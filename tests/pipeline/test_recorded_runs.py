@@ -216,7 +216,7 @@ def test_modules_are_not_imported_because_a_folder_asks(zoo, tmp_path):
     (tmp_path / "config.yml").write_text("{}")
     args = tmp_path / "args.yml"
     args.write_text("{algo: a2c, env: 'antigravity_module:Fly-v0', gym_packages: [fly]}")
-    with pytest.raises(UserError, match="not imported because a file asks: add --gym-packages ant"):
+    with pytest.raises(UserError, match=r"modules of yours \(fly\), and no module is imported"):
         choose_model(ModelRequest(folder))
     args.write_text("{algo: a2c, env: Fly-v0, gym_packages: [antigravity_module]}")
     with pytest.raises(UserError, match=r"modules of yours \(antigravity_module\)"):
