@@ -1,6 +1,7 @@
 """Every agent of the table that the library saves: loaded as data, it is what the library loads."""
 
 import json
+import sys
 import zipfile
 
 import numpy as np
@@ -13,9 +14,11 @@ from stable_baselines3.common.utils import set_random_seed
 from agents import ALGORITHMS, load_algorithm
 from agents.common.model_files import JsonAlgorithm
 from envs.wrappers import ActionMasks
+from pipeline.admitted_classes import own_classes
 from pipeline.errors import UserError
 from pipeline.model_loading import load_model, load_replay_buffer, load_to_play
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.user_modules import import_typed
 
 TINY = {"net_arch": [4]}
 OFF = {"learning_starts": 10, "buffer_size": 100, "batch_size": 8, "policy_kwargs": TINY}
@@ -159,3 +162,50 @@ def test_attributes_that_hide_something_or_are_none_are_refused(key, tmp_path):
     changed(path, **{key: 1})
     with pytest.raises(UserError, match=f"sets '{key}', which is no attribute of such an agent"):
         load_model("qlearning", path)
+
+
+MINE = """
+import agents
+from stable_baselines3 import PPO
+from stable_baselines3.common.torch_layers import FlattenExtractor
+
+agents.register("mine_ppo", f"{__name__}:Mine", actions="Discrete")
+
+
+class Net(FlattenExtractor):
+    pass
+
+
+class Job:
+    pass
+
+
+class Mine(PPO):
+    bonus = 0.5
+
+    def __init__(self, *args, bonus=0.5, **kwargs):
+        self.bonus = bonus
+        super().__init__(*args, **kwargs)
+"""
+
+
+def test_classes_of_the_users_are_admitted_where_the_module_was_typed(own_folder):
+    (own_folder / "mine.py").write_text(MINE)
+    modules = import_typed(["mine"])
+    net = sys.modules["mine"].Net
+    settings = {"policy": "MlpPolicy", "env": "CartPole-v1", "device": "cpu"}
+    settings["policy_kwargs"] = {**TINY, "features_extractor_class": net}
+    for name, more in (("ppo", {}), ("mine_ppo", {"bonus": 0.25})):
+        model = load_algorithm(name)(**settings, **more)
+        model.save(own_folder / "model.zip")
+        loaded = load_model(name, own_folder / "model.zip", modules=modules)
+        assert type(loaded) is type(model)
+        assert type(loaded.policy.features_extractor) is net
+        assert weights(loaded) == weights(model)
+        assert vars(loaded).get("bonus") == more.get("bonus")
+    load_algorithm("ppo")(**settings).save(own_folder / "model.zip")
+    with pytest.raises(UserError, match=r"refers to mine\.Net, .* --gym-packages MODULE"):
+        load_model("ppo", own_folder / "model.zip")
+    # What is no part of a network may not be named, wherever it comes from.
+    assert set(own_classes(load_algorithm("ppo"), modules)) >= {"mine.Net"}
+    assert "mine.Job" not in own_classes(load_algorithm("mine_ppo"), modules)
