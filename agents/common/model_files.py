@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
@@ -109,6 +110,7 @@ class JsonAlgorithm(BaseAlgorithm):
         policy = next(iter(cls.policy_aliases))
         model = cls(policy=policy, env=env, _init_setup_model=False)  # type: ignore[call-arg]
         _check_names(model, data)
+        _check_spaces(data)
         # Without a seed, setting up leaves alone what was saved with its state.
         model.__dict__.update({**data, "seed": None})
         model._setup_model()
@@ -159,6 +161,12 @@ def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:
             raise UnsafeFileError(f"sets {shown(name)}, which is no attribute of such an agent")
 
 
+def _check_spaces(data: Mapping[str, Any]) -> None:
+    for name in ("observation_space", "action_space"):
+        if not isinstance(data.get(name), spaces.Space):
+            raise UnsafeFileError(f"does not say its {name}")
+
+
 def _declared(cls: type) -> Iterable[str]:
     found: Mapping[str, Any] = vars(cls).get("__annotations__", {})
     return found
@@ -179,5 +187,6 @@ def _check_tables(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None
                     f"{name}.pth: {key} is not of the kind that such an agent has"
                 )
             # Scores of arms that were never pulled are infinite from the beginning.
-            may_be_infinite = like is not None and bool(th.isinf(like).any())
+            is_like = like is not None and like.shape == table.shape
+            may_be_infinite = is_like and bool(th.isinf(like).any())
             check_values({name: {key: table[~th.isinf(table)] if may_be_infinite else table}})

@@ -164,6 +164,17 @@ def test_attributes_that_hide_something_or_are_none_are_refused(key, tmp_path):
         load_model("qlearning", path)
 
 
+@pytest.mark.parametrize(
+    "space", [None, 3, {"type": "Discrete", "n": 10**9, "start": 0, "rng": None}]
+)
+def test_spaces_are_spaces_of_bearable_size(space, tmp_path):
+    path = tmp_path / "model.zip"
+    load_algorithm("optimal")(env="FrozenLake-v1", seed=0).save(path)
+    changed(path, observation_space=space)
+    with pytest.raises(UserError, match=r"does not say its observation_space|more than 10,000,000"):
+        load_model("optimal", path)
+
+
 MINE = """
 import agents
 from stable_baselines3 import PPO
