@@ -1,4 +1,4 @@
-"""Going on with a trained agent: where it lies, and what it brings along from its training.
+"""Going on with a trained agent: what it brings along from its training.
 
 A new run begins, in a folder of its own, with so many further steps. As in rl_zoo3, the agent's
 networks or tables, its statistics of VecNormalize and its replay buffer go on, and hyperparameters

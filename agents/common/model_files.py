@@ -99,7 +99,9 @@ class JsonAlgorithm(BaseAlgorithm):
         """
         members = read_members(_content(path), MEMBERS)
         if print_system_info:
-            sys.stdout.write(members.get("system_info.txt", b"").decode("ascii", "replace") + "\n")
+            text = members.get("system_info.txt", b"").decode("ascii", "replace")
+            # Nothing that a terminal obeys.
+            sys.stdout.writelines(f"{shown(line)[1:-1]}\n" for line in text.splitlines())
         data = {**cls._read_data(members, path, custom_objects), **kwargs}
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
@@ -183,9 +185,7 @@ def _check_tables(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None
         for key, table in found[name].items():
             like = tables.get(key)
             if not isinstance(table, th.Tensor) or (like is not None and table.dtype != like.dtype):
-                raise UnsafeFileError(
-                    f"{name}.pth: {key} is not of the kind that such an agent has"
-                )
+                raise UnsafeFileError(f"{name}.pth: {shown(key)} is not of the kind of such agents")
             # Scores of arms that were never pulled are infinite from the beginning.
             is_like = like is not None and like.shape == table.shape
             may_be_infinite = is_like and bool(th.isinf(like).any())
