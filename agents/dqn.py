@@ -45,6 +45,10 @@ class MaskedReplayBuffer(ReplayBuffer):
         shape = (self.buffer_size, self.n_envs, self.action_dim)
         self.actions = np.zeros(shape, dtype=self.actions.dtype)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # The masks of a batch are of that batch alone.
+        return {name: value for name, value in vars(self).items() if name != "sampled_masks"}
+
     def add(
         self,
         obs: NDArray[Any],

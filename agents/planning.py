@@ -66,8 +66,17 @@ class ActionTablePolicy(TablePolicy):
         return np.asarray(self.actions.numpy()[steps_left - 1, obs])
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over a plan of any number of steps."""
+        """Take over a plan of any number of steps.
+
+        Raises:
+            ValueError: if it is a plan for other observations or actions.
+        """
         if "actions" in state_dict:
+            n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+            plan = state_dict["actions"]
+            fits = plan.ndim == 2 and len(plan) and plan.shape[1] == self.actions.shape[1]
+            if not (fits and bool(((plan >= 0) & (plan < n_actions)).all())):
+                raise ValueError("holds no plan for these observations and actions")
             self.actions = th.zeros_like(state_dict["actions"])
         return super().load_state_dict(state_dict, strict, assign)
 

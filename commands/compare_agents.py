@@ -86,7 +86,6 @@ def _add_log_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
     add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
     add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
-    add("--trust", action="store_true", help="load a library zip from outside logs/")
 
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:

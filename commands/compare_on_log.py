@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from commands.terminal import table_console
 from pipeline.errors import UserError
 from pipeline.signs_of_life import Activity, doing
-from pipeline.user_modules import import_typed
+from pipeline.user_modules import UserModule, import_typed
 
 if TYPE_CHECKING:
     from experiments.off_policy.logged_policies import Comparison
@@ -25,26 +26,28 @@ def compare_on_log(args: argparse.Namespace) -> int:
         raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
     if args.study or args.env or args.algos:
         raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
-    import_typed(args.gym_packages)
+    modules = import_typed(args.gym_packages)
     console = table_console(highlight=False)
     n = len(args.policy)
     about = f"{n} {'policy' if n == 1 else 'policies'} on {args.logged}"
     console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries") as activity:
-        compared = _compare(args, activity)
+        compared = _compare(args, modules, activity)
     from report.off_policy_table import print_comparison
 
     print_comparison(console, compared)
     return 0
 
 
-def _compare(args: argparse.Namespace, activity: Activity) -> Comparison:
+def _compare(
+    args: argparse.Namespace, modules: Sequence[UserModule], activity: Activity
+) -> Comparison:
     from experiments.off_policy.logged_policies import compare_policies, read_logged, read_policy
 
     activity.now("reading the log")
     data = read_logged(args.logged)
     activity.now("loading the policies")
-    policies = [read_policy(Path(path), args.trust) for path in args.policy]
+    policies = [read_policy(Path(path), modules) for path in args.policy]
     names = [policy.name for policy in policies]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

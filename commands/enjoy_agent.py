@@ -71,11 +71,6 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="statistics of VecNormalize (default: those that lie with the model)",
     )
-    add(
-        "--trust",
-        action="store_true",
-        help="load a library zip, or statistics, from outside the log folder",
-    )
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=THREADS, default=1, help="torch threads (1); -1 leaves it to torch")
     _add_playing_flags(parser)

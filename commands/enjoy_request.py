@@ -29,7 +29,6 @@ def model_request(args: argparse.Namespace) -> ModelRequest:
         log_folder=Path(args.folder),
         run_number=args.exp_id,
         which=_which(args),
-        is_trusted=args.trust,
         statistics=None if args.vec_normalize is None else Path(args.vec_normalize),
         env_kwargs=parse_assignments(args.env_kwargs, "--env-kwargs"),
         user_modules=import_typed(args.gym_packages, [args.env or ""]),

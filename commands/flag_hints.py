@@ -45,6 +45,7 @@ INSTEAD: Mapping[str, str] = {
         ),
         _NO_WANDB,
     ),
+    "--trust": "it is not needed: whatever is loaded is read as data, and nothing in it is run",
     "--truncate-last-trajectory": "it is not a choice here: the library's default, true, holds",
 }
 

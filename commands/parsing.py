@@ -25,6 +25,7 @@ COMMANDS = {
     "train": "train an agent on an environment",
     "enjoy": "watch a trained agent",
     "compare": "compare agents over seeds, and write a page",
+    "inspect": "say what a model file holds, and run nothing of it",
 }
 
 # What stands for signs that a terminal's encoding lacks; a question mark for all others.

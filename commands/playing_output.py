@@ -114,7 +114,7 @@ def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None
     spec = chosen.spec
     with doing(console, "loading the agent"):
         env = playing_env(chosen, request.mode, request.n_envs, request.monitor_folder)
-        model = load_to_play(spec.algo, chosen.path, env, spec.device)
+        model = load_to_play(spec.algo, chosen.path, env, spec.device, spec.user_modules)
         env.seed(spec.seed)
     show = _Show(Activity(console, "playing"), request.mode, FrameTaker(env))
     # Pictures of letters show by themselves that something goes on.

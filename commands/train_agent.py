@@ -96,7 +96,6 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         "folder: its statistics, replay buffer, step counter and schedules go on, and "
         "hyperparameters are those given here, or of the file",
     )
-    add("--trust", action="store_true", help="let -i load what can run code from outside -f")
     add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=THREADS, default=1, help="torch threads (1); -1 leaves it to torch")

@@ -31,6 +31,10 @@ def _main_of(command: str) -> Callable[[], int]:
         from commands import enjoy_agent
 
         return enjoy_agent.main
+    if command == "inspect":
+        from commands import inspect_model
+
+        return inspect_model.main
     from commands import compare_agents
 
     return compare_agents.main

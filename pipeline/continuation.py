@@ -1,4 +1,4 @@
-"""Going on with a trained agent: where it lies, and what it brings along from its training.
+"""Going on with a trained agent: what it brings along from its training.
 
 A new run begins, in a folder of its own, with so many further steps. As in rl_zoo3, the agent's
 networks or tables, its statistics of VecNormalize and its replay buffer go on, and hyperparameters
@@ -12,16 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.companions import replay_buffer_of, statistics_of
-from pipeline.model_finding import model_at
-from pipeline.model_loading import (
-    REPLAY_BUFFER,
-    STATISTICS,
-    agent_class,
-    check_origin,
-    hand_written_algorithm,
-    load_model,
-    load_replay_buffer,
-)
+from pipeline.model_loading import agent_class, load_model, load_replay_buffer
 from pipeline.normalization import Statistics, normalising, read_statistics
 from pipeline.recorded_runs import run_around
 from pipeline.train_spec import TrainSpec
@@ -29,30 +20,6 @@ from pipeline.train_spec import TrainSpec
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
-
-
-def agent_to_continue(path: Path, log_folder: Path, is_trusted: bool) -> Path:
-    """The zip that a path means, with or without its suffix, or of a run folder.
-
-    Args:
-        path: of the zip or the run folder.
-        log_folder: the folder above all runs.
-        is_trusted: read what can run code from elsewhere too.
-
-    Raises:
-        UserError: if there is none, or it or what goes with it could run code and lies elsewhere.
-    """
-    model = model_at(path)
-    if not is_trusted:
-        if hand_written_algorithm(model) is None:
-            check_origin(model, log_folder)
-        for file, what in (
-            (_statistics_path(model), STATISTICS),
-            (replay_buffer_of(model), REPLAY_BUFFER),
-        ):
-            if file is not None:
-                check_origin(file, log_folder, what=what)
-    return model
 
 
 def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
@@ -87,7 +54,9 @@ def load_to_continue(
     if "n_steps" in kwargs and issubclass(agent_class(spec.algo), OffPolicyAlgorithm):
         # The library chooses a kind of buffer by it, and would leave that of the file.
         kwargs = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **kwargs}
-    model = load_model(spec.algo, trained_agent, env, device=spec.device, **kwargs)
+    model = load_model(
+        spec.algo, trained_agent, env, spec.user_modules, device=spec.device, **kwargs
+    )
     replay_buffer = replay_buffer_of(trained_agent)
     if replay_buffer is not None:
         load_replay_buffer(model, replay_buffer)

@@ -23,7 +23,7 @@ from pipeline.companions import statistics_of
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.model_finding import Which, model_at, model_of
-from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm, telling_masks
+from pipeline.model_loading import hand_written_algorithm, telling_masks
 from pipeline.module_records import check_recorded
 from pipeline.normalization import normalising, read_statistics
 from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
@@ -47,7 +47,6 @@ class ModelRequest:
         run_number: number of the run; 0 for the newest, -1 for one without a number.
         which: the model at the end of training, the best, that of the last checkpoint, or that of
             the checkpoint after so many steps.
-        is_trusted: read what can run code from outside the log folder too.
         statistics: a file of VecNormalize's statistics, instead of those that lie with the model.
         env_kwargs: arguments of the environment, to change those of the run.
         user_modules: modules of the user's, imported already; a run has no others imported.
@@ -61,7 +60,6 @@ class ModelRequest:
     log_folder: Path = Path("logs")
     run_number: int = 0
     which: Which = "final"
-    is_trusted: bool = False
     statistics: Path | None = None
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
     user_modules: tuple[UserModule, ...] = ()
@@ -154,9 +152,6 @@ def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
         raise UserError(f"{path} lies in no run folder: say what it is with {missing}")
     check_algorithm(algo)
     check_env_id(env_id)
-    # What a zip says of itself counts where it is loaded as that, without a pickle.
-    if hand_written != algo and not request.is_trusted:
-        check_origin(path, request.log_folder)
     return ChosenModel(path, _spec(algo, env_id, recorded, request), run)
 
 
@@ -203,7 +198,5 @@ def with_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
                 "are not there: name their file with --vec-normalize"
             )
         return chosen
-    if not request.is_trusted:
-        check_origin(path, request.log_folder, what=STATISTICS)
     spec = normalising(chosen.spec, read_statistics(path).settings)
     return ChosenModel(chosen.path, spec, chosen.run, path)

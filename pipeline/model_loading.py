@@ -2,72 +2,55 @@
 
 from __future__ import annotations
 
+import io
 import json
 import warnings
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents import ALGORITHMS, load_algorithm
+from pipeline.admitted_classes import own_classes, own_makers
 from pipeline.errors import UserError, one_line
 from pipeline.run_folder import Run
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import UserModule
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
 
-# What is done with files that are unpickled.
-LIBRARY_ZIP = "loading a zip of a library agent"
-STATISTICS = "reading statistics of VecNormalize"
-REPLAY_BUFFER = "reading a replay buffer"
+# What a class of the user's may stand for in a zip.
+_CLASS_KEYS = ("policy_class", "policy_kwargs", "replay_buffer_class", "rollout_buffer_class")
 
 # Folders of `agents` in which no agent has a zip with a pickle: known before any is imported.
 _JSON_FAMILIES = {"tabular", "bandits", "mabwiser"}
 
 
 def check_model_file(path: Path) -> None:
-    """Make sure that ``path`` is a whole zip of an agent, without reading any agent from it.
+    """Make sure that ``path`` is a whole zip of an agent, without making any agent of it.
 
     Raises:
-        UserError: if it is missing, unreadable, damaged, or something else.
+        UserError: if it is missing, unreadable, damaged, too large, or something else.
     """
+    from safe_files.archives import read_members
+    from safe_files.limits import MAX_ARCHIVE_BYTES
+    from safe_files.regular_files import read_file
+
     try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-            names = archive.namelist()
+        content = read_file(path, MAX_ARCHIVE_BYTES)
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            names = frozenset(archive.namelist())
+        read_members(content, names)
     except FileNotFoundError:
         raise UserError(f"no such model file: {path}") from None
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
         raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
-    if damaged is not None:
-        raise UserError(f"{path} is damaged: its part {damaged} does not match its checksum")
     if "data" not in names or not any(name.endswith(".pth") for name in names):
         raise UserError(f"{path} is no whole zip of an agent: it lacks parts that one has")
-
-
-def check_origin(
-    path: Path, log_folder: Path, given: Path | None = None, what: str = LIBRARY_ZIP
-) -> None:
-    """Make sure that a file that can run code lies where our own runs do.
-
-    Args:
-        path: the file.
-        log_folder: the folder above all runs.
-        given: what to call the file in a mistake; by default its path.
-        what: what is about to be done with it: `LIBRARY_ZIP`, `STATISTICS` or `REPLAY_BUFFER`.
-
-    Raises:
-        UserError: if it lies elsewhere.
-    """
-    if not path.resolve().is_relative_to(log_folder.resolve()):
-        raise UserError(
-            f"{given or path} lies outside {log_folder}, and {what} can run code that is hidden in "
-            "it: add --trust if you know where it comes from"
-        )
 
 
 def agent_class(algo: str) -> type[BaseAlgorithm]:
@@ -82,16 +65,20 @@ def agent_class(algo: str) -> type[BaseAlgorithm]:
         raise UserError(one_line(error)) from error
 
 
-def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) -> BaseAlgorithm:
-    """Load an agent from its zip.
-
-    A zip of one of the library's agents is unpickled, which can run code: load those that you
-    trust.
+def load_model(
+    algo: str,
+    path: Path,
+    env: VecEnv | None = None,
+    modules: Iterable[UserModule] = (),
+    **kwargs: Any,
+) -> BaseAlgorithm:
+    """Load an agent from its zip, as data: nothing in it is run, whoever wrote it.
 
     Args:
         algo: name of the agent.
         path: the zip.
         env: environment to go on with, or None.
+        modules: those that the user typed: the zip may name classes of theirs.
         kwargs: attributes to change.
 
     Raises:
@@ -103,25 +90,63 @@ def load_model(algo: str, path: Path, env: VecEnv | None = None, **kwargs: Any) 
         with warnings.catch_warnings():
             # Said of the buffer that the library itself chose when the agent was made.
             warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
-            model = _loadable(algorithm).load(path, env=env, **kwargs)
+            model = _loaded(algorithm, path, env, modules, kwargs)
         model.__class__ = algorithm
         return model
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
-        raise UserError(f"{path} cannot be loaded as a {algo} agent: {one_line(error)}") from error
+        raise UserError(
+            f"{path} cannot be loaded as a {algo} agent: {one_line(error)}"
+            f"{_way_out(algorithm, error)}"
+        ) from error
+
+
+def _loaded(
+    algorithm: type[BaseAlgorithm],
+    path: Path,
+    env: VecEnv | None,
+    modules: Iterable[UserModule],
+    kwargs: Mapping[str, Any],
+) -> BaseAlgorithm:
+    """An agent by its class's own `load`, where it has one, or else read as data."""
+    from safe_files import load_model
+
+    if _has_own_load(algorithm):
+        # Of ours, which reads JSON and tensors, or code of the user's.
+        return algorithm.load(path, env=env, **kwargs)
+    return load_model(
+        _loadable(algorithm),
+        path,
+        env,
+        classes=own_classes(algorithm, modules),
+        makers=own_makers(),
+        **kwargs,
+    )
+
+
+def _has_own_load(algorithm: type[BaseAlgorithm]) -> bool:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    return getattr(algorithm.load, "__func__", None) is not vars(BaseAlgorithm)["load"].__func__
+
+
+def _way_out(algorithm: type[BaseAlgorithm], error: Exception) -> str:
+    """What to do about an attribute that a zip may not hold."""
+    key = getattr(error, "key", None)
+    if key in _CLASS_KEYS:
+        return "; a class of yours is admitted where you name its module: --gym-packages MODULE"
+    if key in algorithm_parameters(algorithm):
+        value = "3e-4" if key == "learning_rate" else "VALUE"
+        return f"; train.py -i goes on with another: -params {key}:{value}"
+    return ""
 
 
 def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
     """The class, or a subclass that does without the arguments that `load` hands a constructor."""
-    from stable_baselines3.common.base_class import BaseAlgorithm
-
     parameters = algorithm_parameters(algorithm)
-    is_own_load = (
-        getattr(algorithm.load, "__func__", None) is not vars(BaseAlgorithm)["load"].__func__
-    )
     lacking = {"policy", "device", "_init_setup_model"} - parameters.keys()
-    if not lacking or is_own_load:
+    if not lacking:
         return algorithm
 
     def without_them(self: Any, **kwargs: Any) -> None:
@@ -134,17 +159,23 @@ def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
     return type(algorithm.__name__, (algorithm,), {"__init__": without_them})
 
 
-def load_to_play(algo: str, path: Path, env: VecEnv, device: str = "auto") -> BaseAlgorithm:
+def load_to_play(
+    algo: str,
+    path: Path,
+    env: VecEnv,
+    device: str = "auto",
+    modules: Iterable[UserModule] = (),
+) -> BaseAlgorithm:
     """As `load_model`, for an agent that is not to learn any more.
 
-    What only learning needs is left out: a replay buffer, and schedules, which zips of older
-    versions of Python hold as functions that cannot be read. Observations may have other bounds.
+    What only learning needs is left out: a replay buffer, action noise, and schedules, which zips
+    of older versions hold as functions. Observations may have other bounds.
 
     Raises:
         UserError: as `load_model`; and if the agent was trained on observations of another shape.
     """
     check_model_file(path)
-    if hand_written_algorithm(path) is not None:
+    if _is_hand_written(algo):
         return load_model(algo, path, env, device=device)
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.utils import ConstantSchedule
@@ -157,21 +188,30 @@ def load_to_play(algo: str, path: Path, env: VecEnv, device: str = "auto") -> Ba
             "there, or --env-kwargs"
         )
     unused = ConstantSchedule(0.0)
-    replaced: dict[str, Any] = {"learning_rate": 0.0, "lr_schedule": unused, "clip_range": unused}
+    replaced: dict[str, Any] = {
+        "learning_rate": 0.0,
+        **dict.fromkeys(("lr_schedule", "clip_range", "clip_range_vf"), unused),
+        "action_noise": None,
+    }
     if saved is not None:
         replaced["observation_space"] = env.observation_space
     small = {"buffer_size": 1, "optimize_memory_usage": False}
     extra = small if issubclass(agent_class(algo), OffPolicyAlgorithm) else {}
-    return load_model(algo, path, env, device=device, custom_objects=replaced, **extra)
+    return load_model(algo, path, env, modules, device=device, custom_objects=replaced, **extra)
 
 
 def _plain_data(path: Path) -> dict[str, Any]:
     """The JSON that a zip of any agent holds; what is pickled in it stays text."""
-    with zipfile.ZipFile(path) as archive:
-        try:
+    from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_SETTINGS_BYTES
+    from safe_files.regular_files import opened
+
+    try:
+        with opened(path, MAX_ARCHIVE_BYTES) as file, zipfile.ZipFile(file) as archive:
+            if archive.getinfo("data").file_size > MAX_SETTINGS_BYTES:
+                raise ValueError("its settings are too large")
             data = json.loads(archive.read("data"))
-        except (ValueError, RecursionError) as error:
-            raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
+    except (OSError, ValueError, LookupError, zipfile.BadZipFile, RecursionError) as error:
+        raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
     if not isinstance(data, dict):
         raise UserError(f"{path} is no whole zip of an agent: its data maps no names to values")
     return data
@@ -193,19 +233,20 @@ def _shown_space(attributes: Mapping[str, Any]) -> str | None:
 def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
     """Give an agent the replay buffer in a file, where it is of a kind that has one.
 
-    The file is unpickled, which can run code: load those that you trust.
-
     Raises:
         UserError: if it cannot be read, or was filled by other environments than the agent's.
     """
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+    from agents.dqn import MaskedReplayBuffer
+    from safe_files import load_replay_buffer as load_safely
+
     if not isinstance(model, OffPolicyAlgorithm):
         return
     wanted: Any = model.replay_buffer
     try:
-        model.load_replay_buffer(path)
-    except Exception as error:  # a pickle can fail in any way
+        load_safely(model, path, classes={MaskedReplayBuffer, type(wanted)})
+    except (OSError, ValueError, AssertionError) as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
     buffer: Any = model.replay_buffer
     if buffer.n_envs != model.n_envs:
@@ -213,9 +254,6 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
             f"{path} was filled by {buffer.n_envs} environments at once, and cannot be by "
             f"{model.n_envs}: give -params n_envs:{buffer.n_envs}"
         )
-    for kind in ("observation_space", "action_space"):
-        if getattr(buffer, kind) != getattr(model, kind):
-            raise UserError(f"{path} was filled by environments of another {kind}")
     kinds = [(type(one).__name__, getattr(one, "n_steps", 1)) for one in (buffer, wanted)]
     if kinds[0] != kinds[1]:
         found, needed = (f"{name} with n_steps {n_steps}" for name, n_steps in kinds)
@@ -236,7 +274,7 @@ def run_of(path: Path) -> Run | None:
 def hand_written_algorithm(path: Path) -> str | None:
     """The name of the hand-written agent that a zip says it holds, or None for the library's.
 
-    Reads plain JSON and nothing else.
+    It decides which agent is meant where nobody says so, and nothing about how the zip is read.
 
     Raises:
         UserError: if that is damaged.
@@ -246,7 +284,7 @@ def hand_written_algorithm(path: Path) -> str | None:
         if (
             isinstance(class_name, str)
             and entry.entry_point.endswith(f":{class_name}")
-            and _holds_no_pickle(name)
+            and _is_hand_written(name)
         ):
             return name
     return None
@@ -269,8 +307,8 @@ def telling_masks(spec: TrainSpec, model: Path) -> TrainSpec:
     return replace(spec, hyperparams=hyperparams, saved_hyperparams=saved)
 
 
-def _holds_no_pickle(algo: str) -> bool:
-    """Whether zips of the agent are JSON; where its class is not to be had, they are not loaded."""
+def _is_hand_written(algo: str) -> bool:
+    """Whether zips of the agent hold JSON; where there is no class, none is loaded."""
     if ALGORITHMS[algo].family in _JSON_FAMILIES:
         return True
     from agents.common.model_files import JsonAlgorithm

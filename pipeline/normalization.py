@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -45,26 +44,24 @@ class Statistics:
 
 
 def read_statistics(path: Path) -> Statistics:
-    """Read what VecNormalize saved. It is unpickled, which can run code: read what you trust.
+    """Read what VecNormalize saved, as data: nothing in the file is run.
 
     Raises:
         UserError: if the file is no such thing.
     """
-    from stable_baselines3.common.vec_env import VecNormalize
+    from safe_files.limits import MAX_STATISTICS_BYTES
+    from safe_files.regular_files import read_file
+    from safe_files.vec_normalize import read_normalization
 
     try:
-        with path.open("rb") as file:
-            saved = pickle.load(file)  # noqa: S301  # callers have looked where it comes from
-    except Exception as error:  # a pickle can fail in any way
+        saved = read_normalization(read_file(path, MAX_STATISTICS_BYTES))
+    except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-    if not isinstance(saved, VecNormalize):
-        kind = type(saved).__name__
-        raise UserError(f"{path} holds no statistics of VecNormalize, but an object of {kind}")
-    settings = {key: vars(saved)[key] for key in _SETTINGS if vars(saved).get(key) is not None}
+    settings = {key: saved.settings[key] for key in _SETTINGS if saved.settings[key] is not None}
     return Statistics(
         path,
         {key: _plain(value) for key, value in settings.items()},
-        saved.obs_rms if saved.norm_obs else None,
+        saved.obs_rms if saved.settings["norm_obs"] else None,
         saved.ret_rms,
     )
 

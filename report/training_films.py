@@ -87,7 +87,7 @@ def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[
     th.set_num_threads(chosen.spec.num_threads)
     env = playing_env(chosen, "rgb_array")
     try:
-        model = load_model(chosen.spec.algo, chosen.path, env)
+        model = load_model(chosen.spec.algo, chosen.path, env, chosen.spec.user_modules)
         model.set_random_seed(seed)
         frames, _ = film_episode(model, env, max_steps, deterministic=False)
     finally:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from safe_files.library_classes import all_policy_classes
 from safe_files.limits import MAX_ARCHIVE_BYTES
 from safe_files.models import MEMBERS, NOT_READ, SERIALIZED, TENSORS, decoded, parse_settings
 from safe_files.pickle_trees import Grouped, Made, Mapped, Name, read_tree
+from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import read_file
 from safe_files.tensors import check_values, load_tensors, tensors_in
@@ -35,11 +36,12 @@ class Report:
     suspicious: tuple[str, ...]
 
 
-def inspect_model(path: Path | str) -> Report:
+def inspect_model(path: Path | str, makers: Mapping[str, Maker] | None = None) -> Report:
     """Look into a model's zip; nothing in it is run.
 
     Args:
         path: the zip.
+        makers: what makes further objects that it may hold, as for `safe_files.load_model`.
 
     Raises:
         UnsafeFileError: if it is no zip of a model at all.
@@ -49,7 +51,7 @@ def inspect_model(path: Path | str) -> Report:
     settings: dict[str, str] = {}
     suspicious: list[str] = []
     for key, value in parse_settings(members).items():
-        settings[shown(key).strip("'")], doubts = _setting(key, value)
+        settings[shown(key).strip("'")], doubts = _setting(key, value, makers)
         suspicious += doubts
     weights: dict[str, tuple[int, ...]] = {}
     for name in sorted(TENSORS & set(members)):
@@ -60,26 +62,28 @@ def inspect_model(path: Path | str) -> Report:
             suspicious.append(f"{name} {error}")
         else:
             found = tensors_in(tensors, name.removesuffix(".pth"))
-            weights |= {where: tuple(tensor.shape) for where, tensor in found}
+            weights |= {shown(where).strip("'"): tuple(tensor.shape) for where, tensor in found}
     sizes = {name: len(content) for name, content in members.items()}
     return Report(sizes, weights, settings, tuple(suspicious))
 
 
-def _setting(key: str, value: Any) -> tuple[str, list[str]]:
+def _setting(key: str, value: Any, makers: Mapping[str, Maker] | None) -> tuple[str, list[str]]:
     """An attribute in one line, and what is suspicious about it."""
-    doubts = [f"{key} is set, which models do not keep"] if key in NOT_READ and value else []
+    is_odd = key in NOT_READ - {"tensorboard_log"} and value
+    name = shown(key).strip("'")
+    doubts = [f"{name} is set, which models do not keep"] if is_odd else []
     if not (isinstance(value, dict) and SERIALIZED in value):
         return shown(value), doubts
     try:
         pickled = decoded(key, value[SERIALIZED])
-        names = sorted({shown(str(name)).strip("'") for name in names_in(read_tree(pickled))})
+        names = sorted({shown(str(one)).strip("'") for one in names_in(read_tree(pickled))})
         text = "a pickle of " + (", ".join(names) if names else "plain data")
     except UnsafeFileError as error:
-        return "a pickle that cannot be read", [*doubts, f"{key} {error}"]
+        return "a pickle that cannot be read", [*doubts, f"{name} {error}"]
     try:
-        read_pickle(pickled, all_policy_classes())
+        read_pickle(pickled, all_policy_classes(), makers)
     except UnsafeFileError as error:
-        doubts.append(f"{key} {error}")
+        doubts.append(f"{name} {error}")
     return text, doubts
 
 

@@ -13,13 +13,16 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
+import torch as th
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
+from torch.distributions.transforms import AffineTransform, ComposeTransform, ExpTransform
 
 from safe_files.pickle_trees import Made, Name
 from safe_files.rebuilding import Build, Maker, fields, wrong
 from safe_files.refusals import UnsafeFileError, shown
 
 _UTILS = "stable_baselines3.common.utils"
+_TRANSFORMS = "torch.distributions.transforms"
 _Schedule = Callable[[float], float]
 
 
@@ -79,6 +82,44 @@ def _number(value: Any, made: Made) -> float:
     return value
 
 
+def _exponent(made: Made, build: Build) -> ExpTransform:
+    _transform_state(made, build)
+    return ExpTransform()
+
+
+def _affine(made: Made, build: Build) -> AffineTransform:
+    state = _transform_state(made, build, "loc", "scale", "_event_dim")
+    loc, scale = (_finite(state[name], made) for name in ("loc", "scale"))
+    if state["_event_dim"] != 0:
+        raise wrong(made)
+    return AffineTransform(loc, scale)
+
+
+def _composed(made: Made, build: Build) -> ComposeTransform:
+    """One transform after another: a schedule made of PyTorch's parts, such as exp(a + b x)."""
+    parts = _transform_state(made, build, "parts")["parts"]
+    kinds = ComposeTransform | AffineTransform | ExpTransform
+    if not isinstance(parts, list) or not all(isinstance(part, kinds) for part in parts):
+        raise wrong(made)
+    return ComposeTransform(parts)
+
+
+def _transform_state(made: Made, build: Build, *names: str) -> Mapping[str, Any]:
+    state = fields(made, build)
+    if set(state) != {"_cache_size", "_inv", *names} or state["_cache_size"] or state["_inv"]:
+        raise wrong(made)
+    return state
+
+
+def _finite(value: Any, made: Made) -> Any:
+    """A number, or a tensor of them."""
+    if not isinstance(value, th.Tensor):
+        return _number(value, made)
+    if not bool(th.isfinite(value).all()):
+        raise wrong(made)
+    return value
+
+
 # Functions that made schedules, by module and qualified name: how what they enclosed makes one.
 _ENCLOSING: Mapping[tuple[str, str], Callable[..., _Schedule]] = {
     (_UTILS, "constant_fn.<locals>.func"): ConstantSchedule,
@@ -120,6 +161,9 @@ MAKERS: Mapping[str, Maker] = {
     f"{_UTILS}.ConstantSchedule": _constant,
     f"{_UTILS}.LinearSchedule": _linear,
     f"{_UTILS}.FloatSchedule": _float_schedule,
+    f"{_TRANSFORMS}.ExpTransform": _exponent,
+    f"{_TRANSFORMS}.AffineTransform": _affine,
+    f"{_TRANSFORMS}.ComposeTransform": _composed,
     "rl_zoo3.utils.SimpleLinearSchedule": _simple_linear,
     "functools.partial": _partial,
     "cloudpickle.cloudpickle._make_function": _function,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import binascii
+import inspect
 import io
 import json
 import zipfile
@@ -19,6 +20,7 @@ from safe_files.admission import read_pickle
 from safe_files.archives import read_members
 from safe_files.library_classes import policy_classes
 from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
+from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import read_file
 from safe_files.sizes import check_sizes
@@ -50,6 +52,9 @@ NOT_READ = frozenset(
 DERIVED = frozenset({"lr_schedule", "exploration_schedule"})
 SERIALIZED = ":serialized:"
 
+# What a class may have as the default of an attribute.
+_PLAIN = (bool, int, float, str, type(None))
+
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 
@@ -65,6 +70,9 @@ class Settings:
     plain: Mapping[str, Any]
     pickled: Mapping[str, bytes]
 
+    def __contains__(self, name: str) -> bool:
+        return name in self.plain or name in self.pickled
+
 
 def load_model(
     algorithm: type[Algorithm],
@@ -73,16 +81,22 @@ def load_model(
     *,
     device: th.device | str = "auto",
     classes: Mapping[str, type] | None = None,
+    makers: Mapping[str, Maker] | None = None,
+    custom_objects: Mapping[str, Any] | None = None,
     **replaced: Any,
 ) -> Algorithm:
     """Load a model as ``algorithm.load`` does, without running anything that the file names.
 
     Args:
-        algorithm: the class of the model, of Stable-Baselines3 or sb3-contrib.
+        algorithm: the class of the model, of Stable-Baselines3 or sb3-contrib, or one of your own
+            that is made and saved as theirs are.
         path: the zip.
         env: the environment to go on with, or None.
         device: where the tensors go.
         classes: classes of your own that the file may name, by their full names.
+        makers: what makes further objects that it may hold, by the full names of their classes.
+        custom_objects: values for attributes of the file, which are not read then; names that it
+            does not have are passed over.
         replaced: attributes to set instead of those in the file, which are not read then.
 
     Raises:
@@ -90,15 +104,17 @@ def load_model(
         OSError: if it cannot be read.
         ValueError: if the model does not fit ``env``, as the library says it.
     """
-    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS)
+    files, variables = _tensors_of(algorithm)
+    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS | files)
     settings = read_settings(members, algorithm)
     known = {**policy_classes(algorithm), **(classes or {})}
-    objects = _objects(settings, known, replaced)
+    given = {name: value for name, value in (custom_objects or {}).items() if name in settings}
+    objects = {**_objects(settings, known, makers, {**replaced, **given}), **given}
     if not isinstance(objects.get("policy_class"), type):
         raise UnsafeFileError("does not say its policy's class", "policy_class")
-    tensors = {name: load_tensors(members[name]) for name in sorted(TENSORS & set(members))}
+    tensors = {name: load_tensors(members[name]) for name in sorted(files & set(members))}
     check_values(tensors)
-    _check_variables(tensors)
+    _check_variables(tensors, variables)
     check_sizes({**settings.plain, **objects, **replaced}, tensors)
     checked = _zipped({**members, SETTINGS: _data(settings, objects)})
     try:
@@ -121,13 +137,31 @@ def read_settings(members: Mapping[str, bytes], algorithm: type[BaseAlgorithm]) 
     for key, value in data.items():
         if key in NOT_READ or key in DERIVED:
             continue
-        if not key.isidentifier() or key.startswith("__") or hasattr(algorithm, key):
+        if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
             raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
         if isinstance(value, dict) and SERIALIZED in value:
             pickled[key] = decoded(key, value[SERIALIZED])
         else:
             plain[key] = value
     return Settings(plain, pickled)
+
+
+def hides(algorithm: type, name: str) -> bool:
+    """Whether an attribute of that name would hide something of the class but a plain default."""
+    missing = object()
+    value = inspect.getattr_static(algorithm, name, missing)
+    return value is not missing and not isinstance(value, _PLAIN)
+
+
+def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozenset[str]]:
+    """The files of tensors that such a model has, and its variables that are part of no network."""
+    try:
+        # Those of the libraries need no more than the class to say it, or are known.
+        own: Any = algorithm._get_torch_save_params(algorithm.__new__(algorithm))
+        files, variables = frozenset(f"{name}.pth" for name in own[0]), frozenset(own[1])
+    except AttributeError:
+        return TENSORS, VARIABLES
+    return TENSORS | files, VARIABLES | variables
 
 
 def parse_settings(members: Mapping[str, bytes]) -> dict[str, Any]:
@@ -168,7 +202,10 @@ def decoded(key: str, text: Any) -> bytes:
 
 
 def _objects(
-    settings: Settings, classes: Mapping[str, type], replaced: Mapping[str, Any]
+    settings: Settings,
+    classes: Mapping[str, type],
+    makers: Mapping[str, Maker] | None,
+    replaced: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What the pickled attributes stand for."""
     objects: dict[str, Any] = {}
@@ -176,19 +213,19 @@ def _objects(
         if key in replaced:
             continue
         try:
-            objects[key] = read_pickle(pickled, classes)
+            objects[key] = read_pickle(pickled, classes, makers)
         except UnsafeFileError as error:
             raise UnsafeFileError(f"{key} {error}", key) from error
     return objects
 
 
-def _check_variables(tensors: Mapping[str, Any]) -> None:
+def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
     """The library sets each of these by the way to it: let there be no other than it writes."""
     for name in ("pytorch_variables.pth", "tensors.pth"):
         variables = tensors.get(name)
         if not (variables is None or isinstance(variables, dict)):
             raise UnsafeFileError(f"holds {name} that is not as the library writes it")
-        strange = sorted(map(str, set(variables or ()) - VARIABLES))
+        strange = sorted(map(str, set(variables or ()) - known))
         if strange:
             raise UnsafeFileError(f"sets {shown(strange[0])}, which is no variable of a model")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -40,7 +40,11 @@ class _Stored:
 
 
 def load_replay_buffer(
-    model: OffPolicyAlgorithm, path: Path | str, truncate_last_traj: bool = True
+    model: OffPolicyAlgorithm,
+    path: Path | str,
+    truncate_last_traj: bool = True,
+    *,
+    classes: Iterable[type[ReplayBuffer]] = (),
 ) -> None:
     """As ``model.load_replay_buffer``, without running anything that the file names.
 
@@ -48,12 +52,14 @@ def load_replay_buffer(
         model: the agent to give the buffer to.
         path: the file.
         truncate_last_traj: with `HerReplayBuffer`, end the episode under way in the buffer.
+        classes: of your own, made with the arguments of `ReplayBuffer`, that the file may hold.
 
     Raises:
         UnsafeFileError: if the file is no replay buffer, or does not fit the model.
         OSError: if it cannot be read.
     """
-    makers = {full_name(cls): partial(_stored, cls) for cls in _CLASSES}
+    known: tuple[type[ReplayBuffer], ...] = (*_CLASSES, *classes)
+    makers = {full_name(cls): partial(_stored, cls) for cls in known}
     found = read_pickle(read_file(Path(path), MAX_BUFFER_BYTES), makers=makers)
     if not isinstance(found, _Stored):
         raise UnsafeFileError("holds no replay buffer")

@@ -9,7 +9,7 @@ from typing import Any
 import torch as th
 
 from safe_files.archives import check_tensors
-from safe_files.refusals import UnsafeFileError
+from safe_files.refusals import UnsafeFileError, shown
 
 
 def load_tensors(content: bytes) -> Any:
@@ -36,7 +36,7 @@ def check_values(files: Mapping[str, Any]) -> None:
     """
     for name, content in files.items():
         for path, tensor in tensors_in(content):
-            where = f"{name}: {path}"
+            where = f"{name}: {shown(path)[1:-1]}"
             if tensor.is_complex() or tensor.is_quantized or tensor.layout != th.strided:
                 raise UnsafeFileError(f"{where} is not made of real numbers")
             if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import io
-import json
 import pathlib
+import sys
 import warnings
-import zipfile
-from collections.abc import Iterable
-from typing import Any, ClassVar, Self, cast
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar, Self
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import load_from_zip_file, open_path, save_to_zip_file
+from stable_baselines3.common.save_util import save_to_zip_file
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
 
 from agents.common.serialization import UnknownTypeError, decode, encode
+from safe_files.archives import read_members
+from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.models import MEMBERS, hides, parse_settings
+from safe_files.refusals import UnsafeFileError, shown
+from safe_files.regular_files import read_file
+from safe_files.tensors import check_values, load_tensors
 
 FORMAT_VERSION = 1
+TENSORS = frozenset({"policy.pth"})
 
 
 class JsonAlgorithm(BaseAlgorithm):
@@ -82,7 +89,7 @@ class JsonAlgorithm(BaseAlgorithm):
             device: ignored, as tables live on the CPU.
             custom_objects: values that replace those of the same name in the file, which are not
                 read then; other names are passed over, as the library does.
-            print_system_info: print this system's and the file's library versions.
+            print_system_info: print the library versions that the file was written with.
             force_reset: begin a new episode at the next `learn`.
             kwargs: attributes to change.
 
@@ -90,10 +97,12 @@ class JsonAlgorithm(BaseAlgorithm):
             ValueError: if the zip is of another agent, or damaged, or does not fit ``env``; or if
                 ``custom_objects`` is no dictionary.
         """
-        _, parameters, _ = load_from_zip_file(
-            path, load_data=False, device="cpu", print_system_info=print_system_info
-        )
-        data = {**cls._read_data(path, custom_objects), **kwargs}
+        members = read_members(_content(path), MEMBERS)
+        if print_system_info:
+            text = members.get("system_info.txt", b"").decode("ascii", "replace")
+            # Nothing that a terminal obeys.
+            sys.stdout.writelines(f"{shown(line)[1:-1]}\n" for line in text.splitlines())
+        data = {**cls._read_data(members, path, custom_objects), **kwargs}
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
             check_for_correct_spaces(env, data["observation_space"], data["action_space"])
@@ -102,28 +111,31 @@ class JsonAlgorithm(BaseAlgorithm):
                 data["_last_obs"] = None
         policy = next(iter(cls.policy_aliases))
         model = cls(policy=policy, env=env, _init_setup_model=False)  # type: ignore[call-arg]
+        _check_names(model, data)
+        _check_spaces(data)
         # Without a seed, setting up leaves alone what was saved with its state.
         model.__dict__.update({**data, "seed": None})
         model._setup_model()
         model.__dict__.update(data)
         if "seed" in kwargs:
             model.set_random_seed(kwargs["seed"])
-        model.set_parameters(cast(dict[str, Any], parameters), exact_match=True, device="cpu")
+        parameters = {
+            name.removesuffix(".pth"): load_tensors(members[name])
+            for name in sorted(TENSORS & set(members))
+        }
+        _check_tables(parameters, model.get_parameters())
+        model.set_parameters(parameters, exact_match=True, device="cpu")
         return model
 
     @classmethod
     def _read_data(
-        cls, path: str | pathlib.Path | io.BufferedIOBase, replaced: dict[str, Any] | None
+        cls, members: Mapping[str, bytes], path: Any, replaced: dict[str, Any] | None
     ) -> dict[str, Any]:
         """The decoded attributes of a zip of this very class, but for those that are replaced."""
         if not (replaced is None or isinstance(replaced, dict)):
             raise ValueError("custom_objects must be a dictionary or None")
         known = replaced or {}
-        with (
-            open_path(path, "r", suffix="zip") as file,
-            zipfile.ZipFile(file) as archive,
-        ):
-            raw = json.loads(archive.read("data"))
+        raw = parse_settings(members)
         if raw.pop("algorithm", None) != cls.__name__:
             raise ValueError(f"{path} does not hold a {cls.__name__} agent")
         if raw.pop("format", None) != FORMAT_VERSION:
@@ -131,3 +143,50 @@ class JsonAlgorithm(BaseAlgorithm):
         return {
             name: known[name] if name in known else decode(value) for name, value in raw.items()
         }
+
+
+def _content(path: str | pathlib.Path | io.BufferedIOBase) -> bytes:
+    """All of a file, read once; ``.zip`` is appended where there is none of that name."""
+    if isinstance(path, io.BufferedIOBase):
+        return path.read()
+    path = pathlib.Path(path)
+    if not path.exists():
+        path = path.with_name(f"{path.name}.zip")
+    return read_file(path, MAX_ARCHIVE_BYTES)
+
+
+def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:
+    """Make sure that a file sets only what a new agent has, and hides none of its methods."""
+    known = {*vars(model), *(name for cls in type(model).__mro__ for name in _declared(cls))}
+    for name in data:
+        if name not in known or hides(type(model), name):
+            raise UnsafeFileError(f"sets {shown(name)}, which is no attribute of such an agent")
+
+
+def _check_spaces(data: Mapping[str, Any]) -> None:
+    for name in ("observation_space", "action_space"):
+        if not isinstance(data.get(name), spaces.Space):
+            raise UnsafeFileError(f"does not say its {name}")
+
+
+def _declared(cls: type) -> Iterable[str]:
+    found: Mapping[str, Any] = vars(cls).get("__annotations__", {})
+    return found
+
+
+def _check_tables(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Make sure that tables are of numbers, and of the kind that a new agent's have.
+
+    PyTorch would turn one kind into another; of shapes, the policies make sure themselves.
+    """
+    for name, tables in expected.items():
+        if not isinstance(found.get(name), dict):
+            raise UnsafeFileError(f"holds no {name}.pth")
+        for key, table in found[name].items():
+            like = tables.get(key)
+            if not isinstance(table, th.Tensor) or (like is not None and table.dtype != like.dtype):
+                raise UnsafeFileError(f"{name}.pth: {shown(key)} is not of the kind of such agents")
+            # Scores of arms that were never pulled are infinite from the beginning.
+            is_like = like is not None and like.shape == table.shape
+            may_be_infinite = is_like and bool(th.isinf(like).any())
+            check_values({name: {key: table[~th.isinf(table)] if may_be_infinite else table}})

@@ -22,6 +22,9 @@ from agents.common.schedules import ExponentialSchedule
 
 TYPE = "type"
 
+# Of a space: no table is larger, and each has a row or a column for each of them.
+_MAX_VALUES = 10_000_000
+
 # Truth values and numbers of at most 64 bits, which JSON holds without loss.
 _ARRAY_DTYPE = re.compile(r"[<>|][biuf][1248]")
 
@@ -83,7 +86,10 @@ def decode(data: Any) -> Any:
         raise ValueError(f"damaged {name} in an agent's file: its fields are {', '.join(data)}")
     try:
         return codec.build(**{key: decode(item) for key, item in data.items() if key != TYPE})
-    except (TypeError, LookupError, AttributeError, AssertionError, ArithmeticError) as error:
+    except (
+        *(TypeError, LookupError, AttributeError, AssertionError, ArithmeticError),
+        RecursionError,
+    ) as error:
         raise ValueError(f"damaged {name} in an agent's file: {error}") from error
 
 
@@ -142,6 +148,12 @@ def _array(dtype: str, values: list[Any], shape: tuple[int, ...]) -> np.ndarray[
     return np.array(values, dtype=np.dtype(dtype)).reshape(shape)
 
 
+def _discrete(n: int, start: int) -> spaces.Discrete:
+    if n > _MAX_VALUES:
+        raise ValueError(f"a space of more than {_MAX_VALUES:,} values in an agent's file")
+    return spaces.Discrete(n, start=start)
+
+
 def _multi_discrete(nvec: np.ndarray[Any, Any], start: np.ndarray[Any, Any]) -> Any:
     return spaces.MultiDiscrete(nvec, dtype=nvec.dtype.type, start=start)
 
@@ -176,7 +188,7 @@ _CODEC_LIST = [
     Codec(LinearSchedule, _attributes("start", "end", "end_fraction"), LinearSchedule),
     Codec(ExponentialSchedule, _attributes("start", "end", "end_fraction"), ExponentialSchedule),
     Codec(FloatSchedule, _attributes("value_schedule"), FloatSchedule),
-    _space(spaces.Discrete, spaces.Discrete, **_attributes("n", "start")),
+    _space(spaces.Discrete, _discrete, **_attributes("n", "start")),
     _space(spaces.MultiDiscrete, _multi_discrete, **_attributes("nvec", "start")),
     _space(spaces.MultiBinary, spaces.MultiBinary, **_attributes("n")),
     _space(spaces.Box, _box, **_attributes("low", "high")),

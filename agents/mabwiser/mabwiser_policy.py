@@ -7,7 +7,8 @@ from a generator that is handed in.
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, Self
 
 import numpy as np
 import torch as th
@@ -49,7 +50,25 @@ class MABWiserPolicy(TablePolicy):
         self.fitted = False
 
     def _sizes(self) -> dict[str, Any]:
-        return {"learning_policy": self.mab.learning_policy, "statistics": self.statistics}
+        chosen = self.mab.learning_policy
+        name = [type(chosen).__name__, chosen._asdict()]
+        return {"learning_policy": name, "statistics": self.statistics}
+
+    @classmethod
+    def _remade(cls, arguments: Mapping[str, Any]) -> Self:
+        from mabwiser.mab import LearningPolicy
+
+        name, settings = arguments["learning_policy"]
+        kinds = {
+            kind.__name__: kind
+            for kind in (
+                LearningPolicy.EpsilonGreedy,
+                LearningPolicy.LinUCB,
+                LearningPolicy.ThompsonSampling,
+                LearningPolicy.UCB1,
+            )
+        }
+        return cls(**{**arguments, "learning_policy": kinds[name](**settings)})
 
     @property
     def is_contextual(self) -> bool:
@@ -107,9 +126,15 @@ class MABWiserPolicy(TablePolicy):
         return th.from_numpy(self.parts) if self.fitted else th.zeros(0, dtype=th.float64)
 
     def set_extra_state(self, state: th.Tensor) -> None:
-        """Copy the state of another policy of the kind."""
+        """Copy the state of another policy of the kind.
+
+        Raises:
+            ValueError: if it is of another number of arms.
+        """
         if len(state) == 0:
             return
+        if len(state) != len(self.mab.arms):
+            raise ValueError(f"holds {len(state)} arms, not {len(self.mab.arms)}")
         width = len(features(self.observation_space, self._any_observation())[0])
         self.learn(0, 0.0, np.zeros(width))
         inside, rows = self.mab._imp, state.numpy()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,16 +20,15 @@ from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import policy_matrix, why_not_exact
 from pipeline.model_loading import (
     check_model_file,
-    check_origin,
     hand_written_algorithm,
     load_model,
     run_of,
 )
 from pipeline.module_records import check_recorded
+from pipeline.user_modules import UserModule
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
-_LOG_FOLDER = Path("logs")
 
 
 @dataclass(frozen=True)
@@ -96,12 +95,12 @@ def read_logged(path: str | Path) -> LoggedData:
     return data
 
 
-def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
+def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
     """Load an agent from its run folder or its zip.
 
     Args:
         path: either.
-        trust: load a zip of a library agent from outside ``logs``, which can run code.
+        modules: those that the user typed, which the agent may need.
 
     Raises:
         UserError: if there is no agent, or none that sees a context as the log has it.
@@ -112,18 +111,15 @@ def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
     spec = {} if run is None else run.recorded_spec()
     if run is not None:
         check_recorded(spec, run.path)
-    hand_written = hand_written_algorithm(zip_path)
-    algo = hand_written or spec.get("algo")
+    algo = hand_written_algorithm(zip_path) or spec.get("algo")
     if algo is None:
         raise UserError(f"{path} lies in no run folder: what agent it holds is not known")
-    if hand_written is None and not trust:
-        check_origin(zip_path, _LOG_FOLDER, given=path)
     settings = spec.get("hyperparams") or {}
     changed = next((key for key in _OBSERVATION_SETTINGS if settings.get(key)), None)
     if changed is not None:
         raise UserError(f"{path} was trained with {changed}: it observes more than a log holds")
     check_algorithm(algo)
-    agent = load_model(algo, zip_path, device="cpu")
+    agent = load_model(algo, zip_path, modules=modules, device="cpu")
     if not isinstance(agent.action_space, spaces.Discrete):
         raise UserError(f"{path} chooses no arms: its actions are {agent.action_space}")
     log = (settings.get("env_kwargs") or {}).get("log")

@@ -119,10 +119,11 @@ def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
 
     # Pictures alone: no display is needed, nor looked for.
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    th.set_num_threads(planned.spec.num_threads)
-    env = playing_env(ChosenModel(planned.run.model_path, planned.spec, planned.run), "rgb_array")
+    spec = planned.spec
+    th.set_num_threads(spec.num_threads)
+    env = playing_env(ChosenModel(planned.run.model_path, spec, planned.run), "rgb_array")
     try:
-        model = load_model(planned.spec.algo, planned.run.model_path, env)
+        model = load_model(spec.algo, planned.run.model_path, env, spec.user_modules)
         env.seed(evaluation_seed(planned.seed, 3))
         frames, ended = film_episode(model, env, MAX_STEPS, deterministic=True)
     finally:

@@ -191,15 +191,12 @@ def test_mistakes_are_one_line(type_command, damaged, words, message):
     assert message in err
 
 
-def test_a_library_zip_from_elsewhere_needs_trust(type_command, folder, tmp_path):
+def test_a_library_zip_from_elsewhere_is_judged(type_command, folder, tmp_path):
     run = tmp_path / "elsewhere"
     run.mkdir()
     for name in ("run.json", "ReplayBandit-v0.zip"):
         (run / name).write_bytes((folder / "logs/ppo/ReplayBandit-v0_1" / name).read_bytes())
-    code, _, err = type_command("--logged", "second.csv", "--policy", str(run))
-    assert code == 2
-    assert "add --trust" in err
-    assert type_command("--logged", "second.csv", "--policy", str(run), "--trust")[0] == 0
+    assert type_command("--logged", "second.csv", "--policy", str(run))[0] == 0
     (run / "run.json").unlink()
     code, _, err = type_command(
         "--logged", "second.csv", "--policy", str(run / "ReplayBandit-v0.zip")

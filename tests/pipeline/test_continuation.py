@@ -7,9 +7,9 @@ import pytest
 from rich.console import Console
 
 from pipeline.companions import replay_buffer_of, statistics_of
-from pipeline.continuation import agent_to_continue
 from pipeline.errors import UserError
 from pipeline.model_choice import ModelRequest, choose_model
+from pipeline.model_finding import model_at
 from pipeline.model_loading import load_to_play
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
@@ -96,7 +96,7 @@ def test_old_folders_have_those_of_the_end_alone(tmp_path):
 
 @pytest.mark.parametrize(("model", "before"), [("", 202), ("rl_model_60_steps", 62)])
 def test_statistics_go_on(normalised, tmp_path, model, before):
-    agent = agent_to_continue(normalised.path / model, normalised.path, is_trusted=False)
+    agent = model_at(normalised.path / model)
     # The entry says nothing of normalisation: the agent has been trained on it all the same.
     run = train_to(tmp_path, "a2c", A2C, 40, trained_agent=agent, eval_freq=-1)
     # Two for the new beginning.
@@ -212,16 +212,3 @@ def test_none_is_kept_unless_asked_for_or_where_there_is_none(tmp_path):
             tmp_path, algo, entry, 40, save_freq=20, save_replay_buffer=asked, eval_freq=-1
         )
         assert not list(run.path.glob("*.pkl"))
-
-
-def test_what_lies_elsewhere_wants_trust(replayed, tmp_path):
-    with pytest.raises(UserError, match=r"loading a zip of a library agent .* --trust"):
-        agent_to_continue(replayed.model_path, tmp_path, is_trusted=False)
-    assert agent_to_continue(replayed.path, tmp_path, is_trusted=True) == replayed.model_path
-    entry = {"policy": "RandomPolicy"}
-    run = train_to(tmp_path / "logs", "random", entry, 20, eval_freq=-1)
-    assert agent_to_continue(run.model_path, tmp_path / "x", is_trusted=False) == run.model_path
-    buffer = run.path / "replay_buffer.pkl"
-    buffer.touch()
-    with pytest.raises(UserError, match="reading a replay buffer can run code"):
-        agent_to_continue(run.model_path, tmp_path / "x", is_trusted=False)

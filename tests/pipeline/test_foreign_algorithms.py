@@ -19,7 +19,6 @@ from agents.common.model_files import JsonAlgorithm
 from pipeline import training
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.model_choice import ModelRequest, choose_model
 from pipeline.model_loading import _JSON_FAMILIES, hand_written_algorithm, load_model
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy, needs_policy
 from pipeline.settings.constructor_arguments import algorithm_parameters
@@ -267,13 +266,9 @@ def test_the_agents_that_are_taken_to_hold_no_pickle_do_not():
 @pytest.mark.parametrize(
     ("says", "algo"), [("Plain", None), ("DQN", None), ("QLearning", "qlearning"), (3, None)]
 )
-def test_a_zip_is_what_it_says_only_where_it_holds_no_pickle(says, algo, tmp_path):
+def test_a_zip_says_what_it_is_where_it_holds_json(says, algo, tmp_path):
     path = tmp_path / "model.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("data", json.dumps({"algorithm": says}))
         archive.writestr("policy.pth", b"")
     assert hand_written_algorithm(path) == algo
-    # Nor is it loaded as something else without a look at where it comes from.
-    request = ModelRequest(path, "dqn", "CartPole-v1", log_folder=tmp_path / "logs")
-    with pytest.raises(UserError, match="lies outside"):
-        choose_model(request)

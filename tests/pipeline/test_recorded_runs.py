@@ -111,7 +111,7 @@ def test_it_plays_as_the_library_evaluates_it(zoo, tmp_path, n_envs):
         ModelRequest(run / "CartPole-v1", log_folder=zoo),
         ModelRequest(run / "CartPole-v1.zip", log_folder=zoo),
         ModelRequest(whole, log_folder=tmp_path),
-        ModelRequest(whole / "a2c-CartPole-v1", is_trusted=True),
+        ModelRequest(whole / "a2c-CartPole-v1"),
     ):
         assert returns_of(request, 7, n_envs) == expected
 
@@ -132,7 +132,7 @@ def test_named_statistics_are_used(zoo, tmp_path):
     bare = hub(zoo, tmp_path)
     (bare / "config.yml").write_text("frame_stack: 2")
     saved = zoo / "a2c" / "CartPole-v1_1" / "CartPole-v1" / "vecnormalize.pkl"
-    named = ModelRequest(bare, "a2c", "CartPole-v1", is_trusted=True, statistics=saved)
+    named = ModelRequest(bare, "a2c", "CartPole-v1", statistics=saved)
     whole = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=zoo)
     assert returns_of(named, 5) == returns_of(whole, 5)
     assert choose_model(named).spec.hyperparams.normalize["clip_obs"] == 2.0
@@ -179,36 +179,8 @@ def test_what_does_not_go_together(zoo, tmp_path, case):
     settings, given, complaint = REFUSED[case]
     folder = hub(zoo, tmp_path, *settings)
     with pytest.raises(UserError, match=complaint) as refused:
-        returns_of(ModelRequest(folder, is_trusted=True, **given), 1)
+        returns_of(ModelRequest(folder, **given), 1)
     assert "\n" not in str(refused.value)
-
-
-@pytest.mark.parametrize("hand_written", [False, True])
-def test_statistics_from_elsewhere_want_trust(zoo, tmp_path, hand_written):
-    """Of a hand-written agent too, whose zip itself is read without running anything."""
-    folder = hub(zoo, tmp_path, "args.yml", "config.yml", "vec_normalize.pkl")
-    path = folder / "a2c-CartPole-v1.zip"
-    if hand_written:
-        from agents import load_algorithm
-
-        load_algorithm("random")("RandomPolicy", "CartPole-v1", seed=0).save(path)
-        (folder / "config.yml").write_text("{}")
-        with pytest.raises(UserError, match="reading statistics of VecNormalize can run code"):
-            choose_model(ModelRequest(path))
-    with pytest.raises(UserError, match="--trust"):
-        choose_model(ModelRequest(path))
-    assert choose_model(ModelRequest(path, is_trusted=True)).statistics is not None
-
-
-def test_statistics_that_the_log_folder_only_links_to_want_trust(zoo, tmp_path):
-    logs = tmp_path / "logs"
-    logs.mkdir()
-    run = hub(zoo, logs, "args.yml", "config.yml")
-    (run / "vec_normalize.pkl").symlink_to(
-        zoo / "a2c" / "CartPole-v1_1" / "CartPole-v1" / "vecnormalize.pkl"
-    )
-    with pytest.raises(UserError, match=r"lies outside .*logs, and reading statistics"):
-        choose_model(ModelRequest(run / "a2c-CartPole-v1.zip", log_folder=logs))
 
 
 def test_bounds_and_schedules_of_other_versions_do_not_matter(tmp_path):
@@ -223,7 +195,7 @@ def test_bounds_and_schedules_of_other_versions_do_not_matter(tmp_path):
                 data["lr_schedule"][":serialized:"] = "AAAA"  # as of a Python that is gone
                 content = json.dumps(data)
             old.writestr(name, content)
-    request = ModelRequest(tmp_path / "old.zip", "a2c", "CartPole-v1", is_trusted=True)
+    request = ModelRequest(tmp_path / "old.zip", "a2c", "CartPole-v1")
     assert len(returns_of(request, 2)) == 2
 
 
@@ -244,11 +216,11 @@ def test_modules_are_not_imported_because_a_folder_asks(zoo, tmp_path):
     (tmp_path / "config.yml").write_text("{}")
     args = tmp_path / "args.yml"
     args.write_text("{algo: a2c, env: 'antigravity_module:Fly-v0', gym_packages: [fly]}")
-    with pytest.raises(UserError, match=r"modules of yours \(fly\).*: add --gym-packages fly$"):
-        choose_model(ModelRequest(folder, is_trusted=True))
-    args.write_text("{algo: a2c, env: 'antigravity_module:Fly-v0'}")
-    with pytest.raises(UserError, match=r"'antigravity_module:Fly-v0'.*--gym-packages antigrav"):
-        choose_model(ModelRequest(folder, is_trusted=True))
+    with pytest.raises(UserError, match=r"modules of yours \(fly\), and no module is imported"):
+        choose_model(ModelRequest(folder))
+    args.write_text("{algo: a2c, env: Fly-v0, gym_packages: [antigravity_module]}")
+    with pytest.raises(UserError, match=r"modules of yours \(antigravity_module\)"):
+        choose_model(ModelRequest(folder))
 
 
 def test_several_models_in_a_folder(zoo, tmp_path):
@@ -363,17 +335,15 @@ def test_settings_that_make_no_sense(zoo, tmp_path, settings):
     folder = hub(zoo, tmp_path, "args.yml")
     (folder / "config.yml").write_text(settings)
     with pytest.raises(UserError, match=settings.strip("{").partition(":")[0]):
-        choose_model(
-            ModelRequest(folder, is_trusted=True, env_kwargs={"sutton_barto_reward": True})
-        )
+        choose_model(ModelRequest(folder, env_kwargs={"sutton_barto_reward": True}))
     (folder / "run.json").write_text('{"env_name": "X", "spec": {"algo": 1, "hyperparams": 7}}')
     with pytest.raises(UserError, match="say what it is with --algo"):
-        choose_model(ModelRequest(folder / "a2c-CartPole-v1.zip", is_trusted=True))
+        choose_model(ModelRequest(folder / "a2c-CartPole-v1.zip"))
 
 
 def test_where_a_folder_says_nothing_the_default_entry_counts(zoo, tmp_path, monkeypatch):
     """But whether a stranger's model saw normalised observations is not ours to say."""
-    request = ModelRequest(hub(zoo, tmp_path), "a2c", "CartPole-v1", is_trusted=True)
+    request = ModelRequest(hub(zoo, tmp_path), "a2c", "CartPole-v1")
     entry = {"normalize": True, "frame_stack": 2}
     monkeypatch.setattr("pipeline.model_choice.read_hyperparams", lambda *_: entry)
     hyperparams = choose_model(request).spec.hyperparams

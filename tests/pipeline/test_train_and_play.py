@@ -119,7 +119,7 @@ def test_observations_are_normalised_as_in_training_and_rewards_left_alone(tmp_p
     ("content", "complaint"),
     [
         (b"broken", r"vecnormalize\.pkl cannot be read"),
-        (pickle.dumps(["a list"]), "holds no statistics of VecNormalize, but an object of list"),
+        (pickle.dumps(["a list"]), "holds no statistics of VecNormalize"),
     ],
 )
 def test_statistics_that_are_broken(tmp_path, content, complaint):

@@ -1,0 +1,212 @@
+"""Files of a stranger's in the hands of the commands: nothing that is read is ever code.
+
+Each file here would leave a mark if it were run, or be imported; and each did at some time.
+"""
+
+import base64
+import json
+import os
+import pickle
+import shutil
+import sys
+import zipfile
+
+import gymnasium as gym
+import pytest
+
+import envs  # noqa: F401  # registers the bandits
+from agents import load_algorithm
+from envs.bandits import log_uniformly
+from pipeline.errors import UserError
+from pipeline.model_choice import ChosenModel
+from pipeline.run_folder import Run
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+from report.training_films import episode_in_training
+
+ENV = "SegmentBandit-v0"
+PLAY = ("--render", "none", "--n-episodes", "1")
+MODULE = "import pathlib\npathlib.Path(__file__).with_name('mark').mkdir(exist_ok=True)\n"
+
+
+class Payload:
+    """Makes a folder where it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = str(mark)
+
+    def __reduce__(self):
+        return os.mkdir, (self.mark,)
+
+
+@pytest.fixture
+def mark(own_folder):
+    return own_folder / "mark"
+
+
+@pytest.fixture
+def payload(mark):
+    return pickle.dumps(Payload(mark))
+
+
+@pytest.fixture
+def evil_zip(own_folder, payload):
+    """A zip of a genuine PPO agent with the payload in it, which says that it holds JSON."""
+    folder = own_folder / "gift"
+    folder.mkdir()
+    load_algorithm("ppo")("MlpPolicy", ENV, n_steps=8, batch_size=8).save(folder / "whole.zip")
+    text = base64.b64encode(payload).decode()
+    with (
+        zipfile.ZipFile(folder / "whole.zip") as whole,
+        zipfile.ZipFile(folder / f"{ENV}.zip", "w") as evil,
+    ):
+        for name in whole.namelist():
+            content = whole.read(name)
+            if name == "data":
+                data = {**json.loads(content), "algorithm": "PPO", "format": 1}
+                data["ep_info_buffer"] = {":type:": "deque", ":serialized:": text}
+                content = json.dumps(data)
+            evil.writestr(name, content)
+    (folder / "whole.zip").unlink()
+    write_run(folder, algo="ppo")
+    return folder / f"{ENV}.zip"
+
+
+def write_run(folder, **spec):
+    spec = {"env_id": ENV, "hyperparams": {}, **spec}
+    (folder / "run.json").write_text(json.dumps({"env_name": ENV, "spec": spec}))
+
+
+def hand_written_run(folder, **spec):
+    folder.mkdir(parents=True)
+    load_algorithm("random")("RandomPolicy", ENV, seed=0).save(folder / f"{ENV}.zip")
+    write_run(folder, algo="random", **spec)
+    return folder
+
+
+def check_refused(answer, mark, *words):
+    code, _, err = answer
+    assert (code, err.count("\n")) == (2, 1), err
+    assert not mark.exists()
+    for word in words:
+        assert word in err
+
+
+# --- zips ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("where", ["its path", "its folder", "-f"])
+def test_a_zip_is_played(type_in_own_folder, evil_zip, mark, own_folder, where):
+    words = {"its path": [evil_zip], "its folder": [evil_zip.parent]}
+    if where == "-f":
+        (own_folder / "ppo").mkdir()
+        evil_zip.parent.rename(own_folder / "ppo" / f"{ENV}_1")
+    given = words.get(where, ["-f", own_folder, "--algo", "ppo", "--env", ENV])
+    answer = type_in_own_folder("enjoy.py", *given, *PLAY)
+    check_refused(answer, mark, "ep_info_buffer", "posix.mkdir")
+
+
+def test_training_goes_on_from_a_zip(type_in_own_folder, evil_zip, mark, own_folder):
+    words = ["--algo", "ppo", "--env", ENV, "-n", "8", "-i", evil_zip, "-params", "n_steps:8"]
+    check_refused(type_in_own_folder("train.py", *words), mark, "ep_info_buffer")
+    assert not list((own_folder / "logs").rglob("run.json"))
+
+
+def test_a_policy_is_judged_on_a_log(type_in_own_folder, evil_zip, mark, own_folder):
+    with gym.make(ENV) as env:
+        log_uniformly(env, 100, 0, own_folder / "log.csv")
+    for path in (evil_zip, evil_zip.parent):
+        answer = type_in_own_folder("compare.py", "--logged", "log.csv", "--policy", path)
+        check_refused(answer, mark, "ep_info_buffer")
+
+
+def test_a_film_is_made_of_a_copied_study(evil_zip, mark):
+    raw = {"n_timesteps": 8}
+    spec = TrainSpec("ppo", "CartPole-v1", split(raw), raw, 0)
+    shutil.copy(evil_zip, evil_zip.with_name("CartPole-v1.zip"))
+    chosen = ChosenModel(
+        evil_zip.with_name("CartPole-v1.zip"), spec, Run(evil_zip.parent, "CartPole-v1")
+    )
+    with pytest.raises(UserError) as refused:
+        episode_in_training(chosen, 0, 5)
+    assert not mark.exists()
+    assert "ep_info_buffer" in str(refused.value)
+
+
+# --- statistics and replay buffers ---------------------------------------------------------------
+
+
+def test_statistics_in_a_hand_written_agents_folder(type_in_own_folder, own_folder, payload, mark):
+    run = hand_written_run(own_folder / "gift")
+    (run / ENV).mkdir()
+    (run / ENV / "vecnormalize.pkl").write_bytes(payload)
+    model = run / f"{ENV}.zip"
+    check_refused(type_in_own_folder("enjoy.py", model, *PLAY), mark, "vecnormalize.pkl")
+    words = ["--algo", "random", "--env", ENV, "-n", "8", "-i", model]
+    check_refused(type_in_own_folder("train.py", *words), mark, "vecnormalize.pkl")
+    (run / ENV / "vecnormalize.pkl").rename(own_folder / "named.pkl")
+    words = [model, "--vec-normalize", "named.pkl", *PLAY]
+    check_refused(type_in_own_folder("enjoy.py", *words), mark, "named.pkl")
+
+
+def test_a_replay_buffer_beside_the_agent(type_in_own_folder, own_folder, payload, mark):
+    agent = load_algorithm("dqn")("MlpPolicy", ENV, buffer_size=10)
+    agent.save(own_folder / "dqn.zip")
+    (own_folder / "replay_buffer.pkl").write_bytes(payload)
+    words = ["--algo", "dqn", "--env", ENV, "-n", "8", "-i", "dqn.zip"]
+    check_refused(type_in_own_folder("train.py", *words), mark, "replay_buffer.pkl")
+
+
+def test_a_hand_written_zip_with_a_pickle_in_it(type_in_own_folder, own_folder, payload, mark):
+    run = hand_written_run(own_folder / "gift")
+    text = {":type:": "x", ":serialized:": base64.b64encode(payload).decode()}
+    for changes in ({"verbose": text}, {"predict": 1}, {"invented": 1}):
+        with zipfile.ZipFile(run / f"{ENV}.zip") as archive:
+            members = {name: archive.read(name) for name in archive.namelist()}
+        members["data"] = json.dumps({**json.loads(members["data"]), **changes})
+        with zipfile.ZipFile(own_folder / "evil.zip", "w") as archive:
+            for name, content in members.items():
+                archive.writestr(name, content)
+        answer = type_in_own_folder("enjoy.py", "evil.zip", "--env", ENV, *PLAY)
+        check_refused(answer, mark, "cannot be loaded as a random agent")
+
+
+# --- modules that a file asks for ----------------------------------------------------------------
+
+
+ASKING = {
+    "the environment's id": {"env_id": f"gift.extra:{ENV}"},
+    "a module of Python's": {"env_id": f"this:{ENV}"},
+    "modules that were imported then": {"gym_packages": ["gift.extra"]},
+    "the folder, and a wrapper in it": {
+        "gym_packages": ["gift"],
+        "hyperparams": {"env_wrapper": "gift.extra.Wrapper"},
+    },
+    "a wrapper": {"hyperparams": {"env_wrapper": "gift.extra.Wrapper"}},
+}
+
+
+@pytest.mark.parametrize("way", ASKING)
+def test_a_run_asks_for_a_module(type_in_own_folder, own_folder, way):
+    run = hand_written_run(own_folder / "gift", **ASKING[way])
+    (run / "extra.py").write_text(MODULE)
+    answer = type_in_own_folder("enjoy.py", run / f"{ENV}.zip", *PLAY)
+    assert not {"gift", "gift.extra", "this"} & sys.modules.keys()
+    assert "Beautiful" not in answer[1]
+    check_refused(answer, run / "mark", "--gym-packages")
+
+
+@pytest.mark.parametrize("name", ["extra", "this"])
+def test_a_study_asks_for_a_module(type_in_own_folder, own_folder, name):
+    (own_folder / "extra.py").write_text(MODULE)
+    (own_folder / "gift").mkdir()
+    (own_folder / "gift" / "extra.py").write_text(MODULE)
+    study = (
+        f"environments:\n  one: {{id: '{name}:{ENV}', n_timesteps: 10}}\n"
+        "agents:\n  random: {algo: random}\nseeds: 1\n"
+    )
+    for path in (own_folder / "study.yml", own_folder / "gift" / "study.yml"):
+        path.write_text(study)
+        answer = type_in_own_folder("compare.py", path, "--no-report")
+        check_refused(answer, path.with_name("mark"), f"--gym-packages {name}")
+        assert name not in sys.modules
