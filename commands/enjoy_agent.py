@@ -143,11 +143,10 @@ def main() -> int:
     if film is not None:
         check_film_path(film)
     chosen = _chosen_model(args)
-    from rich.console import Console
-
+    from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
 
-    console = Console(highlight=False, quiet=args.verbose < 1)
+    console = TextConsole(highlight=False, quiet=args.verbose < 1)
     about = f"{chosen.spec.algo} on {chosen.spec.env_id}: {chosen.path}"
     console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries"):

@@ -9,13 +9,14 @@ from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
 from agents.algorithm_entries import has_masks, is_bandit
+from commands.terminal import TextConsole
 from pipeline.environments import make_env
 from pipeline.settings.hyperparam_entries import entry_names
 
 
 def print_lists() -> None:
     """Print the table of agents and that of environments."""
-    console = Console(highlight=False)
+    console = TextConsole(highlight=False)
     _print_agents(console)
     console.print()
     _print_environments(console)

@@ -17,6 +17,7 @@ import envs  # noqa: F401  # registers the project's environments
 from envs.wrappers import ActionMasks
 from pipeline.environment_mistakes import environment_mistake
 from pipeline.errors import UserError, one_line, shown, unknown
+from pipeline.memory_limits import check_environments, check_frame_stack
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
 
@@ -34,6 +35,7 @@ MISTAKES = (
     AssertionError,
     OSError,
     ImportError,
+    MemoryError,
     gym.error.Error,
 )
 
@@ -145,6 +147,7 @@ def _with_masks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gym.Env[Any, Any]:
     """One wrapped environment, outside any VecEnv."""
+    check_environments(n_envs, spec.env_id)
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
     env = make_env(spec.env_id, {**kwargs, **extra})
     wrap = env_wrapper(spec, training)
@@ -224,7 +227,9 @@ def _make_vec_env(
     env = env if wrap is None else wrap(env)
     env = _normalize(env, spec, training)
     if spec.hyperparams.frame_stack is not None:
-        env = vec_env.VecFrameStack(env, spec.hyperparams.frame_stack)
+        n_frames = spec.hyperparams.frame_stack
+        check_frame_stack(n_frames, n_envs, env.observation_space, spec.env_id)
+        env = vec_env.VecFrameStack(env, n_frames)
     return BaseAlgorithm._wrap_env(env)
 
 
