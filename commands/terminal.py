@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.text import Text
 
 from pipeline.errors import visible
 
@@ -18,10 +20,14 @@ class TextConsole(Console):
     Labels, titles and names come from files; what moves the cursor or sets a colour is Rich's own.
     """
 
+    def render_str(self, text: str, **options: Any) -> Text:
+        """As Rich does, of the text made visible, so that it is measured as it is shown."""
+        return super().render_str(visible(text), **options)
+
     def render(
         self, renderable: RenderableType, options: ConsoleOptions | None = None
     ) -> Iterable[Segment]:
-        """As Rich does, the text of every segment made visible."""
+        """As Rich does, the text of every segment made visible, whatever it comes from."""
         for segment in super().render(renderable, options):
             text, style, control = segment
             yield segment if control else Segment(visible(text), style)

@@ -147,7 +147,6 @@ def _with_masks(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
 
 def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gym.Env[Any, Any]:
     """One wrapped environment, outside any VecEnv."""
-    check_environments(n_envs, spec.env_id)
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
     env = make_env(spec.env_id, {**kwargs, **extra})
     wrap = env_wrapper(spec, training)
@@ -205,6 +204,7 @@ def _make_vec_env(
 
     from pipeline.settings.components import vec_wrapper_factory
 
+    check_environments(n_envs, spec.env_id)
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
 
     def make(**given: Any) -> gym.Env[Any, Any]:

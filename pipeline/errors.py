@@ -56,7 +56,7 @@ class UserError(Exception):
 
 
 def visible(text: str) -> str:
-    """The text with control characters spelt out: names from files may hold a terminal's commands."""
+    """The text with control characters spelt out: a terminal shows them, and does not obey."""
     return _OBEYED.sub(lambda sign: sign[0].encode("unicode_escape").decode("ascii"), text)
 
 

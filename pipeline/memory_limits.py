@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Mapping
+from itertools import pairwise
 from typing import Any
 
 from gymnasium import spaces
@@ -19,6 +20,9 @@ _MEMORY_IF_UNKNOWN = 16 * 2**30  # bytes
 _BYTES_PER_ENVIRONMENT = 20_000  # CartPole with its Monitor takes more
 _BYTES_PER_WEIGHT = 16  # of 32 bits, with its gradient and two moments of Adam
 _BYTES_PER_PULL = 24  # the arm, the reward and the regret
+
+# What counts observations among the arguments of an agent's constructor.
+_BUFFERS = frozenset({"buffer_size", "n_steps", "n_delta"})
 
 
 def memory() -> int:
@@ -67,10 +71,15 @@ def check_pulls(n_runs: int, n_timesteps: int, where: str) -> None:
     _check(f"{n_runs:,} seeds with n_timesteps {n_timesteps:,}", n_bytes, where)
 
 
+def takes_buffers(special: Hyperparams, parameters: Iterable[str]) -> bool:
+    """Whether the memory that an agent takes depends on the size of an observation."""
+    return special.frame_stack is not None or not _BUFFERS.isdisjoint(parameters)
+
+
 def check_agent(
     special: Hyperparams,
     arguments: Mapping[str, Any],
-    observations: spaces.Space[Any],
+    observations: spaces.Space[Any] | None,
     where: str,
 ) -> None:
     """Refuse an agent whose environments, buffers or networks the memory does not hold.
@@ -78,14 +87,27 @@ def check_agent(
     Args:
         special: the settings of the run.
         arguments: of the agent's constructor, with the defaults of those that are not given.
-        observations: space of one environment, before its observations are stacked.
+        observations: space of one environment, before its observations are stacked; None where
+            they do not matter, see `takes_buffers`.
         where: begins the error message.
 
     Raises:
         UserError: naming the setting, what it takes, and what there is.
     """
+    check_environments(special.n_envs, where)
+    if observations is not None:
+        _check_buffers(special, arguments, observations, where)
+    n_bytes = _policy_weights(arguments.get("policy_kwargs") or {}) * _BYTES_PER_WEIGHT
+    _check("the network of policy_kwargs", n_bytes, where)
+
+
+def _check_buffers(
+    special: Hyperparams,
+    arguments: Mapping[str, Any],
+    observations: spaces.Space[Any],
+    where: str,
+) -> None:
     n_envs, n_frames = special.n_envs, special.frame_stack or 1
-    check_environments(n_envs, where)
     check_frame_stack(n_frames, n_envs, observations, where)
     # The least that a transition holds, besides what is seen.
     stored = n_frames * observation_bytes(observations) + 8
@@ -93,19 +115,27 @@ def check_agent(
     asked = {
         "buffer_size": (1, copies * stored),
         "n_steps": (n_envs, stored),
+        "n_delta": (1, stored),
         "batch_size": (1, stored if _number(arguments.get("buffer_size")) else 0),
     }
     for name, (times, n_bytes) in asked.items():
         number = _number(arguments.get(name))
         beside = f" with n_envs {times:,}" if times > 1 else ""
         _check(f"{name} {number:,}{beside}", number * times * n_bytes, where)
-    policy = arguments.get("policy_kwargs") or {}
-    weights = _weights(policy.get("net_arch")) + 4 * _number(policy.get("lstm_hidden_size")) ** 2
-    _check("the network of policy_kwargs", weights * _BYTES_PER_WEIGHT, where)
 
 
 def _number(value: object) -> int:
     return value if isinstance(value, int) and not isinstance(value, bool) else 0
+
+
+def _policy_weights(policy: Mapping[str, Any]) -> int:
+    """Weights of a network at least, and the pairs of quantiles that its loss compares."""
+    memory_cells = _number(policy.get("lstm_hidden_size", 256))
+    return (
+        max(_weights(policy.get("net_arch")), 100) * _number(policy.get("n_critics", 1))
+        + 4 * memory_cells**2 * _number(policy.get("n_lstm_layers", 1))
+        + _number(policy.get("n_quantiles")) ** 2
+    )
 
 
 def _weights(layers: object) -> int:
@@ -115,8 +145,9 @@ def _weights(layers: object) -> int:
     if not isinstance(layers, Iterable) or isinstance(layers, str):
         return 0
     layers = list(layers)
-    sizes = [1, *filter(None, map(_number, layers))]
-    between = sum(one * next_one for one, next_one in zip(sizes, sizes[1:], strict=False))
+    sizes = [1, *filter(None, map(_number, layers)), 1]
+    # And a bias for each.
+    between = sum((before + 1) * size for before, size in pairwise(sizes))
     return between + sum(map(_weights, layers))
 
 

@@ -36,7 +36,7 @@ from pipeline.evaluation.exact import (
 from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
-from pipeline.memory_limits import check_agent, check_environments
+from pipeline.memory_limits import check_agent, check_environments, takes_buffers
 from pipeline.model_loading import agent_class
 from pipeline.normalization import take_over
 from pipeline.progress import ProgressDisplay
@@ -92,14 +92,16 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     algorithm, kwargs = agent_class(spec.algo), spec.hyperparams.algorithm
     check_action_noise(spec.hyperparams, algorithm, spec.algo)
     check_environments(spec.hyperparams.n_envs, spec.algo)
-    env = make_single_env(spec, training=True)
-    observations = env.observation_space
-    env.close()
+    parameters, observations = algorithm_parameters(algorithm), None
+    if needs_policy(algorithm, kwargs) or takes_buffers(spec.hyperparams, parameters):
+        env = make_single_env(spec, training=True)
+        observations = env.observation_space
+        env.close()
     if needs_policy(algorithm, kwargs):
         is_dict = isinstance(observations, spaces.Dict)
         kwargs = {"policy": default_policy(algorithm, is_dict), **kwargs}
     built = build_algorithm_kwargs(algorithm, kwargs, spec.algo, spec.gym_packages)
-    defaults = {name: p.default for name, p in algorithm_parameters(algorithm).items()}
+    defaults = {name: parameter.default for name, parameter in parameters.items()}
     check_agent(spec.hyperparams, {**defaults, **built}, observations, spec.algo)
     return built
 

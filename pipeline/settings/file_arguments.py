@@ -64,7 +64,7 @@ def _plain_prefix(value: str, where: str) -> str:
 
 
 def _inside(folder: Path, value: str, where: str) -> str:
-    # Read as on Windows, where both kinds of slashes part folders: a drive letter leads out as well.
+    # Read as on Windows, where both slashes part folders and a drive's letter leads out as well.
     pure = PureWindowsPath(value)
     leads_out = bool(pure.anchor) or ".." in pure.parts or "\0" in value
     # Where it leads by way of links.

@@ -3,6 +3,7 @@
 import importlib.util
 import inspect
 import math
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
