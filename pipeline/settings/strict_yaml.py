@@ -19,7 +19,7 @@ from pipeline.settings.yaml_loaders import SavedSettingsLoader, StrictLoader
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import read_file
 
-# Ten times what the longest file of settings has, and read in well under a second.
+# Twenty times what the longest file of settings has, and read in well under a second.
 _MAX_BYTES = 256 * 1024
 
 

@@ -57,13 +57,14 @@ class StrictLoader(yaml.SafeLoader):
         self._open: list[_Count] = []  # of the nodes that are being read, the outermost first
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
-        mark, is_alias = self.peek_event().start_mark, self.check_event(AliasEvent)
+        untyped: Any = self
+        event = untyped.peek_event()
         if len(self._open) >= _MAX_DEPTH:
-            raise _too_much(mark)
+            raise _too_much(event.start_mark)
         self._open.append(_Count())
         node = super().compose_node(parent, index)
         count = self._open.pop()
-        if is_alias:
+        if isinstance(event, AliasEvent):
             # Not counted yet is a node that holds its own alias.
             count = self._counts.get(id(node), _Count(_MAX_VALUES))
         self._counts[id(node)] = count
@@ -72,7 +73,7 @@ class StrictLoader(yaml.SafeLoader):
             around.values += count.values
             around.depth = max(around.depth, 1 + count.depth)
             if around.values > _MAX_VALUES or len(self._open) + count.depth > _MAX_DEPTH:
-                raise _too_much(mark)
+                raise _too_much(event.start_mark)
         return node
 
     def compose_mapping_node(self, anchor: dict[Any, Node]) -> MappingNode:

@@ -254,7 +254,7 @@ def test_what_is_shared_adds_to_the_depth_too() -> None:
 def test_a_pipe_or_a_large_file_holds_no_settings(tmp_path: Path) -> None:
     pipe, large = tmp_path / "pipe.yml", tmp_path / "large.yml"
     os.mkfifo(pipe)
-    large.write_text("# " + "x" * 300_000)
+    large.write_text("# " + "x" * 600_000)
     with pytest.raises(UserError, match="is no regular file"):
         read_hyperparams("ppo", "A", pipe)
     for read in (read_hyperparams, entry_names):
