@@ -13,11 +13,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.errors import UserError, one_line
 from pipeline.settings.class_names import find_class
 from pipeline.settings.coercion import ScheduleSpec
-from pipeline.settings.constructor_arguments import (
-    check_arguments,
-    check_range,
-    constructor_parameters,
-)
+from pipeline.settings.constructor_arguments import check_arguments, constructor_parameters
 from pipeline.settings.file_arguments import confined
 from pipeline.settings.hyperparams import component_specs
 from pipeline.settings.literals import DottedName
@@ -26,6 +22,10 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
+
+# How wrappers call the number of observations that they stack, which take their memory at once.
+_STACKS = frozenset({"n_stack", "stack_size"})
+_LONGEST_STACK = 10_000
 
 
 @dataclass(frozen=True)
@@ -195,8 +195,9 @@ def _components(
         accepted = dict(list(constructor_parameters(cls).items())[n_inner:])
         given = {key: value for key, value in defaults.items() if key in accepted}
         kwargs = given | confined(check_arguments(item.kwargs, accepted, place), folder, place)
-        for name in kwargs.keys() & {"n_stack", "stack_size"}:  # what takes memory at once
-            check_range(name, kwargs[name], place)
+        for name in _STACKS & kwargs.keys():
+            if isinstance(kwargs[name], int) and kwargs[name] > _LONGEST_STACK:
+                raise UserError(f"{place}: {name} must be at most {_LONGEST_STACK:,}")
         for name, parameter in accepted.items():
             is_variable = parameter.kind in {parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD}
             if parameter.default is parameter.empty and name not in kwargs and not is_variable:

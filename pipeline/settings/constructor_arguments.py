@@ -20,8 +20,6 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "n_episodes": (1, _FINITE),
     "n_envs": (1, _FINITE),
     "frame_stack": (1, _FINITE),
-    "n_stack": (1, 10_000),
-    "stack_size": (1, 10_000),
     "noise_std": (0, _FINITE),
     "learning_rate": (0, _FINITE),
     "gamma": (0, 1),

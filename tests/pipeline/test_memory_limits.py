@@ -119,7 +119,7 @@ def test_stacks_of_an_agent_that_is_played_are_bounded_too():
 )
 def test_stacks_of_wrappers_are_bounded(key, wrapper, argument):
     spec = spec_of("ppo", {key: {wrapper: {argument: 10**9}}})
-    with pytest.raises(UserError, match=f"{argument} must be between 1 and 10000"):
+    with pytest.raises(UserError, match=f"{argument} must be at most 10,000"):
         make_evaluation_env(spec, 1)
 
 
