@@ -97,8 +97,10 @@ def check_agent(
     check_environments(special.n_envs, where)
     if observations is not None:
         _check_buffers(special, arguments, observations, where)
-    n_bytes = _policy_weights(arguments.get("policy_kwargs") or {}) * _BYTES_PER_WEIGHT
-    _check("the network of policy_kwargs", n_bytes, where)
+    policy = arguments.get("policy_kwargs")
+    if isinstance(policy, Mapping):
+        n_bytes = _policy_weights(policy) * _BYTES_PER_WEIGHT
+        _check("the network of policy_kwargs", n_bytes, where)
 
 
 def _check_buffers(

@@ -56,7 +56,7 @@ def _confined(name: str, value: Any, folder: Path | None, where: str) -> Any:
 
 
 def _plain_prefix(value: str, where: str) -> str:
-    if PureWindowsPath(value).name != value:
+    if PureWindowsPath(value).name != value or value == "..":
         raise UserError(
             f"{where} begins the names of files and holds no path, unlike {shown(value)}"
         )

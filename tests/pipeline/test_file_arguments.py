@@ -170,9 +170,10 @@ def test_places_inside_are_resolved_there_and_nothing_else_is_touched(tmp_path):
         confined({"nested": {"log_dir": "/etc"}}, tmp_path, "here")
 
 
-def test_what_is_said_of_names_holds_for_folders(tmp_path):
+@pytest.mark.parametrize("prefix", ["../../escaped", "..", "a/b", "/a", "C:a", "a\\b"])
+def test_a_prefix_holds_no_path(tmp_path, prefix):
     with pytest.raises(UserError, match=r"name_prefix begins the names of files"):
-        confined({"name_prefix": "../../escaped"}, tmp_path, "")
+        confined({"name_prefix": prefix}, tmp_path, "")
 
 
 def test_a_monitor_writes_into_the_run_folder_or_into_none(tmp_path, monkeypatch):

@@ -1,5 +1,7 @@
 """Settings that ask for more memory than there is are refused before any is taken."""
 
+import inspect
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -75,6 +77,7 @@ def test_what_does_not_fit_is_named_with_its_number(special, arguments, complain
         # PPO takes no more than its rollout.
         ({}, {"batch_size": 10**12}),
         ({"n_envs": 8, "frame_stack": 4}, {"policy_kwargs": {"net_arch": [400, 300]}}),
+        ({}, {"policy_kwargs": inspect.Parameter.empty, "n_steps": inspect.Parameter.empty}),
         ({}, {"policy_kwargs": None, "buffer_size": None, "n_steps": True}),
     ],
 )
