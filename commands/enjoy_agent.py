@@ -140,11 +140,10 @@ def main() -> int:
         check_film_path(film)
     wanted = model_request(args)
     found = _found_model(wanted)
-    from rich.console import Console
-
+    from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
 
-    console = Console(highlight=False, quiet=args.verbose < 1)
+    console = TextConsole(highlight=False, quiet=args.verbose < 1)
     about = f"{found.spec.algo} on {found.spec.env_id}: {found.path}"
     console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries"):

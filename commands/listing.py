@@ -9,6 +9,7 @@ from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
 from agents.algorithm_entries import is_bandit
+from commands.terminal import TextConsole
 from envs.action_masks import has_masks
 from pipeline.environments import make_env
 from pipeline.settings.hyperparam_entries import entry_names
@@ -16,7 +17,7 @@ from pipeline.settings.hyperparam_entries import entry_names
 
 def print_lists() -> None:
     """Print the table of agents and that of environments."""
-    console = Console(highlight=False)
+    console = TextConsole(highlight=False)
     _print_agents(console)
     console.print()
     _print_environments(console)

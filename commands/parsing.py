@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from commands.streams import standard_streams
-from pipeline.errors import UserError, one_line
+from pipeline.errors import UserError, one_line, visible
 
 MISTAKE = 2
 INTERRUPT = 130
@@ -77,7 +77,9 @@ class OneLineParser(argparse.ArgumentParser):
         unknown = message.removeprefix("unrecognized arguments: ")
         if unknown != message:
             message = f"unknown argument {unknown or repr('')}{self._hint(unknown.split())}"
-        self.exit(MISTAKE, f"{self.prog}: error: {' '.join(message.split())} (see --help)\n")
+        self.exit(
+            MISTAKE, f"{self.prog}: error: {visible(' '.join(message.split()))} (see --help)\n"
+        )
 
     def _hint(self, words: list[str]) -> str:
         from commands.flag_hints import hint
@@ -114,7 +116,7 @@ def _exit_code(main: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return INTERRUPT
-    print(f"{program}: error: {message}", file=sys.stderr)
+    print(f"{program}: error: {visible(message)}", file=sys.stderr)
     return MISTAKE
 
 

@@ -146,13 +146,12 @@ def main() -> int:
     from commands.train_request import train_spec
 
     spec = train_spec(args)
-    from rich.console import Console
-
     from commands.run_output import print_header, print_outcome, print_refusal
+    from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
 
     go_on_unread()
-    console = Console(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
+    console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
     print_header(console, spec)
     with doing(console, "loading the libraries") as activity:
         from pipeline.run_folder import INTERRUPTED

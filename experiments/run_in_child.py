@@ -35,9 +35,27 @@ def remove_draft(draft: Path) -> None:
     # Windows does not rename a folder of which a file is open.
     for folder in (dead, draft):
         shutil.rmtree(folder, ignore_errors=True)
+        if folder.is_symlink():
+            folder.unlink(missing_ok=True)
     for folder in (draft.parent, draft.parent.parent):
         with contextlib.suppress(OSError):
             folder.rmdir()
+
+
+def claim_draft(draft: Path) -> None:
+    """Make the folder of a run that begins, as a new one.
+
+    Others can tell its name beforehand: what is there already is an earlier process's, or a link to
+    where the run should not write, and is removed.
+    """
+    for _ in range(1000):
+        make_folder(draft.parent)
+        with contextlib.suppress(FileExistsError, FileNotFoundError):
+            draft.mkdir()
+            return
+        if os.path.lexists(draft):
+            remove_draft(draft)
+    draft.mkdir()
 
 
 def remove_dead_drafts(root: Path) -> None:
@@ -88,7 +106,8 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     """Train in ``draft``, and rename it into place; another's result that is there stays."""
     import_again(planned.spec.user_modules)
     run = Run(draft, planned.run.env_name)
-    make_folder(run.params_path)
+    claim_draft(draft)
+    run.params_path.mkdir()
     if planned.spec.tensorboard_log is not None:
         shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)  # of an earlier try
     if planned.is_batch:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -24,6 +25,8 @@ from pipeline.settings.strict_yaml import key_lines, read_yaml
 
 # The studies that come with the project.
 _SHIPPED = Path(__file__).resolve().parents[1] / "studies"
+
+MOST_AGENTS = 10_000
 
 BUDGETS = ("n_timesteps", "n_episodes")
 
@@ -190,7 +193,14 @@ def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[
         settings = {key: entry[key] for key in entry if key not in _AGENT_KEYS}
         values = {"tuned": tuned, "where": document.at(*keys), **values}
         agent = AgentSpec(label, algo, settings, **values)
-        agents += swept(agent, {**shared_sweep, **_sweep(document, entry, *keys)})
+        sweep = {**shared_sweep, **_sweep(document, entry, *keys)}
+        n_agents = len(agents) + math.prod(map(len, sweep.values()))
+        if n_agents > MOST_AGENTS:
+            place = document.at(*keys)
+            raise UserError(
+                f"{place}: {n_agents:,} agents by here; a study has {MOST_AGENTS:,} at most"
+            )
+        agents += swept(agent, sweep)
     return tuple(agents)
 
 

@@ -17,6 +17,7 @@ from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
 from pipeline.map_contents import with_maps_read
+from pipeline.memory_limits import check_pulls
 from pipeline.model_loading import agent_class
 from pipeline.run_folder import FINISHED, Run, environment_name
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
@@ -36,6 +37,8 @@ _MAY_DIFFER = (
     "log_interval",
     "pictures",
 )
+
+MOST_RUNS = 1_000_000
 
 # What a batch can follow, besides the agent's own arguments.
 _BATCH_SETTINGS = ("n_timesteps", "env_kwargs", "algorithm")
@@ -96,6 +99,7 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
     Raises:
         UserError: if an agent cannot be trained so, or does not fit an environment.
     """
+    _check_number(study)
     _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
     _check_folders(
         "environments",
@@ -110,12 +114,24 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
                 check_fit(spec)
             specs[agent.label, environment.label] = spec
     batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
+    for labels in batches:
+        check_pulls(study.n_seeds, specs[labels].hyperparams.n_timesteps or 0, " on ".join(labels))
     return [
         _planned_run(study, root, agent, environment, seed, spec, (agent, environment) in batches)
         for seed in range(study.n_seeds)
         for (agent, environment), spec in specs.items()
         if seed == 0 or (agent, environment) not in batches
     ]
+
+
+def _check_number(study: StudySpec) -> None:
+    n_agents, n_environments = len(study.agents), len(study.environments)
+    n_runs = n_agents * n_environments * study.n_seeds
+    if n_runs > MOST_RUNS:
+        raise UserError(
+            f"{study.name}: {n_agents:,} agents on {n_environments:,} environments with "
+            f"{study.n_seeds:,} seeds are {n_runs:,} runs; a study has {MOST_RUNS:,} at most"
+        )
 
 
 def _planned_run(

@@ -19,6 +19,7 @@ from envs.action_masks import has_masks
 from envs.wrappers import ActionMasks
 from pipeline.environment_mistakes import environment_mistake
 from pipeline.errors import UserError, one_line, shown, unknown
+from pipeline.memory_limits import check_environments, check_frame_stack
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
 
@@ -36,6 +37,7 @@ MISTAKES = (
     AssertionError,
     OSError,
     ImportError,
+    MemoryError,
     gym.error.Error,
 )
 
@@ -118,20 +120,19 @@ def _usual_kwargs(env_id: str) -> dict[str, Any]:
     return {**defaults, **registered.kwargs, "max_episode_steps": registered.max_episode_steps}
 
 
-def env_wrapper(spec: TrainSpec, training: bool) -> Wrap | None:
+def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> Wrap | None:
     """The wrappers that the hyperparameters name, as one function, or None for none.
 
-    Where the agent goes by action masks, the outermost tells them.
+    Where the agent goes by action masks, the outermost tells them. What wrappers write goes into the
+    folder, or where there is none, into a temporary one.
     """
     from pipeline.settings.components import wrapper_factory
 
-    inner = wrapper_factory(spec.hyperparams.env_wrapper, spec.gym_packages)
-    outer = (
-        wrapper_factory(spec.hyperparams.train_env_wrapper, spec.gym_packages, "train_env_wrapper")
-        if training
-        else None
-    )
-    wraps = [wrap for wrap in (inner, outer) if wrap is not None]
+    named = {"env_wrapper": spec.hyperparams.env_wrapper}
+    if training:
+        named["train_env_wrapper"] = spec.hyperparams.train_env_wrapper
+    made = (wrapper_factory(w, spec.gym_packages, key, folder) for key, w in named.items())
+    wraps = [wrap for wrap in made if wrap is not None]
     if spec.hyperparams.algorithm.get("mask_actions", False):
         wraps.append(_with_masks)
     elif spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks:
@@ -162,6 +163,8 @@ def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gy
 
 def make_training_env(spec: TrainSpec, monitor_folder: Path | None) -> Any:
     """The environments of the training, each under a Monitor that writes into the folder.
+
+    What wrappers write goes there too; where it is None, into a temporary folder.
 
     Returns:
         A VecEnv of ``n_envs`` environments.
@@ -206,6 +209,7 @@ def _make_vec_env(
 
     from pipeline.settings.components import vec_wrapper_factory
 
+    check_environments(n_envs, spec.env_id)
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
 
     def make(**given: Any) -> gym.Env[Any, Any]:
@@ -220,14 +224,17 @@ def _make_vec_env(
         env_kwargs={**kwargs, **(extra or {})},
         monitor_dir=None if monitor_folder is None else str(monitor_folder),
         monitor_kwargs=spec.hyperparams.monitor_kwargs,
-        wrapper_class=env_wrapper(spec, training),
+        wrapper_class=env_wrapper(spec, training, monitor_folder),
         vec_env_cls=getattr(vec_env, TRAINING_VEC_ENVS[spec.vec_env if training else "dummy"]),
     )
-    wrap = vec_wrapper_factory(spec.hyperparams.vec_env_wrapper, spec.gym_packages)
+    wrappers = spec.hyperparams.vec_env_wrapper
+    wrap = vec_wrapper_factory(wrappers, spec.gym_packages, folder=monitor_folder)
     env = env if wrap is None else wrap(env)
     env = _normalize(env, spec, training)
     if spec.hyperparams.frame_stack is not None:
-        env = vec_env.VecFrameStack(env, spec.hyperparams.frame_stack)
+        n_frames = spec.hyperparams.frame_stack
+        check_frame_stack(n_frames, n_envs, env.observation_space, spec.env_id)
+        env = vec_env.VecFrameStack(env, n_frames)
     return BaseAlgorithm._wrap_env(env)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import reprlib
 from collections.abc import Iterable, Mapping
 
@@ -42,11 +43,21 @@ _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
 
 
+# What a terminal obeys instead of showing it, but for ends of lines and tabs; and what turns the
+# direction of writing round.
+_OBEYED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
 class UserError(Exception):
     """A mistake of the user's: one line that says what is wrong, where, and what would be right."""
 
     def __init__(self, message: str) -> None:
-        super().__init__(" ".join(line.strip() for line in message.splitlines()))
+        super().__init__(visible(" ".join(line.strip() for line in message.splitlines())))
+
+
+def visible(text: str) -> str:
+    """The text with control characters spelt out: a terminal shows them, and does not obey."""
+    return _OBEYED.sub(lambda sign: sign[0].encode("unicode_escape").decode("ascii"), text)
 
 
 def shown(value: object) -> str:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import re
+import secrets
 import sys
 import time
 from collections.abc import Iterator
@@ -60,7 +61,8 @@ def put_in_place(draft: Path, path: Path) -> None:
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a name beside ``path`` to write to, and rename it into place once it is whole."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # A name that could be guessed might be there already, as a link to another's file.
+    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     try:
         yield draft
         with draft.open("rb+") as file:  # Windows flushes only what may be written

@@ -36,6 +36,7 @@ from pipeline.evaluation.exact import (
 from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
+from pipeline.memory_limits import check_agent, check_environments, takes_buffers
 from pipeline.model_loading import agent_class, telling_masks
 from pipeline.normalization import take_over
 from pipeline.progress import ProgressDisplay
@@ -85,16 +86,24 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     """The arguments of the agent's constructor, checked and made into objects.
 
     Raises:
-        UserError: if one is unknown or has a wrong type or range.
+        UserError: if one is unknown, has a wrong type or range, or asks for more memory than there
+            is.
     """
     algorithm, kwargs = agent_class(spec.algo), spec.hyperparams.algorithm
     check_action_noise(spec.hyperparams, algorithm, spec.algo)
-    if needs_policy(algorithm, kwargs):
+    check_environments(spec.hyperparams.n_envs, spec.algo)
+    parameters, observations = algorithm_parameters(algorithm), None
+    if needs_policy(algorithm, kwargs) or takes_buffers(spec.hyperparams, parameters):
         env = make_single_env(spec, training=True)
-        is_dict = isinstance(env.observation_space, spaces.Dict)
+        observations = env.observation_space
         env.close()
+    if needs_policy(algorithm, kwargs):
+        is_dict = isinstance(observations, spaces.Dict)
         kwargs = {"policy": default_policy(algorithm, is_dict), **kwargs}
-    return build_algorithm_kwargs(algorithm, kwargs, spec.algo, spec.gym_packages)
+    built = build_algorithm_kwargs(algorithm, kwargs, spec.algo, spec.gym_packages)
+    defaults = {name: parameter.default for name, parameter in parameters.items()}
+    check_agent(spec.hyperparams, {**defaults, **built}, observations, spec.algo)
+    return built
 
 
 def set_up(

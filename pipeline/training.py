@@ -112,7 +112,7 @@ def _library_errors_in_one_line() -> Iterator[None]:
     """Errors of settings that only the library checks, when it gets them."""
     try:
         yield
-    except (ValueError, TypeError, AssertionError, RuntimeError) as error:
+    except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
         raise UserError(one_line(error)) from error
 
 

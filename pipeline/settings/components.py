@@ -14,6 +14,7 @@ from pipeline.errors import UserError, one_line
 from pipeline.settings.class_names import find_class
 from pipeline.settings.coercion import ScheduleSpec
 from pipeline.settings.constructor_arguments import check_arguments, constructor_parameters
+from pipeline.settings.file_arguments import confined
 from pipeline.settings.hyperparams import component_specs
 from pipeline.settings.literals import DottedName
 
@@ -21,6 +22,10 @@ if TYPE_CHECKING:
     import gymnasium as gym
     from stable_baselines3.common.callbacks import BaseCallback
     from stable_baselines3.common.vec_env import VecEnv
+
+# How wrappers call the number of observations that they stack, which take their memory at once.
+_STACKS = frozenset({"n_stack", "stack_size"})
+_LONGEST_STACK = 10_000
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,10 @@ class _Chain:
 
 
 def wrapper_factory(
-    spec: Any, extra_packages: Sequence[str] = (), where: str = "env_wrapper"
+    spec: Any,
+    extra_packages: Sequence[str] = (),
+    where: str = "env_wrapper",
+    folder: Path | None = None,
 ) -> Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None:
     """What wraps an environment as ``spec`` says, the first wrapper innermost.
 
@@ -62,6 +70,8 @@ def wrapper_factory(
         spec: a dotted name, a mapping from it to arguments, a list of either, or None.
         extra_packages: packages that the user allows besides the usual ones.
         where: begins every error message.
+        folder: that they may write to; None for a temporary one, see
+            `pipeline.settings.file_arguments`.
 
     Returns:
         A function of the environment, or None if there is nothing to wrap.
@@ -71,16 +81,19 @@ def wrapper_factory(
     """
     from gymnasium import Wrapper
 
-    return _chain(spec, Wrapper, extra_packages, where)
+    return _chain(spec, Wrapper, extra_packages, where, folder)
 
 
 def vec_wrapper_factory(
-    spec: Any, extra_packages: Sequence[str] = (), where: str = "vec_env_wrapper"
+    spec: Any,
+    extra_packages: Sequence[str] = (),
+    where: str = "vec_env_wrapper",
+    folder: Path | None = None,
 ) -> Callable[[VecEnv], VecEnv] | None:
     """As `wrapper_factory`, for wrappers of a vectorised environment."""
     from stable_baselines3.common.vec_env import VecEnvWrapper
 
-    return _chain(spec, VecEnvWrapper, extra_packages, where)
+    return _chain(spec, VecEnvWrapper, extra_packages, where, folder)
 
 
 def callbacks(
@@ -91,15 +104,17 @@ def callbacks(
     Args:
         spec: a dotted name, a mapping from it to arguments, a list of either, or None.
         extra_packages: packages that the user allows besides the usual ones.
-        save_path: given to callbacks that have a ``save_path`` and are not told another.
+        save_path: given to callbacks that have a ``save_path`` and are not told another; what
+            they are told lies inside it.
 
     Raises:
         UserError: if a name is not that of a callback, or an argument does not fit it.
     """
     from stable_baselines3.common.callbacks import BaseCallback
 
-    defaults = {} if save_path is None else {"save_path": str(save_path)}
-    components = _components(spec, BaseCallback, extra_packages, "callback", 0, defaults)
+    folder = None if save_path is None else Path(save_path)
+    defaults = {} if folder is None else {"save_path": str(folder)}
+    components = _components(spec, BaseCallback, extra_packages, "callback", 0, folder, defaults)
     return [component.build() for component in components]
 
 
@@ -146,8 +161,10 @@ def _value_bases() -> tuple[type, ...]:
     return nn.Module, optim.Optimizer, BaseBuffer
 
 
-def _chain(spec: Any, base: type, extra_packages: Sequence[str], where: str) -> _Chain | None:
-    components = _components(spec, base, extra_packages, where, 1, {})
+def _chain(
+    spec: Any, base: type, extra_packages: Sequence[str], where: str, folder: Path | None
+) -> _Chain | None:
+    components = _components(spec, base, extra_packages, where, 1, folder, {})
     return _Chain(components) if components else None
 
 
@@ -157,6 +174,7 @@ def _components(
     extra_packages: Sequence[str],
     where: str,
     n_inner: int,
+    folder: Path | None,
     defaults: Mapping[str, Any],
 ) -> tuple[_Component, ...]:
     """Look up and check what ``spec`` names.
@@ -167,6 +185,7 @@ def _components(
         extra_packages: packages that the user allows.
         where: begins every error message.
         n_inner: how many leading arguments a class is given when it is built.
+        folder: that they may write to, or None for a temporary one.
         defaults: arguments for those classes that know them and are not told others.
     """
     components = []
@@ -175,7 +194,10 @@ def _components(
         place = f"{where}: {item.name}"
         accepted = dict(list(constructor_parameters(cls).items())[n_inner:])
         given = {key: value for key, value in defaults.items() if key in accepted}
-        kwargs = check_arguments(given | item.kwargs, accepted, place)
+        kwargs = given | confined(check_arguments(item.kwargs, accepted, place), folder, place)
+        for name in _STACKS & kwargs.keys():
+            if isinstance(kwargs[name], int) and kwargs[name] > _LONGEST_STACK:
+                raise UserError(f"{place}: {name} must be at most {_LONGEST_STACK:,}")
         for name, parameter in accepted.items():
             is_variable = parameter.kind in {parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD}
             if parameter.default is parameter.empty and name not in kwargs and not is_variable:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError, did_you_mean, shown
-from pipeline.settings.strict_yaml import read_yaml
+from pipeline.settings.strict_yaml import read_settings_text, read_yaml
 
 _FOLDER = Path(__file__).resolve().parents[2] / "hyperparams"
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
@@ -76,7 +76,7 @@ def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
     """
     path = _path(algo, path)
     # The keys alone, by their place in the line: parsing all files would slow listing them down.
-    names = _TOP_LEVEL_KEY.findall(path.read_text("utf-8")) if path.is_file() else []
+    names = _TOP_LEVEL_KEY.findall(read_settings_text(path)) if path.is_file() else []
     return [name for name in names if name not in _STAND_INS]
 
 

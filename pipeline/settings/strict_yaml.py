@@ -7,85 +7,20 @@ has it, not a text.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import yaml
-from yaml.constructor import ConstructorError
-from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
+from yaml.nodes import MappingNode, Node, SequenceNode
 
-from pipeline.errors import UserError, shown
+from pipeline.errors import UserError
+from pipeline.settings.yaml_loaders import SavedSettingsLoader, StrictLoader
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import read_file
 
-_TAG = "tag:yaml.org,2002:"
-_PLAIN_TAGS = frozenset(
-    _TAG + name for name in ("null", "bool", "int", "float", "str", "seq", "map")
-)
-# How rl_zoo3 writes the settings of a run.
-_ORDERED_DICT = _TAG + "python/object/apply:collections.OrderedDict"
-_MAX_DEPTH = 50
-_MAX_VALUES = 100_000
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """Refuses repeated keys and every tag but those of plain data."""
-
-    admitted_tags = _PLAIN_TAGS
-
-    yaml_implicit_resolvers = {  # noqa: RUF012 # PyYAML copies it itself before it adds to it
-        first: [(tag, regexp) for tag, regexp in resolvers if tag != _TAG + "timestamp"]
-        for first, resolvers in yaml.SafeLoader.yaml_implicit_resolvers.items()
-    }
-
-    def compose_mapping_node(self, anchor: dict[Any, Node]) -> MappingNode:
-        # Here, and not where the mapping is built: by then merged keys stand among its own.
-        node = super().compose_mapping_node(anchor)
-        first_lines: dict[str, int] = {}
-        for key in (key for key, _ in node.value if isinstance(key, ScalarNode)):
-            if key.value in first_lines:
-                first = first_lines[key.value]
-                problem = f"key {shown(key.value)} appears twice, first on line {first}"
-                raise ConstructorError(None, None, problem, key.start_mark)
-            first_lines[key.value] = key.start_mark.line + 1
-        return node
-
-    def construct_object(self, node: Node, deep: bool = False) -> Any:
-        if node.tag not in self.admitted_tags:
-            problem = f"{node.tag.replace(_TAG, '!!')} is not allowed here"
-            raise ConstructorError(None, None, problem, node.start_mark)
-        try:
-            return super().construct_object(node, deep)
-        except (ValueError, LookupError) as error:
-            problem = f"{shown(node.value)} is no {node.tag.removeprefix(_TAG)}"
-            raise ConstructorError(None, None, problem, node.start_mark) from error
-
-
-_StrictLoader.add_implicit_resolver(
-    _TAG + "float", re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+$"), "-+0123456789"
-)
-
-
-class _SavedSettingsLoader(_StrictLoader):
-    """Reads rl_zoo3's tag for an OrderedDict too: as the data that it is, looking nothing up."""
-
-    admitted_tags = _PLAIN_TAGS | {_ORDERED_DICT}
-
-
-def _ordered_dict(loader: _SavedSettingsLoader, node: Node) -> dict[str, Any]:
-    arguments = loader.construct_sequence(node, deep=True) if isinstance(node, SequenceNode) else 0
-    match arguments:
-        case [] | [[]]:
-            return {}
-        case [list(pairs)] if all(isinstance(pair, list) and len(pair) == 2 for pair in pairs):
-            keys = [key for key, _ in pairs]
-            if all(isinstance(key, str) for key in keys) and len(set(keys)) == len(keys):
-                return dict(pairs)
-    problem = "is no OrderedDict of different keys, as rl_zoo3 writes it"
-    raise ConstructorError(None, None, problem, node.start_mark)
-
-
-_SavedSettingsLoader.add_constructor(_ORDERED_DICT, _ordered_dict)
+# Twenty times what the longest file of settings has, and read in well under a second.
+_MAX_BYTES = 256 * 1024
 
 
 def parse_yaml(content: str | bytes, where: str) -> Any:
@@ -101,13 +36,14 @@ def parse_yaml(content: str | bytes, where: str) -> Any:
     Raises:
         UserError: if it is not YAML, holds anything but plain data, or a key twice.
     """
-    return _parse(content, where, _StrictLoader)
+    return _parse(content, where, StrictLoader)
 
 
-def _parse(content: str | bytes, where: str, loader: type[_StrictLoader]) -> Any:
+def _parse(content: str | bytes, where: str, loader: type[StrictLoader]) -> Any:
+    if len(content) > _MAX_BYTES:
+        raise UserError(f"{where}: is larger than {_MAX_BYTES:,} bytes")
     try:
-        value = _load(content, loader)
-        _check_size(value)
+        return _load(content, loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
@@ -116,7 +52,6 @@ def _parse(content: str | bytes, where: str, loader: type[_StrictLoader]) -> Any
         raise UserError(f"{where}: is not a text file, or holds control characters") from error
     except (RecursionError, ValueError) as error:
         raise UserError(f"{where}: is nested too deeply, or too large") from error
-    return value
 
 
 def read_yaml(path: Path) -> Any:
@@ -125,7 +60,7 @@ def read_yaml(path: Path) -> Any:
     Raises:
         UserError: if the file cannot be read, or is not such a document.
     """
-    return _parse(_content(path), str(path), _StrictLoader)
+    return _parse(_content(path), str(path), StrictLoader)
 
 
 def read_saved_settings(path: Path) -> dict[str, Any]:
@@ -136,7 +71,7 @@ def read_saved_settings(path: Path) -> dict[str, Any]:
     Raises:
         UserError: if the file cannot be read, or does not map names to plain data.
     """
-    value = _parse(_content(path), str(path), _SavedSettingsLoader)
+    value = _parse(_content(path), str(path), SavedSettingsLoader)
     if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
         raise UserError(f"{path}: must map names to values")
     return value
@@ -144,10 +79,24 @@ def read_saved_settings(path: Path) -> dict[str, Any]:
 
 def _content(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_file(path, _MAX_BYTES)
+    except UnsafeFileError as error:
+        raise UserError(str(error)) from error
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise UserError(f"{path}: cannot be read: {reason}") from error
+
+
+def read_settings_text(path: Path) -> str:
+    """The text of a file of settings, for what needs no more than a look at it.
+
+    Raises:
+        UserError: if the file cannot be read, or is no text in UTF-8.
+    """
+    try:
+        return _content(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is not a text file, or holds control characters") from error
 
 
 def key_lines(path: Path) -> dict[tuple[str | int, ...], int]:
@@ -159,7 +108,7 @@ def key_lines(path: Path) -> dict[tuple[str | int, ...], int]:
     Returns:
         Line numbers, counted from 1, by the keys and indexes that lead to the value.
     """
-    loader = _StrictLoader(path.read_bytes())
+    loader = StrictLoader(_content(path))
     try:
         node = loader.get_single_node()
         return {} if node is None else dict(_node_lines(node, ()))
@@ -182,23 +131,9 @@ def _node_lines(
             yield from _node_lines(value, (*keys, index))
 
 
-def _load(content: str | bytes, loader_class: type[_StrictLoader]) -> Any:
+def _load(content: str | bytes, loader_class: type[StrictLoader]) -> Any:
     loader = loader_class(content)
     try:
         return loader.get_single_data()
     finally:
         loader.dispose()
-
-
-def _check_size(value: Any) -> None:
-    """Refuse what a few anchors can grow to: structures without end, or of billions of values."""
-    pending = [(value, 0)]
-    count = 0
-    while pending:
-        item, depth = pending.pop()
-        count += 1
-        if depth > _MAX_DEPTH or count > _MAX_VALUES:
-            raise ValueError
-        children = item.values() if isinstance(item, dict) else item
-        if isinstance(item, dict | list):
-            pending.extend((child, depth + 1) for child in children)

@@ -166,7 +166,9 @@ def test_what_is_about_to_be_trained(entry, budget):
 def lists(monkeypatch):
     """The lines of both lists, on a wide terminal."""
     file = io.StringIO()
-    monkeypatch.setattr(listing, "Console", lambda **more: Console(file=file, width=300, **more))
+    monkeypatch.setattr(
+        listing, "TextConsole", lambda **more: Console(file=file, width=300, **more)
+    )
     listing.print_lists()
     return [line.rstrip() for line in file.getvalue().splitlines()]
 

@@ -11,6 +11,7 @@ import pytest
 
 from experiments import run_in_child
 from experiments.run_in_child import (
+    claim_draft,
     do_run,
     draft_path,
     make_folder,
@@ -191,6 +192,24 @@ def test_no_file_of_a_run_is_open_when_it_is_renamed_into_place(
     (planned,) = plan(study, tmp_path)
     do_run(planned, draft_path(tmp_path, planned), "")
     assert still_open == [[]]
+
+
+def test_a_draft_is_a_new_folder_whatever_lies_there(tmp_path):
+    """Its name can be told beforehand, and a link there would lead out."""
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "precious").touch()
+    draft = tmp_path / "study" / ".drafts" / "1@here@mine@lake_1"
+    draft.parent.mkdir(parents=True)
+    draft.symlink_to(outside)
+    claim_draft(draft)
+    assert draft.is_dir()
+    assert not draft.is_symlink()
+    assert [path.name for path in draft.parent.iterdir()] == [draft.name]
+    (draft / "left over").touch()
+    claim_draft(draft)
+    assert list(draft.iterdir()) == []
+    assert [path.name for path in outside.iterdir()] == ["precious"]
 
 
 def test_a_folder_is_made_while_another_run_removes_it(tmp_path, monkeypatch):

@@ -261,6 +261,13 @@ def test_a_sweep_has_each_combination_once(sweep):
         assert all(f"{name}={agent.settings[name]}" in agent.label for name in sweep)
 
 
+def test_a_sweep_is_counted_before_it_is_made(read):
+    values = f"[{', '.join(map(str, range(100)))}]"
+    sweep = ", ".join(f"{name}: {values}" for name in "abcdef")
+    with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents by here; .* 10,000 at most"):
+        read(f"environments: [Taxi-v4]\nagents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
+
+
 def test_a_swept_budget_replaces_the_other():
     agent = AgentSpec("one", "qlearning", {"n_timesteps": 500})
     assert [a.settings for a in swept(agent, {"n_episodes": [5, 9]})] == [

@@ -43,6 +43,30 @@ def test_every_agent_on_every_environment_with_every_seed(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_study_has_a_bearable_number_of_runs(monkeypatch):
+    monkeypatch.setattr("experiments.study_plan.MOST_RUNS", 6)
+    dry = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_episodes": 9})
+    study = study_of("qlearning", "sarsa", "dqn", environments=(LAKE, dry), n_seeds=1)
+    assert len(plan(study, Path("nowhere"))) == 6
+    with pytest.raises(UserError) as caught:
+        plan(replace(study, n_seeds=10**12), Path("nowhere"))
+    assert str(caught.value) == (
+        "lakes: 3 agents on 2 environments with 1,000,000,000,000 seeds are "
+        "6,000,000,000,000 runs; a study has 6 at most"
+    )
+
+
+def test_a_batch_has_a_bearable_number_of_pulls(monkeypatch):
+    monkeypatch.setattr("pipeline.memory_limits.memory", lambda: 10**6)
+    settings = {"n_timesteps": 1000, "env_kwargs": {"pulls": 1000}}
+    bandit = EnvironmentSpec("arms", "GaussianBandit-v0", settings)
+    assert len(plan(study_of("ucb", environments=[bandit], n_seeds=30), Path("nowhere"))) == 1
+    with pytest.raises(
+        UserError, match=r"^ucb on arms: 50 seeds with n_timesteps 1,000 would take"
+    ):
+        plan(study_of("ucb", environments=[bandit], n_seeds=50), Path("nowhere"))
+
+
 def test_labels_become_names_of_folders(tmp_path):
     agent = AgentSpec("a/b: gamma=0.9 (mine)", "qlearning")
     assert only(study_of(agent), tmp_path).path.parent.name == "a_b_gamma=0.9_mine"

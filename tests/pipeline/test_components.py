@@ -222,7 +222,7 @@ def test_callbacks_and_where_they_save(tmp_path: Path) -> None:
     assert isinstance(second, CheckpointCallback)
     assert (second.save_freq, second.save_path) == (1000, str(tmp_path))
     assert isinstance(third, CheckpointCallback)
-    assert third.save_path == "elsewhere"
+    assert third.save_path == str(tmp_path / "elsewhere")
     assert isinstance(fourth, LogEveryNTimesteps)
 
 

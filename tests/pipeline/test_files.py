@@ -46,6 +46,16 @@ def test_the_draft_lies_beside_and_the_old_file_stays_until_the_end(tmp_path):
     assert names(tmp_path) == ["model.zip"]
 
 
+def test_nobody_can_tell_the_name_of_a_draft(tmp_path):
+    """A link of that name would lead what is written to another's file."""
+    names = set()
+    for _ in range(20):
+        with replacing(tmp_path / "model.zip") as draft:
+            draft.write_text("new")
+            names.add(draft.name)
+    assert len(names) == 20
+
+
 @pytest.mark.parametrize("error", [OSError, ValueError, KeyboardInterrupt])
 @pytest.mark.parametrize("old", ["old", None])
 def test_a_writer_that_fails_changes_nothing(tmp_path, error, old):

@@ -3,6 +3,7 @@
 import importlib.util
 import inspect
 import math
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -209,8 +210,11 @@ def test_merge_keys_and_anchors(tmp_path: Path) -> None:
         ("A: {x: !!int ''}\n", ":1:8: '' is no int"),
         ("A: {x: !!bool maybe}\n", ":1:8: 'maybe' is no bool"),
         ("A: {[1]: 2}\n", ":1:5: found unhashable key"),
-        ("A: &a [*a]\n", ": is nested too deeply, or too large"),
-        ("A: " + "[" * 3000, ": is nested too deeply, or too large"),
+        ("A: &a [*a]\n", ":1:8: is nested too deeply, or too large"),
+        ("A: " + "[" * 3000, ":1:53: is nested too deeply, or too large"),
+        ("A: {b: " + "9" * 5000 + "}", "is too long for a number"),
+        ("A: {b: 0x" + "f" * 5000 + "}", "is too long for a number"),
+        ("A: {b: " + ":".join(["1"] * 5000) + "}", "is too long for a number"),
         (b"\x00\x01\x02", ": is not a text file"),
         (b"PK\x03\x04\xff\xfe", ": is not a text file"),
         (b"A: \xff", ": is not a text file"),
@@ -229,14 +233,39 @@ def test_a_broken_file_is_told_with_its_place(
 def test_anchors_cannot_unfold_without_end() -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 10)]
-    with pytest.raises(UserError, match="too large"):
+    with pytest.raises(UserError, match=r"^bomb:5:\d+: .*too large"):
         parse_yaml("\n".join(lines), "bomb")
+
+
+def test_merge_keys_are_counted_before_they_are_merged() -> None:
+    lines = ["a0: &a0 {x: 1}"]
+    lines += [f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 9)}]}}" for i in range(1, 9)]
+    with pytest.raises(UserError, match=r"^bomb:5:\d+: .*too large"):
+        parse_yaml("\n".join(lines), "bomb")
+
+
+def test_what_is_shared_adds_to_the_depth_too() -> None:
+    lines = ["a0: &a0 [x]", *(f"a{i}: &a{i} [*a{i - 1}]" for i in range(1, 60))]
+    with pytest.raises(UserError, match=r"^deep:49:\d+: is nested too deeply"):
+        parse_yaml("\n".join(lines), "deep")
+    assert parse_yaml("\n".join(lines[:40]), "deep")["a1"] == [["x"]]
+
+
+def test_a_pipe_or_a_large_file_holds_no_settings(tmp_path: Path) -> None:
+    pipe, large = tmp_path / "pipe.yml", tmp_path / "large.yml"
+    os.mkfifo(pipe)
+    large.write_text("# " + "x" * 600_000)
+    with pytest.raises(UserError, match="is no regular file"):
+        read_hyperparams("ppo", "A", pipe)
+    for read in (read_hyperparams, entry_names):
+        with pytest.raises(UserError, match="is larger than 262,144 bytes"):
+            read("ppo", *(["A"] if read is read_hyperparams else []), large)
 
 
 def test_what_is_no_readable_file(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"missing\.yml: cannot be read: No such file"):
         read_hyperparams("ppo", "A", tmp_path / "missing.yml")
-    with pytest.raises(UserError, match="cannot be read: Is a directory"):
+    with pytest.raises(UserError, match="is no regular file"):
         read_hyperparams("ppo", "A", tmp_path)
     with pytest.raises(UserError, match="cannot be read: embedded null byte"):
         read_hyperparams("ppo", "A", "a\0b")

@@ -261,6 +261,8 @@ def test_the_policy_allows_the_scripts_of_the_page_and_nothing_from_outside(page
     directives = dict(part.strip().split(" ", 1) for part in policies[0].split(";"))
     assert directives["default-src"] == "'none'"
     assert directives["img-src"] == "data: blob:"
+    # These two do not follow from default-src.
+    assert directives["form-action"] == directives["base-uri"] == "'none'"
     running = [s for a, s in page.all("script") if a.get("type") != "application/json"]
     hashes = {
         f"'sha256-{base64.b64encode(hashlib.sha256(s.encode()).digest()).decode()}'"
