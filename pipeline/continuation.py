@@ -23,7 +23,7 @@ from pipeline.model_loading import (
     load_replay_buffer,
 )
 from pipeline.normalization import Statistics, normalising, read_statistics
-from pipeline.recorded_runs import run_around
+from pipeline.recorded_runs import check_digest, run_around
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
@@ -40,9 +40,14 @@ def agent_to_continue(path: Path, log_folder: Path, is_trusted: bool) -> Path:
         is_trusted: read what can run code from elsewhere too.
 
     Raises:
-        UserError: if there is none, or it or what goes with it could run code and lies elsewhere.
+        UserError: if there is none, or it or what goes with it is not as its run left it, or could
+            run code and lies elsewhere.
     """
     model = model_at(path)
+    run = run_around(model)
+    for file in (model, _statistics_path(model), replay_buffer_of(model)):
+        if file is not None:
+            check_digest(run, file)
     if not is_trusted:
         if hand_written_algorithm(model) is None:
             check_origin(model, log_folder)

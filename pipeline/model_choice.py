@@ -26,7 +26,7 @@ from pipeline.model_finding import Which, model_at, model_of
 from pipeline.model_loading import STATISTICS, check_origin, hand_written_algorithm
 from pipeline.module_records import check_recorded
 from pipeline.normalization import normalising, read_statistics
-from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
+from pipeline.recorded_runs import RecordedRun, check_digest, recorded_run, run_around
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import split
@@ -103,6 +103,7 @@ def choose_model(request: ModelRequest) -> ChosenModel:
         chosen = _newest(request)
     else:
         chosen = _model_at(model_at(request.path, request.which), request)
+    check_digest(chosen.run, chosen.path)
     return _checked_statistics(chosen, request)
 
 
@@ -197,5 +198,6 @@ def _checked_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenMod
         return chosen
     if not request.is_trusted:
         check_origin(path, request.log_folder, what=STATISTICS)
+    check_digest(chosen.run, path)
     spec = normalising(chosen.spec, read_statistics(path).settings)
     return ChosenModel(chosen.path, spec, chosen.run, path)

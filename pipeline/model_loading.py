@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError, one_line
+from pipeline.file_digests import RECORD, read_record
 from pipeline.run_folder import Run
 from pipeline.settings.constructor_arguments import algorithm_parameters
 
@@ -221,9 +222,8 @@ def run_of(path: Path) -> Run | None:
     """The run folder that a model file lies in, or None if it lies elsewhere."""
     folder = path.resolve().parent
     try:
-        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        env_name = str(info["env_name"])
-    except (OSError, ValueError, KeyError, TypeError):
+        env_name = str(read_record(folder / RECORD)["env_name"])
+    except (OSError, UserError, KeyError):
         return None
     return Run(folder, env_name)
 

@@ -26,6 +26,7 @@ from pipeline.model_loading import (
     run_of,
 )
 from pipeline.module_records import check_recorded
+from pipeline.recorded_runs import check_digest
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
@@ -112,6 +113,7 @@ def read_policy(path: Path, trust: bool = False) -> LoggedPolicy:
     spec = {} if run is None else run.recorded_spec()
     if run is not None:
         check_recorded(spec, run.path)
+        check_digest(run, zip_path)
     hand_written = hand_written_algorithm(zip_path)
     algo = hand_written or spec.get("algo")
     if algo is None:
