@@ -109,12 +109,13 @@ class PullStatistics:
             self.shares.shape: (self.shares, self.context_regret),
         }
         fits = all(array.shape == shape for shape, arrays in shapes.items() for array in arrays)
-        optional = (self.estimates, self.estimates_std, self.true_means)
         return (
             fits
             and self.shares.ndim == 2
             and n_points > 0
-            and all(not array.size or array.shape == self.shares.shape for array in optional)
+            # An agent that sees no contexts has one row of estimates for all of them.
+            and self.estimates.shape == self.estimates_std.shape
+            and self.estimates.ndim == self.true_means.ndim == 2
             and self.posteriors.ndim == 4
             and (not self.posteriors.size or self.posteriors.shape[0] == self.moments.size)
         )

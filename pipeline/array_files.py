@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import math
+import tokenize
 import warnings
 import zipfile
 import zlib
@@ -42,6 +43,7 @@ _DAMAGE = (
     EOFError,
     OverflowError,
     MemoryError,
+    tokenize.TokenError,  # of headers that are read as if Python 2 had written them
     Warning,
 )
 

@@ -196,7 +196,7 @@ class Run:
         write_json(self.info_path, sealed({**self.read_info(), **fields}))
 
     def end(self, **fields: Any) -> None:
-        """Set fields of ``run.json``, the last file of a run, and note the digests of all others."""
+        """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
         self.update_info(**fields, **{FIELD: digests_of(self.path)})
 
     @property
