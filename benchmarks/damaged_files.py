@@ -1,4 +1,4 @@
-"""What becomes of a run whose files are damaged: one line that names the file, or the right figures.
+"""What becomes of a run whose files are damaged: one line that names the file, or right figures.
 
     python benchmarks/damaged_files.py                   # a tenth of the flips, a minute
     python benchmarks/damaged_files.py --flips 300       # all: some minutes
