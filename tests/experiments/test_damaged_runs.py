@@ -164,10 +164,9 @@ WRONG_ARRAYS = {
 }
 
 
-@pytest.mark.parametrize(
-    ("kind", "name", "array", "change"), WRONG_ARRAYS.values(), ids=WRONG_ARRAYS
-)
-def test_arrays_of_no_form_in_runs_without_digests(copied, kind, name, array, change):
+@pytest.mark.parametrize("what", WRONG_ARRAYS)
+def test_arrays_of_no_form_in_runs_without_digests(copied, what):
+    kind, name, array, change = WRONG_ARRAYS[what]
     study, planned, _ = copied(kind)
     forget_digests(planned[0])
     path = planned[0].path / name
@@ -175,7 +174,7 @@ def test_arrays_of_no_form_in_runs_without_digests(copied, kind, name, array, ch
     with np.load(path) as file:
         arrays = dict(file)
     np.savez(path, **arrays)
-    assert read_run(study, planned[0]).rows == expected.rows
+    assert repr(read_run(study, planned[0]).rows) == repr(expected.rows)  # there are NaN in it
     changed = {} if change is None else {array: change(arrays[array])}
     del arrays[array]
     np.savez(path, **arrays, **changed)
@@ -259,10 +258,10 @@ def test_a_sample_of_the_campaign(tmp_path):
     for study, planned in campaign["finished_runs"](tmp_path):
         for forget in (lambda run: None, forget_digests):
             forget(planned)
-            for ends in campaign["campaign"](study, planned, flips=60, stride=17).values():
+            for ends in campaign["campaign"](study, planned, flips=60, stride=29).values():
                 if forget is forget_digests:
                     ends.pop(campaign["WRONG"], None)
                     ends.pop(campaign["ANOTHER"], None)
                 total += ends
     assert set(total) == {campaign["REFUSED"], campaign["RIGHT"]}
-    assert min(total.values()) > 300
+    assert min(total.values()) > 200
