@@ -24,6 +24,7 @@ RECORD = "run.json"
 FIELD = "files"
 LARGEST_RECORD = 64 << 20  # bytes
 LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
+_PIECE = 1 << 20  # bytes
 _DEEPEST_RECORD = 100  # lists and objects inside each other
 
 
@@ -152,8 +153,11 @@ def _reading(read: Callable[[Path, int], Content], path: Path, limit: int) -> Co
 
 
 def _digest(path: Path, limit: int) -> str:
+    digest = hashlib.sha256()
     with opened(path, limit) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        while piece := file.read(_PIECE):
+            digest.update(piece)
+    return digest.hexdigest()
 
 
 def _seal(record: Mapping[str, Any]) -> str:

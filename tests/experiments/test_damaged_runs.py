@@ -258,10 +258,10 @@ def test_a_sample_of_the_campaign(tmp_path):
     for study, planned in campaign["finished_runs"](tmp_path):
         for forget in (lambda run: None, forget_digests):
             forget(planned)
-            for ends in campaign["campaign"](study, planned, flips=60, stride=29).values():
+            for ends in campaign["campaign"](study, planned, flips=30, stride=29).values():
                 if forget is forget_digests:
-                    ends.pop(campaign["WRONG"], None)
-                    ends.pop(campaign["ANOTHER"], None)
-                total += ends
+                    assert not any(end.startswith(campaign["BROKEN"]) for end in ends)
+                else:
+                    total += ends
     assert set(total) == {campaign["REFUSED"], campaign["RIGHT"]}
-    assert min(total.values()) > 200
+    assert min(total.values()) > 90
