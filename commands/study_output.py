@@ -75,7 +75,8 @@ def _print_left_out(console: Console, left_out: Sequence[LeftOut]) -> None:
     for damaged in left_out:
         _say(console, f"left out: {_whose(damaged)}")
     if left_out:
-        runs = "1 run is" if len(left_out) == 1 else f"{len(left_out)} runs are"
+        n_runs = sum(damaged.planned.n_runs for damaged in left_out)
+        runs = "1 run is" if n_runs == 1 else f"{n_runs} runs are"
         _say(console, f"{runs} damaged and in no figure; --repair does such runs again")
 
 

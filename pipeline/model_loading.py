@@ -222,10 +222,10 @@ def run_of(path: Path) -> Run | None:
     """The run folder that a model file lies in, or None if it lies elsewhere."""
     folder = path.resolve().parent
     try:
-        env_name = str(read_record(folder / RECORD)["env_name"])
-    except (OSError, UserError, KeyError):
+        env_name = read_record(folder / RECORD).get("env_name")
+    except (OSError, UserError):
         return None
-    return Run(folder, env_name)
+    return Run(folder, env_name) if isinstance(env_name, str) else None
 
 
 def hand_written_algorithm(path: Path) -> str | None:
