@@ -108,6 +108,7 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
     add("-f", "--log-folder", type=filled, default="logs/studies", help="folder above all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
+    add("--repair", action="store_true", help="do damaged runs again; their folders are kept")
     add("--no-report", action="store_true", help="tables alone: no figures and no page")
 
 
@@ -130,11 +131,15 @@ def main() -> int:
     planned = plan(study, root)
     console = table_console()
     console.print(study.title, style="bold", markup=False, highlight=False)
+    if args.repair:
+        from commands.study_output import repair
+
+        repair(console, study, planned)
     with doing(console, "looking for runs that are there") as activity:
         from experiments.child_processes import start_server
         from experiments.warm_ups import warm_ups
 
-        if not all(run.is_finished for run in planned):
+        if any(run.is_to_do for run in planned):
             start_server(warm_ups(planned))  # it imports the libraries while this process does
         activity.now("loading the libraries")
         from commands.study_output import run_study

@@ -10,8 +10,9 @@ from rich.console import Console
 
 from commands.study_progress import StudyProgress
 from experiments.execution import RunFailure, available_cores, execute
+from experiments.repair import move_damaged_aside
 from experiments.study_plan import PlannedRun
-from experiments.study_results import StudyResults, read_results
+from experiments.study_results import LeftOut, StudyResults, read_results
 from experiments.study_spec import StudySpec
 from pipeline.signs_of_life import Activity, doing
 
@@ -43,7 +44,7 @@ def run_study(
         with_page: draw the figures and write the page, beside the tables.
 
     Returns:
-        The exit code: 1 where a run failed, else 0.
+        The exit code: 1 where a run failed or is damaged, else 0.
     """
     failures = _do_missing(console, planned, root, command, n_workers or available_cores())
     with doing(console, "reading the results") as activity:
@@ -58,13 +59,41 @@ def run_study(
             highlight=False,
             soft_wrap=True,
         )
-    return 1 if failures else 0
+    _print_left_out(console, results.left_out)
+    return 1 if failures or results.left_out else 0
+
+
+def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) -> None:
+    """Move the folders of damaged runs aside, and say so."""
+    with doing(console, "looking for damaged runs") as activity:
+        moved = move_damaged_aside(study, planned, activity.at)
+    for damaged, place in moved:
+        _say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
+
+
+def _print_left_out(console: Console, left_out: Sequence[LeftOut]) -> None:
+    for damaged in left_out:
+        _say(console, f"left out: {_whose(damaged)}")
+    if left_out:
+        n_runs = sum(damaged.planned.n_runs for damaged in left_out)
+        runs = "1 run is" if n_runs == 1 else f"{n_runs} runs are"
+        _say(console, f"{runs} damaged and in no figure; --repair does such runs again")
+
+
+def _whose(damaged: LeftOut) -> str:
+    run = damaged.planned
+    seeds = f"seeds 0 to {run.n_runs - 1}" if run.n_runs > 1 else f"seed {run.seed}"
+    return f"{run.agent} on {run.environment}, {seeds}: {damaged.reason}"
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _do_missing(
     console: Console, planned: Sequence[PlannedRun], root: Path, command: str, n_workers: int
 ) -> list[RunFailure]:
-    missing = [run for run in planned if not run.is_finished]
+    missing = [run for run in planned if run.is_to_do]
     done = [run for run in planned if run.is_finished]
     console.print(
         f"{len(planned)} runs, {len(done)} of them there already; {n_workers} at once, in {root}",

@@ -90,7 +90,7 @@ class StudyProgress:
     def note_refusal(self, run: PlannedRun) -> None:
         """Say once for each environment why its own model is not used, where that is so."""
         refusal = run.run.read_info().get("model_refused")
-        if refusal is not None and run.environment not in self._refused:
+        if isinstance(refusal, str) and run.environment not in self._refused:
             self._refused.add(run.environment)
             self.console.print(
                 f"{run.environment}: {refusal}; figures are sampled",

@@ -34,9 +34,9 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     raw = with_logs_located(args.env, with_maps_read(args.env, _raw_hyperparams(args)))
     trained_agent = None
     if args.trained_agent:
-        from pipeline.model_finding import model_at
+        from pipeline.continuation import agent_to_continue
 
-        trained_agent = model_at(Path(args.trained_agent))
+        trained_agent = agent_to_continue(Path(args.trained_agent))
     # A flag that has the name of a field goes there as it is.
     named = {key.name: getattr(args, key.name) for key in fields(TrainSpec) if key.name in args}
     changed = {

@@ -18,7 +18,9 @@ from agents.compiled.compile_envs import NotCompilable
 from experiments.pull_statistics import PullStatistics, pull_statistics
 from mdp.array_types import Floats
 from mdp.machine_code import compile_timer
+from pipeline.array_files import read_arrays
 from pipeline.environments import make_single_env
+from pipeline.file_digests import DamagedFileError
 from pipeline.preparation import algorithm_kwargs
 from pipeline.pull_recording import PULLS_FILE
 from pipeline.run_folder import FINISHED, Run
@@ -26,6 +28,7 @@ from pipeline.run_record import recorded_versions, write_settings
 from pipeline.train_spec import TrainSpec
 
 STATISTICS_FILE = "pull_statistics.npz"
+_PULLS = ("arms", "rewards", "regrets")  # what figures are made of, beside contexts
 
 
 def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
@@ -40,7 +43,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
         env.close()
     statistics.save(run.path / STATISTICS_FILE)
     write_settings(run, spec, command)
-    run.update_info(
+    run.end(
         state=FINISHED,
         env_name=run.env_name,
         spec=spec.as_data(),
@@ -105,9 +108,47 @@ def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
     """The pulls of a run of its own in the order of time, each of shape (n_pulls,).
 
     Agents that collect whole rollouts go on beyond ``n_timesteps``; that is left out.
+
+    Raises:
+        DamagedFileError: if their file is missing or changed, or holds anything else.
     """
-    with np.load(folder / PULLS_FILE) as arrays:
-        return {name: array.T.ravel()[:n_timesteps] for name, array in arrays.items()}
+    return {name: array.T.ravel()[:n_timesteps] for name, array in _pulls(folder).items()}
+
+
+def _pulls(folder: Path) -> dict[str, NDArray[Any]]:
+    path = folder / PULLS_FILE
+    arrays = read_arrays(path, Run(folder, "").files.read(path))
+    lacking = [name for name in _PULLS if name not in arrays]
+    if lacking:
+        raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
+    shape = arrays["arms"].shape
+    if len(shape) != 2 or not arrays["arms"].size:
+        raise DamagedFileError(path, "is damaged: it has not one row for each environment")
+    if any(array.shape != shape for array in arrays.values()):
+        raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+    for name in ("arms", "contexts"):
+        numbers = arrays.get(name)
+        if numbers is not None and (numbers.dtype.kind not in "iu" or (numbers < 0).any()):
+            raise DamagedFileError(path, f"is damaged: {name} are no numbers from 0 on")
+    return arrays
+
+
+def check_pulls(spec: TrainSpec, folder: Path) -> None:
+    """Make sure that what a run pulled is there in the environment of its spec.
+
+    Raises:
+        DamagedFileError: if it is not.
+    """
+    pulls = read_run(folder, spec.hyperparams.n_timesteps)
+    env = make_single_env(spec)
+    try:
+        bandit: Any = env.unwrapped
+        sizes = {"arms": bandit.n_arms, "contexts": bandit.n_contexts}
+    finally:
+        env.close()
+    for name, size in sizes.items():
+        if size > 0 and name in pulls and pulls[name].max() >= size:
+            raise DamagedFileError(folder / PULLS_FILE, f"is damaged: {name} are of another bandit")
 
 
 def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:

@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.array_types import AnyInts, Floats, Ints
+from pipeline.array_files import read_arrays
+from pipeline.file_digests import DamagedFileError
 from pipeline.files import replacing
+from pipeline.run_folder import Run
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 FIRST_PULLS = 100  # kept one by one; of later ones fewer and fewer, `MAX_POINTS` in all
@@ -73,9 +76,49 @@ class PullStatistics:
 
     @classmethod
     def load(cls, path: Path) -> PullStatistics:
-        """Read what `save` wrote."""
-        with np.load(path) as arrays:
-            return cls(**{field.name: arrays[field.name] for field in fields(cls)})
+        """Read what `save` wrote.
+
+        Raises:
+            DamagedFileError: if the file is missing or changed, or holds anything else.
+        """
+        arrays = read_arrays(path, Run(path.parent, "").files.read(path))
+        names = [field.name for field in fields(cls)]
+        lacking = [name for name in names if name not in arrays]
+        if lacking:
+            raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
+        statistics = cls(**{name: arrays[name] for name in names})
+        if not statistics._is_of_one_shape():
+            raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+        return statistics
+
+    def _is_of_one_shape(self) -> bool:
+        """Whether the arrays have the shapes that the class says."""
+        n_points, n_runs = self.pulls.size, self.total_reward.size
+        shapes = {
+            (n_points,): (
+                self.pulls,
+                self.reward,
+                self.optimal,
+                self.regret,
+                self.cumulative_regret,
+                self.cumulative_regret_sem,
+                self.simple_regret,
+            ),
+            (len(QUANTILES), n_points): (self.cumulative_regret_quantiles,),
+            (n_runs,): (self.total_reward, self.total_regret),
+            self.shares.shape: (self.shares, self.context_regret),
+        }
+        fits = all(array.shape == shape for shape, arrays in shapes.items() for array in arrays)
+        return (
+            fits
+            and self.shares.ndim == 2
+            and n_points > 0
+            # An agent that sees no contexts has one row of estimates for all of them.
+            and self.estimates.shape == self.estimates_std.shape
+            and self.estimates.ndim == self.true_means.ndim == 2
+            and self.posteriors.ndim == 4
+            and (not self.posteriors.size or self.posteriors.shape[0] == self.moments.size)
+        )
 
 
 def points_of(n_pulls: int) -> Ints:

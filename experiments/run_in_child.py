@@ -12,7 +12,9 @@ from pathlib import Path
 from rich.console import Console
 
 from experiments.bandit_batches import do_batch
+from experiments.repair import move_aside
 from experiments.study_plan import PlannedRun
+from pipeline.file_digests import DamagedFileError
 from pipeline.files import portable_name, put_in_place
 from pipeline.run_folder import Run
 from pipeline.training import train
@@ -102,6 +104,18 @@ else:
         return True
 
 
+def _make_room(planned: PlannedRun) -> None:
+    """Remove a run of other settings, or one that was cut off; what is damaged is kept."""
+    if not planned.path.exists() or planned.is_finished:
+        return
+    try:
+        planned.check_record()
+    except DamagedFileError:
+        move_aside(planned.path)
+    else:
+        shutil.rmtree(planned.path)
+
+
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     """Train in ``draft``, and rename it into place; another's result that is there stays."""
     import_again(planned.spec.user_modules)
@@ -115,8 +129,7 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     else:
         args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
         train(planned.spec, Console(quiet=True), args, command, run)
-    if planned.path.exists() and not planned.is_finished:
-        shutil.rmtree(planned.path)  # of other settings, or cut off
+    _make_room(planned)
     planned.path.parent.mkdir(parents=True, exist_ok=True)
     try:
         put_in_place(draft, planned.path)

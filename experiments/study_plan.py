@@ -16,6 +16,7 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_n
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
+from pipeline.file_digests import DamagedFileError
 from pipeline.map_contents import with_maps_read
 from pipeline.memory_limits import check_pulls
 from pipeline.model_loading import agent_class
@@ -73,15 +74,44 @@ class PlannedRun:
 
     @property
     def is_finished(self) -> bool:
-        """Whether the folder holds this very run, to its end."""
-        info = self.run.read_info()
+        """Whether the folder holds this very run, to its end; what else it holds is not read."""
+        try:
+            info = self.run.read_info()
+        except DamagedFileError:
+            return False
         if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
             return False
-        recorded = completed(self.run.recorded_spec())
+        spec = info.get("spec")
+        recorded = completed(spec if isinstance(spec, dict) else {})
         wanted = self.spec.save_every_n_episodes
         return _identity(recorded) == _identity(self.spec.as_data()) and (
             wanted < 1 or self.is_batch or recorded["save_every_n_episodes"] == wanted
         )
+
+    @property
+    def is_to_do(self) -> bool:
+        """Whether there is no such run; one that is damaged is there."""
+        if self.is_finished:
+            return False
+        try:
+            self.check_record()
+        except DamagedFileError:
+            return False
+        return True
+
+    def check_record(self) -> None:
+        """Make sure that the folder, where there is one, says which run it holds.
+
+        Raises:
+            DamagedFileError: if its ``run.json`` is missing or damaged.
+        """
+        path = self.run.info_path
+        if not (self.path.is_dir() and any(self.path.iterdir())):
+            return
+        if not path.exists():
+            raise DamagedFileError(path, "is missing")
+        if not self.run.recorded_spec():
+            raise DamagedFileError(path, "is damaged: it does not say what was asked for")
 
 
 def _identity(spec: Mapping[str, Any]) -> Any:

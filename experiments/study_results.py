@@ -12,15 +12,48 @@ import pandas as pd
 
 from experiments.bandit_results import batch_rows, read_pulls, run_regret
 from experiments.pull_statistics import PullStatistics
+from experiments.run_figures import (
+    Episodes,
+    read_episodes,
+    read_evaluations,
+    read_outcome,
+    read_value_maps,
+)
 from experiments.study_plan import PlannedRun
 from experiments.study_spec import StudySpec
 from mdp.array_types import Floats
-from pipeline.run_folder import Run
+from pipeline.file_digests import DamagedFileError
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import area_under_curve, steps_to_threshold
 
 LAST_EPISODES = 100
 TRAINING_POINTS = 100
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """A run that is there, and counts for nothing, since a file of it is damaged.
+
+    Attributes:
+        planned: the run.
+        reason: which file, and what of it, in one line.
+    """
+
+    planned: PlannedRun
+    reason: str
+
+
+@dataclass(frozen=True)
+class RunResults:
+    """What one finished run, or one batch of them, has to say.
+
+    Attributes:
+        rows: of the summary, see `RUN_COLUMNS`.
+        curves: see `CURVE_COLUMNS`.
+    """
+
+    rows: list[dict[str, Any]]
+    curves: list[pd.DataFrame] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -34,6 +67,7 @@ class StudyResults:
         curves: learning curves of all runs, see `CURVE_COLUMNS`.
         planned: all runs of the study, also those that failed.
         pulls: on bandits, figures by pull, by labels of agent and environment.
+        left_out: the runs that are damaged.
     """
 
     study: StudySpec
@@ -42,6 +76,13 @@ class StudyResults:
     curves: pd.DataFrame
     planned: tuple[PlannedRun, ...]
     pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
+    left_out: tuple[LeftOut, ...] = ()
+
+    @property
+    def finished(self) -> list[PlannedRun]:
+        """The runs that the results are of."""
+        damaged = {one.planned.path for one in self.left_out}
+        return [run for run in self.planned if run.path not in damaged and run.is_finished]
 
 
 # Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.
@@ -94,57 +135,61 @@ CURVE_COLUMNS = (
 _FIGURES = ("success_rate", "exact", "optimum", "best_blind", "gap", "score")
 
 
-@dataclass(frozen=True)
-class Episodes:
-    """The training episodes of a run in the order in which they ended.
-
-    Attributes:
-        steps: environment steps done by then, over all environments, shape (n,).
-        returns: undiscounted returns, shape (n,).
-        seconds: time since the beginning, shape (n,).
-    """
-
-    steps: Floats
-    returns: Floats
-    seconds: Floats
-
-
-def read_episodes(run: Run) -> Episodes:
-    """The training episodes that Monitor wrote down."""
-    tables = []
-    paths = sorted(run.path.glob("*.monitor.csv"))
-    for path in paths:
-        table = pd.read_csv(path, skiprows=1, usecols=["r", "l", "t"], engine="c")
-        # The environments are stepped together: all have done what one of them has.
-        table["step"] = len(paths) * table["l"].cumsum()
-        tables.append(table)
-    rows = pd.concat(tables).sort_values("step", kind="stable")
-    return Episodes(*(rows[name].to_numpy(dtype=np.float64) for name in ("step", "r", "t")))
-
-
 def read_results(
     study: StudySpec, planned: Sequence[PlannedRun], root: Path, tell: Tell = tell_nobody
 ) -> StudyResults:
-    """Read all runs that have finished."""
-    rows, curves = [], []
-    pulls = read_pulls([run for run in planned if run.is_finished])
+    """Read all runs that have finished; those whose files are damaged are left out."""
+    rows, curves, done, left_out = [], [], [], []
     for place, run in enumerate(planned, start=1):
         tell(f"run {place:,} of {len(planned):,}")
-        if run.is_finished and run.is_batch:
-            rows += batch_rows(run, pulls[run.agent, run.environment])
-        elif run.is_finished:
-            episodes = read_episodes(run.run)
-            evaluations = _evaluation_curve(run, episodes)
-            rows.append(_summary_row(study, run, episodes, evaluations))
-            curves += [evaluations, _training_curve(run, episodes)]
+        try:
+            found = read_run(study, run)
+        except DamagedFileError as error:
+            left_out.append(LeftOut(run, str(error)))
+            continue
+        if found is not None:
+            rows += found.rows
+            curves += found.curves
+            done.append(run)
     return StudyResults(
         study,
         root,
         pd.DataFrame(rows, columns=list(RUN_COLUMNS)),
         pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=CURVE_COLUMNS),
         tuple(planned),
-        pulls,
+        read_pulls(done),
+        tuple(left_out),
     )
+
+
+def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
+    """What a run has to say, or None where it is not there or has not finished.
+
+    Raises:
+        DamagedFileError: if a file that a comparison reads is missing, changed or no such file.
+    """
+    planned.check_record()
+    if not planned.is_finished:
+        return None
+    if planned.is_batch:
+        return RunResults(batch_rows(planned))
+    _check_for_page(planned)
+    episodes = read_episodes(planned.run)
+    evaluations = _evaluation_curve(planned, episodes)
+    row = _summary_row(study, planned, episodes, evaluations)
+    return RunResults([row], [evaluations, _training_curve(planned, episodes)])
+
+
+def _check_for_page(planned: PlannedRun) -> None:
+    """Make sure of the files that the page opens later: maps, and the agent that is filmed."""
+    run = planned.run
+    files = run.files
+    for path in files.matching(run.value_maps_path.name):
+        if files.digests is None:
+            read_value_maps(run)
+        files.check(path)
+    if planned.seed == 0:
+        files.check(run.model_path)
 
 
 def _curve(planned: PlannedRun, kind: str, columns: dict[str, Floats]) -> pd.DataFrame:
@@ -155,12 +200,7 @@ def _curve(planned: PlannedRun, kind: str, columns: dict[str, Floats]) -> pd.Dat
 
 
 def _evaluation_curve(planned: PlannedRun, episodes: Episodes) -> pd.DataFrame:
-    path = planned.run.evaluations_path
-    steps, returns = np.empty(0), np.empty(0)
-    if path.exists():
-        with np.load(path) as evaluations:
-            steps = evaluations["timesteps"].astype(np.float64)
-            returns = evaluations["results"].mean(axis=1)
+    steps, returns = read_evaluations(planned.run)
     seconds = np.interp(
         steps, np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
     )
@@ -209,8 +249,10 @@ def _mean(values: Floats) -> float:
 def _summary_row(
     study: StudySpec, planned: PlannedRun, episodes: Episodes, evaluations: pd.DataFrame
 ) -> dict[str, Any]:
-    info = planned.run.read_info()
-    final = info["final"] or {}
+    info = read_outcome(
+        planned.run, ("final", "best_mean_return", "best_timesteps", "n_timesteps", "seconds")
+    )
+    final = info["final"]
     threshold = threshold_of(study, planned.spec.env_id, final)
     steps = evaluations["step"].to_numpy()
     values = evaluations["value"].to_numpy()

@@ -33,7 +33,7 @@ def warm_ups(planned: Sequence[PlannedRun]) -> str:
     for run in planned:
         spec, key = run.spec, (run.spec.algo, run.environment)
         # A batch is one process, and a batch alone.
-        if not spec.user_modules or run.is_batch or key in chosen or run.is_finished:
+        if not spec.user_modules or run.is_batch or key in chosen or not run.is_to_do:
             continue
         if _is_compiled_rule_of_users(spec.algo):
             chosen[key] = {

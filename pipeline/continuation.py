@@ -12,14 +12,29 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.companions import replay_buffer_of, statistics_of
+from pipeline.model_finding import model_at
 from pipeline.model_loading import agent_class, load_model, load_replay_buffer
 from pipeline.normalization import Statistics, normalising, read_statistics
-from pipeline.recorded_runs import run_around
+from pipeline.recorded_runs import check_digest, run_around
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
+
+
+def agent_to_continue(path: Path) -> Path:
+    """The zip that a path means, with or without its suffix, or of a run folder.
+
+    Raises:
+        UserError: if there is none, or it or what goes with it is not as its run left it.
+    """
+    model = model_at(path)
+    run = run_around(model)
+    for file in (model, _statistics_path(model), replay_buffer_of(model)):
+        if file is not None:
+            check_digest(run, file)
+    return model
 
 
 def statistics_to_continue(spec: TrainSpec) -> Statistics | None:

@@ -123,8 +123,8 @@ def _usual_kwargs(env_id: str) -> dict[str, Any]:
 def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> Wrap | None:
     """The wrappers that the hyperparameters name, as one function, or None for none.
 
-    Where the agent goes by action masks, the outermost tells them. What wrappers write goes into the
-    folder, or where there is none, into a temporary one.
+    Where the agent goes by action masks, the outermost tells them. What wrappers write goes into
+    the folder, or where there is none, into a temporary one.
     """
     from pipeline.settings.components import wrapper_factory
 

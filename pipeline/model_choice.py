@@ -26,7 +26,7 @@ from pipeline.model_finding import Which, model_at, model_of
 from pipeline.model_loading import hand_written_algorithm, telling_masks
 from pipeline.module_records import check_recorded
 from pipeline.normalization import normalising, read_statistics
-from pipeline.recorded_runs import RecordedRun, recorded_run, run_around
+from pipeline.recorded_runs import RecordedRun, check_digest, recorded_run, run_around
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import split
@@ -108,6 +108,7 @@ def find_model(request: ModelRequest) -> ChosenModel:
         chosen = _newest(request)
     else:
         chosen = _model_at(model_at(request.path, request.which), request)
+    check_digest(chosen.run, chosen.path)
     return replace(chosen, spec=telling_masks(chosen.spec, chosen.path))
 
 
@@ -198,5 +199,6 @@ def with_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
                 "are not there: name their file with --vec-normalize"
             )
         return chosen
+    check_digest(chosen.run, path)
     spec = normalising(chosen.spec, read_statistics(path).settings)
     return ChosenModel(chosen.path, spec, chosen.run, path)

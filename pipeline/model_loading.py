@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from agents import ALGORITHMS, load_algorithm
 from pipeline.admitted_classes import own_classes, own_makers
 from pipeline.errors import UserError, one_line
+from pipeline.file_digests import RECORD, read_record
 from pipeline.run_folder import Run
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.train_spec import TrainSpec
@@ -264,11 +265,10 @@ def run_of(path: Path) -> Run | None:
     """The run folder that a model file lies in, or None if it lies elsewhere."""
     folder = path.resolve().parent
     try:
-        info = json.loads((folder / "run.json").read_text(encoding="utf-8"))
-        env_name = str(info["env_name"])
-    except (OSError, ValueError, KeyError, TypeError):
+        env_name = read_record(folder / RECORD).get("env_name")
+    except (OSError, UserError):
         return None
-    return Run(folder, env_name)
+    return Run(folder, env_name) if isinstance(env_name, str) else None
 
 
 def hand_written_algorithm(path: Path) -> str | None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.file_digests import DamagedFileError
 from pipeline.model_loading import run_of
 from pipeline.run_folder import Run
 from pipeline.settings.strict_yaml import read_saved_settings
@@ -100,6 +101,20 @@ def recorded_run(run: Run | None) -> RecordedRun:
     return RecordedRun(
         _text(args.get("algo")), _text(args.get("env")), config, _texts(args.get("gym_packages"))
     )
+
+
+def check_digest(run: Run | None, path: Path) -> None:
+    """Make sure that a file of a run is as the run left it, where the run recorded that.
+
+    Raises:
+        UserError: if it is not.
+    """
+    if run is None:
+        return
+    try:
+        run.files.check(path)
+    except DamagedFileError as error:
+        raise UserError(f"{error}: train again, or name another copy of it") from error
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -6,7 +6,6 @@ The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, so that its to
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
+from pipeline.file_digests import FIELD, RECORD, RecordedFiles, digests_of, read_record, sealed
 from pipeline.files import portable_name, write_json
 
 RUNNING = "running"
@@ -149,7 +149,7 @@ class Run:
     @property
     def info_path(self) -> Path:
         """What the run was asked for and what came out."""
-        return self.path / "run.json"
+        return self.path / RECORD
 
     @property
     def curve_path(self) -> Path:
@@ -178,14 +178,9 @@ class Run:
             UserError: if the file is damaged.
         """
         try:
-            info = json.loads(self.info_path.read_text(encoding="utf-8"))
+            return read_record(self.info_path)
         except FileNotFoundError:
             return {}
-        except ValueError as error:
-            raise UserError(f"{self.info_path} is damaged: {error}") from error
-        if not isinstance(info, dict):
-            raise UserError(f"{self.info_path} is damaged: it must map names to values")
-        return info
 
     def recorded_spec(self) -> dict[str, Any]:
         """What ``run.json`` says was asked for; empty where it says nothing.
@@ -198,7 +193,20 @@ class Run:
 
     def update_info(self, **fields: Any) -> None:
         """Set fields of ``run.json``."""
-        write_json(self.info_path, {**self.read_info(), **fields})
+        write_json(self.info_path, sealed({**self.read_info(), **fields}))
+
+    def end(self, **fields: Any) -> None:
+        """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
+        self.update_info(**fields, **{FIELD: digests_of(self.path)})
+
+    @property
+    def files(self) -> RecordedFiles:
+        """The files that the run left, each held against what it was then.
+
+        Raises:
+            UserError: if ``run.json`` is damaged.
+        """
+        return RecordedFiles(self.path, self.read_info().get(FIELD))
 
     def discard(self) -> None:
         """Remove the folder of a run that left nothing, and those above it that are empty then."""

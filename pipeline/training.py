@@ -222,7 +222,7 @@ def _finish(training: Training, state: str, seconds: float, activity: Activity) 
 def _record(outcome: Outcome) -> None:
     """Write what came out into ``run.json``, the last file of a run."""
     pulls = outcome.pulls
-    outcome.run.update_info(
+    outcome.run.end(
         state=outcome.state,
         n_timesteps=outcome.n_steps,
         seconds=round(outcome.seconds, 3),

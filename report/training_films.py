@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.run_figures import read_episodes
 from experiments.study_plan import PlannedRun
-from experiments.study_results import StudyResults, read_episodes
+from experiments.study_results import StudyResults
 from experiments.study_spec import file_name
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError, one_line
@@ -33,9 +34,9 @@ def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[P
     """
     paths: list[Path] = []
     refused: list[str] = []
-    for planned in results.planned:
+    for planned in results.finished:
         is_asked_for = planned.spec.save_every_n_episodes > 0 and not planned.is_batch
-        if is_asked_for and planned.is_finished:
+        if is_asked_for:
             tell(f"{planned.agent} on {planned.environment}")
             try:
                 paths += _films_of(planned, results.root / "films")
@@ -49,6 +50,7 @@ def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     for checkpoint, episode in _checkpoints(planned):
         path = folder / f"{name}_{episode}.gif"
         if not (path.exists() and path.stat().st_mtime >= checkpoint.stat().st_mtime):
+            planned.run.files.check(checkpoint)
             chosen = ChosenModel(checkpoint, planned.spec, planned.run)
             frames = episode_in_training(chosen, evaluation_seed(planned.seed, 4), MAX_STEPS)
             folder.mkdir(exist_ok=True)

@@ -25,6 +25,7 @@ from pipeline.model_loading import (
     run_of,
 )
 from pipeline.module_records import check_recorded
+from pipeline.recorded_runs import check_digest
 from pipeline.user_modules import UserModule
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
@@ -111,6 +112,7 @@ def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
     spec = {} if run is None else run.recorded_spec()
     if run is not None:
         check_recorded(spec, run.path)
+        check_digest(run, zip_path)
     algo = hand_written_algorithm(zip_path) or spec.get("algo")
     if algo is None:
         raise UserError(f"{path} lies in no run folder: what agent it holds is not known")

@@ -76,9 +76,9 @@ def _runs_to_film(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
     A batch leaves no agent.
     """
     first: dict[tuple[str, str], PlannedRun] = {}
-    for run in analysis.results.planned:
+    for run in analysis.results.finished:
         is_new = (run.agent, run.environment) not in first
-        if is_new and run.is_finished and not run.is_batch:
+        if is_new and not run.is_batch:
             first[run.agent, run.environment] = run
     return [
         [
@@ -121,6 +121,7 @@ def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     spec = planned.spec
     th.set_num_threads(spec.num_threads)
+    planned.run.files.check(planned.run.model_path)
     env = playing_env(ChosenModel(planned.run.model_path, spec, planned.run), "rgb_array")
     try:
         model = load_model(spec.algo, planned.run.model_path, env, spec.user_modules)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from envs.known_models import transition_model
 from envs.layout import GridLayout, grid_layout
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from experiments.run_figures import read_value_maps
 from experiments.study_plan import PlannedRun
 from pipeline.environments import make_single_env
 from report.page.sections import Report, Section
@@ -70,10 +71,8 @@ def _recorded_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) ->
     order = [agent.agent for agent in environment.agents]
     runs = [
         run
-        for run in analysis.results.planned
-        if run.environment == environment.environment
-        and run.run.value_maps_path.exists()
-        and run.is_finished
+        for run in analysis.results.finished
+        if run.environment == environment.environment and run.run.value_maps_path.exists()
     ]
     return sorted(runs, key=lambda run: (run.seed, order.index(run.agent)))
 
@@ -84,7 +83,7 @@ def _read_maps(runs: Sequence[PlannedRun], layout: GridLayout) -> dict[tuple[str
     figures = 0
     for run in runs:
         arrays = _read(run)
-        if arrays["values"].shape[1] != layout.n_states:
+        if arrays["optimal_actions"].shape != (layout.n_states, len(layout.moves)):
             continue  # an agent that was given another map
         figures += 2 * arrays["values"].size
         if figures > MAX_FIGURES and run.seed != runs[0].seed:
@@ -95,8 +94,7 @@ def _read_maps(runs: Sequence[PlannedRun], layout: GridLayout) -> dict[tuple[str
 
 
 def _read(run: PlannedRun) -> Arrays:
-    with np.load(run.run.value_maps_path) as file:
-        arrays = dict(file)
+    arrays = read_value_maps(run.run)
     n = len(arrays["timesteps"])
     if n > MAX_MAPS:
         kept = np.linspace(0, n - 1, MAX_MAPS).round().astype(np.int64)

@@ -49,9 +49,9 @@ class SettingsTable:
 def section(report: Report) -> Section | None:
     """Settings by environment, and what holds for the whole study."""
     results = report.analysis.results
-    infos = {i: run.run.read_info() for i, run in enumerate(results.planned) if run.is_finished}
-    done = [(results.planned[i], info) for i, info in infos.items()]
-    missing = [run for i, run in enumerate(results.planned) if i not in infos]
+    done = [(run, run.run.read_info()) for run in results.finished]
+    there = {run.path for run, _ in done}
+    missing = [run for run in results.planned if run.path not in there]
     context = {
         "command": report.command,
         "absent": ABSENT,
@@ -99,10 +99,11 @@ def _versions(infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
 
 def _missing_runs(results: StudyResults, missing: Iterable[PlannedRun]) -> list[MissingRuns]:
     groups: dict[tuple[str, str, str], MissingRuns] = {}
+    damaged = {one.planned.path: one.reason for one in results.left_out}
     for run in missing:
         log = failure_log(results.root, run)
         details = log.read_text(encoding="utf-8").strip() if log.exists() else ""
-        reason = details.splitlines()[-1] if details else "not done yet"
+        reason = damaged.get(run.path) or (details.splitlines()[-1] if details else "not done yet")
         key = (run.agent, run.environment, reason)
         seeds = groups[key].seeds if key in groups else []
         groups[key] = MissingRuns(*key[:2], [*seeds, run.seed], reason, details)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pandas as pd
 
-from experiments.study_results import StudyResults, read_episodes
+from experiments.run_figures import read_episodes
+from experiments.study_results import StudyResults
 
 
 def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
@@ -18,20 +19,19 @@ def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
         Columns agent, environment, episode (the last of the block), average, minimum, maximum.
     """
     rows = []
-    for planned in results.planned:
-        if planned.is_finished:
-            returns = read_episodes(planned.run).returns
-            block = pd.Series(range(len(returns))) // width
-            rows.append(
-                pd.DataFrame(
-                    {
-                        "agent": planned.agent,
-                        "environment": planned.environment,
-                        "episode": (block + 1) * width,
-                        "return": returns,
-                    }
-                )
+    for planned in results.finished:
+        returns = read_episodes(planned.run).returns
+        block = pd.Series(range(len(returns))) // width
+        rows.append(
+            pd.DataFrame(
+                {
+                    "agent": planned.agent,
+                    "environment": planned.environment,
+                    "episode": (block + 1) * width,
+                    "return": returns,
+                }
             )
+        )
     if not rows:
         return pd.DataFrame(columns=["agent", "environment", "episode"])
     grouped = pd.concat(rows).groupby(["environment", "agent", "episode"], sort=False)["return"]

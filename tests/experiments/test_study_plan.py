@@ -9,6 +9,7 @@ import pytest
 from experiments.study_plan import check_settings, plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
+from pipeline.file_digests import DamagedFileError
 from pipeline.run_folder import FAILED, FINISHED
 from pipeline.train_spec import TrainSpec
 
@@ -334,5 +335,7 @@ def test_a_damaged_record_is_named(tmp_path):
     planned = only(study_of("qlearning"), tmp_path)
     record(planned)
     planned.run.info_path.write_text("{")
-    with pytest.raises(UserError, match=r"run\.json is damaged"):
-        _ = planned.is_finished
+    assert not planned.is_finished
+    assert not planned.is_to_do
+    with pytest.raises(DamagedFileError, match=r"run\.json is damaged"):
+        planned.check_record()

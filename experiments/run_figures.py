@@ -1,0 +1,181 @@
+"""The figures that one finished run left, each file held against its digest and its form.
+
+Runs of earlier versions recorded no digests: of these a file counts that has the form.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from mdp.array_types import Floats
+from pipeline.array_files import read_arrays
+from pipeline.errors import one_line
+from pipeline.file_digests import DamagedFileError
+from pipeline.run_folder import Run
+
+LARGEST_FIGURE = 1e300
+_FINAL_FIGURES = (
+    "mean_return",
+    "std_return",
+    "mean_length",
+    "success_rate",
+    "exact",
+    "gap",
+    "score",
+)
+_MAPS = ("timesteps", "values", "actions", "optimal_values", "optimal_actions")
+_COLUMNS = ["r", "l", "t"]  # return, length, seconds since the beginning
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """The training episodes of a run in the order in which they ended.
+
+    Attributes:
+        steps: environment steps done by then, over all environments, shape (n,).
+        returns: undiscounted returns, shape (n,).
+        seconds: time since the beginning, shape (n,).
+    """
+
+    steps: Floats
+    returns: Floats
+    seconds: Floats
+
+
+def read_episodes(run: Run) -> Episodes:
+    """The training episodes that Monitor wrote down.
+
+    Raises:
+        DamagedFileError: if a file of them is missing or changed, or holds anything else.
+    """
+    tables = []
+    files = run.files
+    paths = files.matching("*.monitor.csv")
+    if not paths:
+        raise DamagedFileError(run.path / "0.monitor.csv", "is missing")
+    for path in paths:
+        table = _monitor_table(path, files.read(path))
+        # The environments are stepped together: all have done what one of them has.
+        table["step"] = len(paths) * table["l"].cumsum()
+        tables.append(table)
+    rows = pd.concat(tables).sort_values("step", kind="stable")
+    return Episodes(*(rows[name].to_numpy(dtype=np.float64) for name in ("step", "r", "t")))
+
+
+def _monitor_table(path: Path, content: bytes) -> pd.DataFrame:
+    try:
+        if not content.startswith(b"#"):
+            raise ValueError("it does not begin with Monitor's line of settings")
+        table = pd.read_csv(
+            io.BytesIO(content), skiprows=1, usecols=_COLUMNS, dtype=np.float64, engine="c"
+        )
+    except (ValueError, OverflowError) as error:
+        raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error
+    if not np.isfinite(table.to_numpy()).all() or (table["l"] < 1).any():
+        raise DamagedFileError(path, "is damaged: an episode has no return, length or time")
+    return table
+
+
+def read_evaluations(run: Run) -> tuple[Floats, Floats]:
+    """Steps and mean returns of the evaluations during training, each of shape (n_evaluations,).
+
+    Raises:
+        DamagedFileError: if their file is missing or changed, or holds anything else.
+    """
+    files = run.files
+    for path in files.matching(run.evaluations_path.name):
+        arrays = read_arrays(path, files.read(path))
+        steps, returns = arrays.get("timesteps"), arrays.get("results")
+        if steps is None or returns is None:
+            raise DamagedFileError(path, "is damaged: it lacks timesteps or results")
+        if steps.ndim != 1 or returns.ndim != 2 or len(steps) != len(returns) or not returns.size:
+            raise DamagedFileError(path, "is damaged: it has not one row for each evaluation")
+        if not (np.isfinite(returns).all() and np.isfinite(steps).all()):
+            raise DamagedFileError(path, "is damaged: it holds what is no finite number")
+        if (steps < 0).any() or (np.diff(steps.astype(np.float64)) < 0).any():
+            raise DamagedFileError(path, "is damaged: its steps do not rise")
+        return steps.astype(np.float64), returns.mean(axis=1, dtype=np.float64)
+    return np.empty(0), np.empty(0)
+
+
+def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
+    """What ``run.json`` says came out, in which ``final`` maps names to figures.
+
+    Args:
+        run: the run.
+        required: the names of figures that have to be there.
+
+    Raises:
+        DamagedFileError: if it is damaged, or says anything else.
+    """
+    info = run.read_info()
+    final = info.get("final")
+    if not (final is None or isinstance(final, dict)):
+        raise DamagedFileError(run.info_path, "is damaged: final holds no figures")
+    final = final or {}
+    missing = [name for name in required if name not in info]
+    if missing:
+        raise DamagedFileError(run.info_path, f"is damaged: it lacks {missing[0]}")
+    given = {name: info[name] for name in required if name != "final"}
+    figures = {name: final[name] for name in _FINAL_FIGURES if name in final}
+    for name, value in (given | figures).items():
+        if not (value is None or _is_figure(value)):
+            raise DamagedFileError(run.info_path, f"is damaged: {name} is no figure")
+    yardstick = [final[name] for name in ("optimum", "best_blind") if name in final]
+    if len(yardstick) == 1 or not all(_is_figure(value) for value in yardstick):
+        raise DamagedFileError(run.info_path, "is damaged: it lacks the optimum's figures")
+    _check_texts(run, info)
+    return {**info, "final": final}
+
+
+def _check_texts(run: Run, info: Mapping[str, Any]) -> None:
+    versions = info.get("versions", {})
+    texts = [info.get("engine") or "", info.get("model_refused") or ""]
+    if isinstance(versions, dict):
+        texts += versions.values()
+    if not isinstance(versions, dict) or not all(isinstance(text, str) for text in texts):
+        raise DamagedFileError(run.info_path, "is damaged: engine or versions are no text")
+
+
+def _is_figure(value: object) -> bool:
+    if isinstance(value, float) and math.isnan(value):
+        return True
+    return isinstance(value, int | float) and abs(value) < LARGEST_FIGURE
+
+
+def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
+    """The maps that a run kept, as `pipeline.evaluation.value_maps` writes them.
+
+    Raises:
+        DamagedFileError: if their file is missing or changed, or holds anything else.
+    """
+    path = run.value_maps_path
+    arrays = read_arrays(path, run.files.read(path))
+    lacking = [name for name in _MAPS if name not in arrays]
+    if lacking:
+        raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
+    steps, values, actions, best_values, best_actions = (arrays[name] for name in _MAPS)
+    if values.ndim != 2 or best_actions.ndim != 2 or not values.size:
+        raise DamagedFileError(path, "is damaged: it has not one row for each evaluation")
+    n_states, n_actions = best_actions.shape
+    shapes = (values.shape, actions.shape, best_values.shape)
+    if shapes != ((len(values), n_states), (len(values), n_states), (n_states,)) or (
+        steps.shape != (len(values),)
+    ):
+        raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+    if actions.dtype.kind not in "iu" or best_actions.dtype.kind not in "biu":
+        raise DamagedFileError(path, "is damaged: its actions are no whole numbers")
+    if (actions < 0).any() or (actions >= n_actions).any():
+        raise DamagedFileError(path, "is damaged: it has actions that there are not")
+    if not all(np.isfinite(array).all() for array in (steps, values, best_values)):
+        raise DamagedFileError(path, "is damaged: it holds what is no finite number")
+    return arrays

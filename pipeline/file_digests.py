@@ -1,0 +1,185 @@
+"""What the files of a run were when it ended: their SHA-256, which ``run.json`` keeps in ``files``.
+
+The entry of ``run.json`` itself is the digest of all else in it, as JSON without spaces and with
+sorted keys. A file that is not listed is the user's own, and nothing is said of it. Runs of earlier
+versions have no such field: their files are taken as they are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pipeline.errors import UserError, one_line
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import opened, read_file
+
+RECORD = "run.json"
+FIELD = "files"
+LARGEST_RECORD = 64 << 20  # bytes
+LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
+_PIECE = 1 << 20  # bytes
+_DEEPEST_RECORD = 100  # lists and objects inside each other
+
+
+Content = TypeVar("Content")
+
+
+class DamagedFileError(UserError):
+    """A file of a run is missing, or is not what the run left.
+
+    Attributes:
+        path: the file.
+    """
+
+    def __init__(self, path: Path, reason: str) -> None:
+        super().__init__(f"{path} {reason}")
+        self.path = path
+
+
+@dataclass(frozen=True)
+class RecordedFiles:
+    """The files of a run, each held against what it was when the run ended.
+
+    Attributes:
+        folder: the run folder.
+        digests: by name relative to the folder; None where the run recorded none.
+    """
+
+    folder: Path
+    digests: Mapping[str, str] | None
+
+    def matching(self, pattern: str) -> list[Path]:
+        """The files in the folder itself that the run left, by name; see `fnmatch`.
+
+        Of a run that recorded no digests, those that are there.
+        """
+        if self.digests is None:
+            return sorted(self.folder.glob(pattern))
+        names = (name for name in self.digests if "/" not in name and fnmatchcase(name, pattern))
+        return [self.folder / name for name in sorted(names)]
+
+    def read(self, path: Path) -> bytes:
+        """All of a file, which is as the run left it.
+
+        Raises:
+            DamagedFileError: if it is not, or cannot be read.
+        """
+        content = _reading(read_file, path, LARGEST_READ)
+        recorded = self._recorded(path)
+        if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
+            raise DamagedFileError(path, "is not as the run left it")
+        return content
+
+    def check(self, path: Path) -> None:
+        """Make sure of the same for a file that need not fit the memory.
+
+        Raises:
+            DamagedFileError: if it is missing or changed.
+        """
+        recorded = self._recorded(path)
+        if recorded is not None and _reading(_digest, path, sys.maxsize) != recorded:
+            raise DamagedFileError(path, "is not as the run left it")
+
+    def _recorded(self, path: Path) -> str | None:
+        """The digest of a file; None where the run recorded none, or the file is not its own."""
+        place = path.resolve()
+        folder = self.folder.resolve()
+        if self.digests is None or not place.is_relative_to(folder):
+            return None
+        return self.digests.get(place.relative_to(folder).as_posix())
+
+
+def digests_of(folder: Path) -> dict[str, str]:
+    """The digests of all files of a run folder but ``run.json``, by relative name."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    names = {path.relative_to(folder).as_posix(): path for path in paths}
+    return {
+        name: _digest(path, sys.maxsize)
+        for name, path in names.items()
+        if name != RECORD and not (path.name.startswith(".") and path.suffix == ".tmp")
+    }
+
+
+def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
+    """The record with its own digest, where it has those of the run's files."""
+    if FIELD not in record:
+        return dict(record)
+    plain = json.loads(json.dumps(record))
+    return {**plain, FIELD: {**plain[FIELD], RECORD: _seal(plain)}}
+
+
+def read_record(path: Path) -> dict[str, Any]:
+    """The contents of a ``run.json``, which is as it was written.
+
+    Raises:
+        FileNotFoundError: if there is none.
+        DamagedFileError: if it holds anything else than a run's record, or was changed.
+    """
+    try:
+        record = json.loads(read_file(path, LARGEST_RECORD))
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise DamagedFileError(path, f"cannot be read: {error.strerror}") from error
+    except UnsafeFileError as error:
+        raise DamagedFileError(path, f"is damaged: {error}") from error
+    except (ValueError, RecursionError) as error:
+        raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error
+    if not isinstance(record, dict):
+        raise DamagedFileError(path, "is damaged: it must map names to values")
+    if _is_too_deep(record):
+        raise DamagedFileError(path, "is damaged: it is nested too deeply")
+    if FIELD in record and not _is_whole(record):
+        raise DamagedFileError(path, "is damaged: it is not as the run left it")
+    return record
+
+
+def _reading(read: Callable[[Path, int], Content], path: Path, limit: int) -> Content:
+    try:
+        return read(path, limit)
+    except FileNotFoundError as error:
+        raise DamagedFileError(path, "is missing") from error
+    except OSError as error:
+        raise DamagedFileError(path, f"cannot be read: {error.strerror}") from error
+    except UnsafeFileError as error:
+        raise DamagedFileError(path, str(error).removeprefix(f"{path} ")) from error
+
+
+def _digest(path: Path, limit: int) -> str:
+    digest = hashlib.sha256()
+    with opened(path, limit) as file:
+        while piece := file.read(_PIECE):
+            digest.update(piece)
+    return digest.hexdigest()
+
+
+def _seal(record: Mapping[str, Any]) -> str:
+    files = {name: digest for name, digest in record[FIELD].items() if name != RECORD}
+    text = json.dumps({**record, FIELD: files}, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _is_whole(record: Mapping[str, Any]) -> bool:
+    files = record[FIELD]
+    return (
+        isinstance(files, dict)
+        and all(isinstance(digest, str) for digest in files.values())
+        and files.get(RECORD) == _seal(record)
+    )
+
+
+def _is_too_deep(value: Any) -> bool:
+    level = [value]
+    for _ in range(_DEEPEST_RECORD):
+        inner = [item.values() if isinstance(item, dict) else item for item in level]
+        level = [child for items in inner for child in items if isinstance(child, dict | list)]
+        if not level:
+            return False
+    return True

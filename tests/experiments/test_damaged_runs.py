@@ -1,0 +1,267 @@
+"""Runs whose files are damaged: left out with the reason, and done again when that is asked for."""
+
+import json
+import runpy
+import shutil
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import compare
+from commands.study_output import repair, run_study
+from experiments.bandit_batches import STATISTICS_FILE
+from experiments.repair import move_damaged_aside
+from experiments.run_figures import read_value_maps
+from experiments.run_in_child import do_run, draft_path
+from experiments.study_plan import plan
+from experiments.study_results import read_results, read_run
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.file_digests import DamagedFileError
+from pipeline.pull_recording import PULLS_FILE
+
+STEPS = {"n_timesteps": 60}
+WAREHOUSE = EnvironmentSpec("grid", "Warehouse-v0", STEPS)
+ARMS = EnvironmentSpec("arms", "BernoulliBandit-v0", STEPS)
+PPO = {"policy": "MlpPolicy", "n_steps": 32, "batch_size": 32, "policy_kwargs": {"net_arch": [4]}}
+
+
+def study_of(algo, environment, settings=None, n_seeds=2):
+    agent = AgentSpec(algo, algo, settings or {}, tuned=not settings)
+    return StudySpec("s", "S", (agent,), (environment,), n_seeds=n_seeds, eval_freq=30)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory, do_study):
+    """Three studies whose runs have finished."""
+    root = tmp_path_factory.mktemp("whole")
+    studies = {
+        "grid": study_of("qlearning", WAREHOUSE),
+        "batch": study_of("ucb", ARMS),
+        "pulls": study_of("ppo", ARMS, PPO, n_seeds=1),
+    }
+    for name, study in studies.items():
+        do_study(study, root / name)
+    return studies, root
+
+
+@pytest.fixture
+def copied(whole, tmp_path):
+    """A copy of one of them, to damage: its study, plan, and folder."""
+    studies, source = whole
+
+    def copy(name):
+        shutil.copytree(source / name, tmp_path / name)
+        return studies[name], plan(studies[name], tmp_path / name), tmp_path / name
+
+    return copy
+
+
+def forget_digests(planned):
+    """As an earlier version left it."""
+    info = planned.run.read_info()
+    del info["files"]
+    planned.run.info_path.write_text(json.dumps(info))
+
+
+def cut(path):
+    path.write_bytes(path.read_bytes()[:-7])
+
+
+def bit(path):
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(bytes(content))
+
+
+READ = {
+    "grid": ["0.monitor.csv", "evaluations.npz", "value_maps.npz", "Warehouse-v0.zip", "run.json"],
+    "batch": [STATISTICS_FILE, "run.json"],
+    "pulls": ["0.monitor.csv", "evaluations.npz", PULLS_FILE, "run.json"],
+}
+
+
+@pytest.mark.parametrize("damage", [cut, bit, Path.unlink], ids=["cut", "bit", "missing"])
+@pytest.mark.parametrize(("kind", "name"), [(kind, n) for kind, ns in READ.items() for n in ns])
+def test_a_damaged_run_is_left_out_and_said_to_be(copied, kind, name, damage):
+    study, planned, root = copied(kind)
+    damage(planned[0].path / name)
+    results = read_results(study, planned, root)
+    (left_out,) = results.left_out
+    assert left_out.planned is planned[0]
+    what = "missing" if damage is Path.unlink else "not as the run left it|damaged"
+    assert any(word in left_out.reason for word in what.split("|"))
+    assert str(planned[0].path / name) in left_out.reason
+    assert results.finished == planned[1:]
+    assert not planned[0].is_to_do
+    expected = [] if planned[0].is_batch or not planned[1:] else [1]
+    assert results.summary["seed"].tolist() == expected
+    assert len(results.pulls) == 0
+
+
+def test_what_a_comparison_does_not_read_is_not_held_against_it(copied):
+    study, planned, root = copied("grid")
+    (planned[0].path / "notes.txt").write_text("mine")
+    bit(planned[0].run.params_path / "config.yml")
+    planned[1].run.model_path.unlink()  # no episode of this one is filmed
+    results = read_results(study, planned, root)
+    assert results.left_out == ()
+    assert results.summary["seed"].tolist() == [0, 1]
+
+
+@pytest.mark.parametrize(
+    "record", ["null", "[]", "{}", '{"spec": null}', '{"state": "finished", "spec": [1]}', "{", ""]
+)
+def test_a_record_that_says_nothing_is_damage_and_no_other_run(copied, record):
+    study, planned, root = copied("grid")
+    planned[0].run.info_path.write_text(record)
+    assert not planned[0].is_to_do
+    (left_out,) = read_results(study, planned, root).left_out
+    assert "run.json is damaged" in left_out.reason
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"final": 3},
+        {"final": {"mean_return": "much"}},
+        {"final": {"mean_return": 1.0, "optimum": 2.0}},
+        {"final": {"optimum": None, "best_blind": 1.0}},
+        {"seconds": "long"},
+        {"n_timesteps": [1]},
+        {"best_mean_return": 10**400},
+        {"engine": 3},
+        {"versions": ["numpy"]},
+        {"versions": {"numpy": 2}},
+    ],
+)
+def test_a_record_of_wrong_types(copied, fields):
+    study, planned, _ = copied("grid")
+    forget_digests(planned[0])
+    planned[0].run.update_info(**fields)
+    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: "):
+        read_run(study, planned[0])
+
+
+WRONG_ARRAYS = {
+    "no arms": ("pulls", PULLS_FILE, "arms", None),
+    "arms that there are not": ("pulls", PULLS_FILE, "arms", lambda arms: arms + 10),
+    "arms below 0": ("pulls", PULLS_FILE, "arms", lambda arms: -arms - 1),
+    "arms of floats": ("pulls", PULLS_FILE, "arms", lambda arms: arms * 1.0),
+    "few rewards": ("pulls", PULLS_FILE, "rewards", lambda rewards: rewards[:, 1:]),
+    "no regret": ("batch", STATISTICS_FILE, "regret", None),
+    "little regret": ("batch", STATISTICS_FILE, "regret", lambda regret: regret[1:]),
+    "flat shares": ("batch", STATISTICS_FILE, "shares", np.ravel),
+    "few runs": ("batch", STATISTICS_FILE, "total_reward", lambda total: total[1:]),
+    "no actions": ("grid", "value_maps.npz", "actions", None),
+    "actions that there are not": ("grid", "value_maps.npz", "actions", lambda a: a + 9),
+    "actions of floats": ("grid", "value_maps.npz", "actions", lambda a: a * 1.0),
+    "no values": ("grid", "value_maps.npz", "values", lambda values: values * np.nan),
+    "few values": ("grid", "value_maps.npz", "values", lambda values: values[:, 1:]),
+}
+
+
+@pytest.mark.parametrize("what", WRONG_ARRAYS)
+def test_arrays_of_no_form_in_runs_without_digests(copied, what):
+    kind, name, array, change = WRONG_ARRAYS[what]
+    study, planned, _ = copied(kind)
+    forget_digests(planned[0])
+    path = planned[0].path / name
+    expected = read_run(study, planned[0])
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **arrays)
+    assert repr(read_run(study, planned[0]).rows) == repr(expected.rows)  # there are NaN in it
+    changed = {} if change is None else {array: change(arrays[array])}
+    del arrays[array]
+    np.savez(path, **arrays, **changed)
+    with pytest.raises(DamagedFileError, match=f"{name} is damaged: "):
+        read_run(study, planned[0])
+
+
+def test_maps_are_read_as_they_were_written(copied):
+    _, planned, _ = copied("grid")
+    run = planned[0].run
+    with np.load(run.value_maps_path) as file:
+        assert all(
+            np.array_equal(array, file[name]) for name, array in read_value_maps(run).items()
+        )
+
+
+@pytest.fixture
+def compare_again(capsys):
+    """What the command does and prints, in this process: exit code and output."""
+
+    def again(study, planned, root):
+        console = Console(width=400)
+        code = run_study(console, study, planned, root, "c", n_workers=1, with_page=False)
+        return code, capsys.readouterr().out
+
+    return again
+
+
+def test_without_repair_a_damaged_run_stays_as_it_is(copied, compare_again):
+    study, planned, root = copied("grid")
+    path = planned[1].run.evaluations_path
+    bit(path)
+    before = path.read_bytes()
+    code, out = compare_again(study, planned, root)
+    assert code == 1
+    assert f"left out: qlearning on grid, seed 1: {path} is not as the run left it\n" in out
+    assert "1 run is damaged and in no figure; --repair does such runs again" in out
+    assert "1 of 2 runs of qlearning is missing" in out
+    assert path.read_bytes() == before
+
+
+def test_repair_moves_aside_what_is_done_again(copied, compare_again, capsys):
+    study, planned, root = copied("grid")
+    whole = read_results(study, planned, root).summary.drop(columns=["seconds", "engine"])
+    bit(planned[1].run.evaluations_path)
+    before = planned[1].run.evaluations_path.read_bytes()
+    repair(Console(width=400), study, planned)
+    assert "its folder is grid_2.damaged-1 now" in capsys.readouterr().out
+    aside = planned[1].path.with_name("grid_2.damaged-1")
+    assert (aside / "evaluations.npz").read_bytes() == before
+    assert [run.is_to_do for run in planned] == [False, True]
+    do_run(planned[1], draft_path(root, planned[1]), "c")
+    code, out = compare_again(study, planned, root)
+    assert (code, "damaged" in out) == (0, False)
+    again = read_results(study, planned, root).summary.drop(columns=["seconds", "engine"])
+    assert again.equals(whole)
+    # And once more: nothing is written over.
+    bit(planned[1].run.evaluations_path)
+    ((_, place),) = move_damaged_aside(study, planned)
+    assert place.name == "grid_2.damaged-2"
+
+
+def test_another_process_does_not_remove_what_is_damaged(copied):
+    _, planned, root = copied("grid")
+    planned[0].run.info_path.write_text("{")
+    do_run(planned[0], draft_path(root, planned[0]), "c")
+    assert planned[0].is_finished
+    assert (planned[0].path.with_name("grid_1.damaged-1") / "run.json").read_text() == "{"
+
+
+def test_a_run_of_other_settings_is_no_damage(copied):
+    study, _, root = copied("grid")
+    other = replace(study, eval_freq=20)
+    assert all(run.is_to_do for run in plan(other, root))
+    assert read_results(other, plan(other, root), root).left_out == ()
+
+
+def test_a_sample_of_the_campaign(tmp_path):
+    campaign = runpy.run_path(str(Path(compare.__file__).parent / "benchmarks/damaged_files.py"))
+    total = Counter()
+    for study, planned in campaign["finished_runs"](tmp_path):
+        for forget in (lambda run: None, forget_digests):
+            forget(planned)
+            for ends in campaign["campaign"](study, planned, flips=30, stride=29).values():
+                if forget is forget_digests:
+                    assert not any(end.startswith(campaign["BROKEN"]) for end in ends)
+                else:
+                    total += ends
+    assert set(total) == {campaign["REFUSED"], campaign["RIGHT"]}
+    assert min(total.values()) > 90

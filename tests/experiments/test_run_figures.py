@@ -1,0 +1,56 @@
+"""The files of a run's figures, where they have not the form that a run gives them."""
+
+import numpy as np
+import pytest
+
+from experiments.run_figures import read_episodes, read_evaluations
+from pipeline.file_digests import DamagedFileError
+from pipeline.run_folder import Run
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "#{}",
+        "#{}\n",
+        "r,l,t\n1,2,3\n",
+        "#{}\nr,l\n1,2\n",
+        "#{}\nr,l,t\n1,2\n",
+        "#{}\nr,l,t\nnan,2,3\n",
+        "#{}\nr,l,t\n1,0,3\n",
+        "#{}\nr,l,t\n1,two,3\n",
+        "#{}\nr,l,t\n1e999,2,3\n",
+        "#{}\n\0\0\xff\n",
+    ],
+)
+def test_a_monitor_file_of_no_form(tmp_path, text):
+    path = tmp_path / "0.monitor.csv"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(DamagedFileError, match=r"0\.monitor\.csv is damaged: ") as error:
+        read_episodes(Run(tmp_path, "x"))
+    assert "\n" not in str(error.value)
+
+
+def test_a_monitor_file_without_episodes(tmp_path):
+    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 0}\nr,l,t\n')
+    assert read_episodes(Run(tmp_path, "x")).returns.size == 0
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"timesteps": [1]},
+        {"timesteps": [1], "results": [1.0]},
+        {"timesteps": [1, 2], "results": [[1.0]]},
+        {"timesteps": [1], "results": [[np.nan]]},
+        {"timesteps": [2, 1], "results": [[1.0], [1.0]]},
+        {"timesteps": [-1], "results": [[1.0]]},
+        {"timesteps": ["1"], "results": [[1.0]]},
+    ],
+)
+def test_evaluations_of_no_form(tmp_path, arrays):
+    run = Run(tmp_path, "x")
+    np.savez(run.evaluations_path, **arrays)
+    with pytest.raises(DamagedFileError, match=r"evaluations\.npz is damaged: "):
+        read_evaluations(run)

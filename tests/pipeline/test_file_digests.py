@@ -1,0 +1,174 @@
+"""What a run says of its files, and what becomes of files that are not so any more."""
+
+import hashlib
+import json
+import os
+import subprocess
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pipeline.errors import UserError
+from pipeline.file_digests import DamagedFileError, digests_of, read_record, sealed
+from pipeline.recorded_runs import check_digest
+from pipeline.run_folder import Run
+
+
+@pytest.fixture
+def run(tmp_path):
+    """A run that has ended."""
+    run = Run(tmp_path, "Lake-v1")
+    run.params_path.mkdir()
+    (run.params_path / "config.yml").write_bytes(b"a: 1\n")
+    (tmp_path / "0.monitor.csv").write_bytes(b"r,l,t\n")
+    (tmp_path / ".best_model.zip.77.tmp").write_bytes(b"half")
+    run.end(state="finished", final={"mean_return": 0.1}, steps=(1, 2))
+    return run
+
+
+def test_the_digests_are_those_of_sha256sum(run):
+    files = run.read_info()["files"]
+    assert list(files) == ["0.monitor.csv", "Lake-v1/config.yml", "run.json"]
+    known = subprocess.run(  # a fixed command
+        ["/usr/bin/sha256sum", "0.monitor.csv", "Lake-v1/config.yml"],
+        cwd=run.path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert known.stdout == "".join(f"{files[name]}  {name}\n" for name in list(files)[:2])
+
+
+def test_the_record_has_a_digest_of_its_own(run):
+    record = json.loads(run.info_path.read_text())
+    own = record["files"].pop("run.json")
+    text = json.dumps(record, sort_keys=True, separators=(",", ":"))
+    assert own == hashlib.sha256(text.encode()).hexdigest()
+    assert record["steps"] == [1, 2]
+
+
+def test_a_record_may_be_written_again(run):
+    run.update_info(state="failed")
+    assert run.read_info()["state"] == "failed"
+
+
+def test_a_record_without_digests_gets_none():
+    assert sealed({"state": "running"}) == {"state": "running"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"finished"', '"finishee"'),
+        ("0.1", "0.3"),
+        ("Lake-v1/config.yml", "Lake-v1/confic.yml"),
+        ('"run.json"', '"run.jsom"'),
+        ('"steps"', '"stepz"'),
+    ],
+)
+def test_a_changed_record_is_refused(run, old, new):
+    text = run.info_path.read_text()
+    assert text.count(old) == 1
+    run.info_path.write_text(text.replace(old, new))
+    with pytest.raises(UserError, match=r"run\.json is damaged: it is not as the run left it"):
+        run.read_info()
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner),
+    max_leaves=8,
+)
+
+
+@given(content=st.binary(max_size=40) | JSON.map(lambda data: json.dumps(data).encode()))
+def test_any_record_is_read_or_refused_in_one_line(tmp_path_factory, content):
+    path = tmp_path_factory.mktemp("record") / "run.json"
+    path.write_bytes(content)
+    try:
+        found = read_record(path)
+    except DamagedFileError as error:
+        found = error
+    is_one_line = str(found).startswith(f"{path} is damaged: ") and "\n" not in str(found)
+    assert isinstance(found, dict) or is_one_line
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"null",
+        b"[1]",
+        b"{",
+        b'{"a": "\xff"}',
+        b"[" * 100_000,
+        b'{"a": ' + b"[" * 200 + b"]" * 200 + b"}",
+        b'{"a": ' + b"9" * 5000 + b"}",
+        b'{"files": 3}',
+        b'{"files": {"x": 3}}',
+        b'{"files": {}}',
+    ],
+)
+def test_odd_records(tmp_path, content):
+    path = tmp_path / "run.json"
+    path.write_bytes(content)
+    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: "):
+        read_record(path)
+
+
+def test_a_record_that_is_no_file(tmp_path):
+    folder, pipe = tmp_path / "folder", tmp_path / "pipe"
+    folder.mkdir()
+    os.mkfifo(pipe)
+    for path in (folder, pipe):
+        with pytest.raises(DamagedFileError, match="is no regular file"):
+            read_record(path)
+
+
+def test_files_are_held_against_their_digests(run):
+    csv = run.path / "0.monitor.csv"
+    assert run.files.read(csv) == b"r,l,t\n"
+    csv.write_bytes(b"r,l,u\n")
+    for read in (run.files.read, run.files.check):
+        with pytest.raises(DamagedFileError, match=r"0\.monitor\.csv is not as the run left it"):
+            read(csv)
+    with pytest.raises(UserError, match=r"left it: train again, or name another copy of it$"):
+        check_digest(run, csv)
+    csv.unlink()
+    for read in (run.files.read, run.files.check):
+        with pytest.raises(DamagedFileError, match=r"0\.monitor\.csv is missing"):
+            read(csv)
+
+
+def test_files_of_the_user_are_nobodys_business(run):
+    (run.path / "notes.txt").write_text("mine")
+    (run.path / "1.monitor.csv").write_text("mine")
+    (run.path / "notes.txt").write_text("mine, changed")
+    run.files.check(run.path / "notes.txt")
+    check_digest(run, run.path.parent / "elsewhere.zip")
+    check_digest(None, run.path / "0.monitor.csv")
+    # What the run did not leave is not read as if it had.
+    assert [path.name for path in run.files.matching("*.monitor.csv")] == ["0.monitor.csv"]
+
+
+def test_a_run_of_an_earlier_version_is_taken_as_it_is(tmp_path):
+    run = Run(tmp_path, "Lake-v1")
+    run.update_info(state="finished")
+    (tmp_path / "0.monitor.csv").write_bytes(b"anything")
+    assert run.files.digests is None
+    assert run.files.read(tmp_path / "0.monitor.csv") == b"anything"
+    run.files.check(tmp_path / "0.monitor.csv")
+    assert [path.name for path in run.files.matching("*.csv")] == ["0.monitor.csv"]
+
+
+def test_a_path_through_a_link_is_the_same_file(run, tmp_path_factory):
+    link = tmp_path_factory.mktemp("links") / "run"
+    link.symlink_to(run.path)
+    (run.path / "0.monitor.csv").write_bytes(b"changed")
+    with pytest.raises(DamagedFileError):
+        Run(link, "Lake-v1").files.check(run.path / "0.monitor.csv")
+
+
+def test_digests_of_an_empty_folder(tmp_path):
+    assert digests_of(tmp_path) == {}
