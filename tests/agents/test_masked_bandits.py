@@ -267,6 +267,13 @@ def test_late_feedback_remembers_what_was_allowed():
     assert [pull.probability for pull in learnt] == pytest.approx([1 / 2, 1 / 4], rel=1e-15)
 
 
+def test_each_environment_has_masks_of_its_own():
+    model, learnt = agent_on("exp3", n_envs=2), []
+    model._learn = learnt.append
+    model.learn(40)
+    assert [pull.mask for pull in learnt] == [BY_CONTEXT[pull.context].tolist() for pull in learnt]
+
+
 @pytest.mark.parametrize("name", ["epsilon_greedy", "linucb"])
 def test_predict_goes_by_what_it_is_told_or_what_was_allowed_last(name):
     model = agent_on(name).learn(200)
