@@ -89,7 +89,7 @@ def as_played(study: StudySpec, planned: PlannedRun) -> str | None:
     if planned.is_batch:
         return ""  # it leaves no agent
     request = ModelRequest(path=planned.path, log_folder=planned.path.parents[1])
-    return repr((choose_model(request), agent_to_continue(planned.path, request.log_folder, True)))
+    return repr((choose_model(request), agent_to_continue(planned.path)))
 
 
 def as_played_at_its_best(study: StudySpec, planned: PlannedRun) -> str | None:

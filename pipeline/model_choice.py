@@ -23,7 +23,7 @@ from pipeline.companions import statistics_of
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.model_finding import Which, model_at, model_of
-from pipeline.model_loading import hand_written_algorithm, telling_masks
+from pipeline.model_zips import hand_written_algorithm, telling_masks
 from pipeline.module_records import check_recorded
 from pipeline.normalization import normalising, read_statistics
 from pipeline.recorded_runs import RecordedRun, check_digest, recorded_run, run_around

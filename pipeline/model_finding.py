@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import UserError
-from pipeline.model_loading import check_model_file
+from pipeline.model_zips import check_model_file
 from pipeline.recorded_runs import run_in
 from pipeline.run_folder import Run
 

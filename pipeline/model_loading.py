@@ -2,22 +2,16 @@
 
 from __future__ import annotations
 
-import io
-import json
 import warnings
-import zipfile
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from agents import ALGORITHMS, load_algorithm
+from agents import load_algorithm
 from pipeline.admitted_classes import own_classes, own_makers
 from pipeline.errors import UserError, one_line
-from pipeline.file_digests import RECORD, read_record
-from pipeline.run_folder import Run
+from pipeline.model_zips import _is_hand_written, check_model_file, saved_observation, shown_space
 from pipeline.settings.constructor_arguments import algorithm_parameters
-from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule
 
 if TYPE_CHECKING:
@@ -26,32 +20,6 @@ if TYPE_CHECKING:
 
 # What a class of the user's may stand for in a zip.
 _CLASS_KEYS = ("policy_class", "policy_kwargs", "replay_buffer_class", "rollout_buffer_class")
-
-# Folders of `agents` in which no agent has a zip with a pickle: known before any is imported.
-_JSON_FAMILIES = {"tabular", "bandits", "mabwiser"}
-
-
-def check_model_file(path: Path) -> None:
-    """Make sure that ``path`` is a whole zip of an agent, without making any agent of it.
-
-    Raises:
-        UserError: if it is missing, unreadable, damaged, too large, or something else.
-    """
-    from safe_files.archives import read_members
-    from safe_files.limits import MAX_ARCHIVE_BYTES
-    from safe_files.regular_files import read_file
-
-    try:
-        content = read_file(path, MAX_ARCHIVE_BYTES)
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            names = frozenset(archive.namelist())
-        read_members(content, names)
-    except FileNotFoundError:
-        raise UserError(f"no such model file: {path}") from None
-    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
-        raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
-    if "data" not in names or not any(name.endswith(".pth") for name in names):
-        raise UserError(f"{path} is no whole zip of an agent: it lacks parts that one has")
 
 
 def agent_class(algo: str) -> type[BaseAlgorithm]:
@@ -181,7 +149,7 @@ def load_to_play(
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.utils import ConstantSchedule
 
-    saved, given = _saved_observation(path), _shown_space(vars(env.observation_space))
+    saved, given = saved_observation(path), shown_space(vars(env.observation_space))
     if saved != given and saved is not None:
         raise UserError(
             f"{path} was trained on observations of {saved}, and the environment as it is made "
@@ -199,36 +167,6 @@ def load_to_play(
     small = {"buffer_size": 1, "optimize_memory_usage": False}
     extra = small if issubclass(agent_class(algo), OffPolicyAlgorithm) else {}
     return load_model(algo, path, env, modules, device=device, custom_objects=replaced, **extra)
-
-
-def _plain_data(path: Path) -> dict[str, Any]:
-    """The JSON that a zip of any agent holds; what is pickled in it stays text."""
-    from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_SETTINGS_BYTES
-    from safe_files.regular_files import opened
-
-    try:
-        with opened(path, MAX_ARCHIVE_BYTES) as file, zipfile.ZipFile(file) as archive:
-            if archive.getinfo("data").file_size > MAX_SETTINGS_BYTES:
-                raise ValueError("its settings are too large")
-            data = json.loads(archive.read("data"))
-    except (OSError, ValueError, LookupError, zipfile.BadZipFile, RecursionError) as error:
-        raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
-    if not isinstance(data, dict):
-        raise UserError(f"{path} is no whole zip of an agent: its data maps no names to values")
-    return data
-
-
-def _saved_observation(path: Path) -> str | None:
-    """What a library's zip says of the space that its agent observes; None if nothing plain."""
-    space = _plain_data(path).get("observation_space")
-    return _shown_space(space) if isinstance(space, dict) else None
-
-
-def _shown_space(attributes: Mapping[str, Any]) -> str | None:
-    if "n" in attributes:
-        return f"{attributes['n']} kinds"
-    shape = attributes.get("_shape")
-    return f"shape {tuple(shape)}" if shape else None
 
 
 def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
@@ -259,61 +197,3 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
     if kinds[0] != kinds[1]:
         found, needed = (f"{name} with n_steps {n_steps}" for name, n_steps in kinds)
         raise UserError(f"{path} holds a {found}; these hyperparameters need a {needed}")
-
-
-def run_of(path: Path) -> Run | None:
-    """The run folder that a model file lies in, or None if it lies elsewhere."""
-    folder = path.resolve().parent
-    try:
-        env_name = read_record(folder / RECORD).get("env_name")
-    except (OSError, UserError):
-        return None
-    return Run(folder, env_name) if isinstance(env_name, str) else None
-
-
-def hand_written_algorithm(path: Path) -> str | None:
-    """The name of the hand-written agent that a zip says it holds, or None for the library's.
-
-    It decides which agent is meant where nobody says so, and nothing about how the zip is read.
-
-    Raises:
-        UserError: if that is damaged.
-    """
-    class_name = _plain_data(path).get("algorithm")
-    for name, entry in ALGORITHMS.items():
-        if (
-            isinstance(class_name, str)
-            and entry.entry_point.endswith(f":{class_name}")
-            and _is_hand_written(name)
-        ):
-            return name
-    return None
-
-
-def telling_masks(spec: TrainSpec, model: Path) -> TrainSpec:
-    """The spec with environments that tell action masks, where the agent in a zip goes by them.
-
-    What the spec says of ``mask_actions`` itself holds. Reads plain JSON and nothing else.
-
-    Raises:
-        UserError: if the zip is damaged.
-    """
-    check_model_file(model)
-    algorithm, name = spec.hyperparams.algorithm, "mask_actions"
-    if name in algorithm or _plain_data(model).get(name) is not True:
-        return spec
-    hyperparams = replace(spec.hyperparams, algorithm={**algorithm, name: True})
-    saved = {**spec.saved_hyperparams, name: True}
-    return replace(spec, hyperparams=hyperparams, saved_hyperparams=saved)
-
-
-def _is_hand_written(algo: str) -> bool:
-    """Whether zips of the agent hold JSON; where there is no class, none is loaded."""
-    if ALGORITHMS[algo].family in _JSON_FAMILIES:
-        return True
-    from agents.common.model_files import JsonAlgorithm
-
-    try:
-        return issubclass(load_algorithm(algo), JsonAlgorithm)
-    except ImportError:
-        return True

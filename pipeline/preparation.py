@@ -37,7 +37,8 @@ from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
-from pipeline.model_loading import agent_class, telling_masks
+from pipeline.model_loading import agent_class
+from pipeline.model_zips import telling_masks
 from pipeline.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
