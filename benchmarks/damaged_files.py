@@ -33,9 +33,9 @@ from experiments.run_in_child import do_run, draft_path
 from experiments.study_plan import PlannedRun, plan
 from experiments.study_results import read_run
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.continuation import agent_to_continue
 from pipeline.errors import UserError
-from pipeline.model_choice import ModelRequest, choose_model
+from pipeline.models.continuation import agent_to_continue
+from pipeline.models.model_choice import ModelRequest, choose_model
 
 REFUSED, RIGHT, WRONG, ANOTHER, BROKEN = "refused", "right", "wrong", "another run", "broken"
 UNNAMED = "refused, and the file not named"

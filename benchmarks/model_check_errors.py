@@ -25,7 +25,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.random import Generator
 
-from envs import check_transition_model, odd_frequencies
+from envs import check_transition_model
+from envs.checking import odd_frequencies
 
 N_MODELS = 10_000
 STEPS = 500

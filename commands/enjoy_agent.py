@@ -19,7 +19,7 @@ from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, 
 from commands.streams import go_on_unread
 
 if TYPE_CHECKING:
-    from pipeline.model_choice import ChosenModel, ModelRequest
+    from pipeline.models.model_choice import ChosenModel, ModelRequest
 
 STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
 RUN_NUMBER = whole_number(0, besides={-1: "the run without a number"})
@@ -148,7 +148,7 @@ def main() -> int:
     console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries"):
         from commands.playing_output import PlayingRequest, play
-        from pipeline.model_choice import with_statistics
+        from pipeline.models.model_choice import with_statistics
 
         chosen = with_statistics(found, wanted)
     if film is not None or args.reward_log:
@@ -170,7 +170,7 @@ def main() -> int:
 
 def _found_model(wanted: ModelRequest) -> ChosenModel:
     from pipeline.errors import UserError
-    from pipeline.model_choice import find_model
+    from pipeline.models.model_choice import find_model
     from pipeline.run_folder import NoRunError
 
     try:

@@ -17,8 +17,8 @@ from commands.run_output import describe, print_refusal
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator, model_refusal, why_not_exact
 from pipeline.filming import write_film
-from pipeline.model_choice import ChosenModel
-from pipeline.model_loading import load_to_play
+from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_loading import load_to_play
 from pipeline.playing import KEPT_MODES, FrameTaker, RenderMode, play_episodes, playing_env
 from pipeline.signs_of_life import Activity, doing
 from pipeline.train_spec import TrainSpec

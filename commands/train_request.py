@@ -34,7 +34,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     raw = with_logs_located(args.env, with_maps_read(args.env, _raw_hyperparams(args)))
     trained_agent = None
     if args.trained_agent:
-        from pipeline.continuation import agent_to_continue
+        from pipeline.models.continuation import agent_to_continue
 
         trained_agent = agent_to_continue(Path(args.trained_agent))
     # A flag that has the name of a field goes there as it is.

@@ -3,7 +3,8 @@
 The answer is None wherever something in the chain of wrappers is not known to leave the dynamics
 alone: a wrong model would make every figure computed from it wrong. For the same reason an
 environment's word is not proof: a model that comes neither from Gymnasium's own classes nor from
-this project's is held against `step` before it is believed (`envs.model_checks`), once a process.
+this project's is held against `step` before it is believed, once a process: see
+`envs.checking.model_checks`.
 """
 
 from __future__ import annotations
@@ -16,10 +17,10 @@ import numpy as np
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 from numpy.typing import NDArray
 
-from envs.claimed_models import Claim, claim_of, is_trusted
+from envs.checking.claimed_models import Claim, claim_of, is_trusted
+from envs.checking.model_checks import ModelCheck, checked
 from envs.grid import GridWorld
 from envs.grid_map import GOAL
-from envs.model_checks import ModelCheck, checked
 from envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,

@@ -19,7 +19,7 @@ from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
 from pipeline.map_contents import with_maps_read
 from pipeline.memory_limits import check_pulls
-from pipeline.model_loading import agent_class
+from pipeline.models.model_loading import agent_class
 from pipeline.run_folder import FINISHED, Run, environment_name
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import Hyperparams, split

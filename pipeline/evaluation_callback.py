@@ -12,11 +12,11 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from agents.common.callback_horizons import Horizon, calls_until_multiple
-from pipeline.companions import statistics_path
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
-from pipeline.model_saving import save_model, save_normalization
+from pipeline.models.companions import statistics_path
+from pipeline.models.model_saving import save_model, save_normalization
 from pipeline.run_folder import Run
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.model_choice import ChosenModel
-from pipeline.normalization import normalising, read_statistics, take_over
+from pipeline.models.model_choice import ChosenModel
+from pipeline.models.normalization import normalising, read_statistics, take_over
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

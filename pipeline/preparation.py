@@ -19,7 +19,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
-from pipeline.continuation import continuing, load_to_continue, statistics_to_continue
 from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
@@ -37,9 +36,10 @@ from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
-from pipeline.model_loading import agent_class
-from pipeline.model_zips import telling_masks
-from pipeline.normalization import take_over
+from pipeline.models.continuation import continuing, load_to_continue, statistics_to_continue
+from pipeline.models.model_loading import agent_class
+from pipeline.models.model_zips import telling_masks
+from pipeline.models.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.run_folder import Run, environment_name

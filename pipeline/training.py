@@ -13,12 +13,12 @@ import torch as th
 from rich.console import Console
 
 from mdp.machine_code import compile_timer
-from pipeline.companions import final_replay_buffer_path
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import value_map
-from pipeline.model_saving import save_model, save_normalization, save_replay_buffer
+from pipeline.models.companions import final_replay_buffer_path
+from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
 from pipeline.pictures.learning_curve import draw_learning_curve
 from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map

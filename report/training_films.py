@@ -15,8 +15,8 @@ from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing
 from pipeline.filming import film_episode, write_film
-from pipeline.model_choice import ChosenModel
-from pipeline.model_loading import load_model
+from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_loading import load_model
 from pipeline.playing import playing_env
 from pipeline.signs_of_life import Tell, tell_nobody
 

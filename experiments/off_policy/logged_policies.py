@@ -18,10 +18,10 @@ from mdp.array_types import Floats
 from pipeline.agent_checks import check_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import policy_matrix, why_not_exact
-from pipeline.model_loading import load_model
-from pipeline.model_zips import check_model_file, hand_written_algorithm, run_of
+from pipeline.models.model_loading import load_model
+from pipeline.models.model_zips import check_model_file, hand_written_algorithm, run_of
+from pipeline.models.recorded_runs import check_digest
 from pipeline.module_records import check_recorded
-from pipeline.recorded_runs import check_digest
 from pipeline.user_modules import UserModule
 
 # What changes an agent's observations, so that they are no longer the log's contexts.

@@ -20,8 +20,8 @@ from pipeline.errors import UserError
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing, write_json
 from pipeline.filming import film_episode, write_film
-from pipeline.model_choice import ChosenModel
-from pipeline.model_loading import load_model
+from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_loading import load_model
 from pipeline.playing import playing_env
 from report.page.markup import data_uri
 from report.page.sections import Report, Section

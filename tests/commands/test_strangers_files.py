@@ -18,7 +18,7 @@ import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
 from envs.bandits import log_uniformly
 from pipeline.errors import UserError
-from pipeline.model_choice import ChosenModel
+from pipeline.models.model_choice import ChosenModel
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec

@@ -15,18 +15,19 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.utils import categorical_sample
 
 import envs
-from envs import check_transition_model, model_checks
-from envs.claimed_models import claim_of
+from envs import check_transition_model
+from envs.checking import model_checks
+from envs.checking.claimed_models import claim_of
+from envs.checking.model_sampling import Budget, sample
+from envs.checking.odd_frequencies import odd_frequencies
+from envs.checking.watched_env import WatchedEnv
 from envs.known_models import (
     model_check,
     observations_of_states,
     success_outcomes,
     transition_model,
 )
-from envs.model_sampling import Budget, sample
-from envs.odd_frequencies import odd_frequencies
 from envs.warehouse import WarehouseEnv
-from envs.watched_env import WatchedEnv
 
 # Where nothing is a question of frequencies, or these are far off.
 FEW = 5_000

@@ -28,9 +28,9 @@ from pipeline.callbacks import (
     ExponentialExploration,
     StepCheckpoint,
 )
-from pipeline.companions import statistics_path
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.evaluation_callback import EvaluationCallback
+from pipeline.models.companions import statistics_path
 from pipeline.run_folder import Run
 
 TINY_DQN = {

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from pipeline.companions import replay_buffer_of, statistics_of
 from pipeline.errors import UserError
-from pipeline.model_choice import ModelRequest, choose_model
-from pipeline.model_finding import model_at
-from pipeline.model_loading import load_to_play
+from pipeline.models.companions import replay_buffer_of, statistics_of
+from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.models.model_finding import model_at
+from pipeline.models.model_loading import load_to_play
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec

@@ -19,8 +19,8 @@ from agents.common.model_files import JsonAlgorithm
 from pipeline import training
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.model_loading import load_model
-from pipeline.model_zips import _JSON_FAMILIES, hand_written_algorithm
+from pipeline.models.model_loading import load_model
+from pipeline.models.model_zips import _JSON_FAMILIES, hand_written_algorithm
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy, needs_policy
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.settings.hyperparams import split

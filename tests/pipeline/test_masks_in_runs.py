@@ -18,7 +18,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator, policy_matrix
 from pipeline.evaluation.mask_telling import takes_masks
 from pipeline.evaluation.sampled import evaluate
-from pipeline.model_choice import ModelRequest, choose_model
+from pipeline.models.model_choice import ModelRequest, choose_model
 from pipeline.playing import play_episodes, playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec

@@ -14,9 +14,9 @@ from stable_baselines3.common.utils import set_random_seed
 from agents import ALGORITHMS, load_algorithm
 from agents.common.model_files import JsonAlgorithm
 from envs.wrappers import ActionMasks
-from pipeline.admitted_classes import own_classes
 from pipeline.errors import UserError
-from pipeline.model_loading import load_model, load_replay_buffer, load_to_play
+from pipeline.models.admitted_classes import own_classes
+from pipeline.models.model_loading import load_model, load_replay_buffer, load_to_play
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.user_modules import import_typed
 

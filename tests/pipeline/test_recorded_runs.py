@@ -19,10 +19,10 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.model_choice import ModelRequest, choose_model
-from pipeline.model_loading import load_to_play
+from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.models.model_loading import load_to_play
+from pipeline.models.recorded_runs import recorded_run, run_around
 from pipeline.playing import play_episodes, playing_env
-from pipeline.recorded_runs import recorded_run, run_around
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import NoEntryError
 from pipeline.settings.strict_yaml import read_saved_settings
@@ -345,12 +345,12 @@ def test_where_a_folder_says_nothing_the_default_entry_counts(zoo, tmp_path, mon
     """But whether a stranger's model saw normalised observations is not ours to say."""
     request = ModelRequest(hub(zoo, tmp_path), "a2c", "CartPole-v1")
     entry = {"normalize": True, "frame_stack": 2}
-    monkeypatch.setattr("pipeline.model_choice.read_hyperparams", lambda *_: entry)
+    monkeypatch.setattr("pipeline.models.model_choice.read_hyperparams", lambda *_: entry)
     hyperparams = choose_model(request).spec.hyperparams
     assert (hyperparams.normalize, hyperparams.frame_stack) == (None, 2)
 
     def no_entry(*_):
         raise NoEntryError("none")
 
-    monkeypatch.setattr("pipeline.model_choice.read_hyperparams", no_entry)
+    monkeypatch.setattr("pipeline.models.model_choice.read_hyperparams", no_entry)
     assert choose_model(request).spec.hyperparams.frame_stack is None

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
-from pipeline.model_choice import ChosenModel
+from pipeline.models.model_choice import ChosenModel
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec

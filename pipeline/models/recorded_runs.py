@@ -19,7 +19,7 @@ from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
-from pipeline.model_zips import run_of
+from pipeline.models.model_zips import run_of
 from pipeline.run_folder import Run
 from pipeline.settings.strict_yaml import read_saved_settings
 

@@ -8,9 +8,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents import load_algorithm
-from pipeline.admitted_classes import own_classes, own_makers
 from pipeline.errors import UserError, one_line
-from pipeline.model_zips import _is_hand_written, check_model_file, saved_observation, shown_space
+from pipeline.models.admitted_classes import own_classes, own_makers
+from pipeline.models.model_zips import (
+    _is_hand_written,
+    check_model_file,
+    saved_observation,
+    shown_space,
+)
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.user_modules import UserModule
 

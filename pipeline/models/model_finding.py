@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import UserError
-from pipeline.model_zips import check_model_file
-from pipeline.recorded_runs import run_in
+from pipeline.models.model_zips import check_model_file
+from pipeline.models.recorded_runs import run_in
 from pipeline.run_folder import Run
 
 Which = Literal["final", "best", "last checkpoint"] | int

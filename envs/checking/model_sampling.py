@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.random import Generator
 
-from envs.watched_env import SEED, WatchedEnv
+from envs.checking.watched_env import SEED, WatchedEnv
 from mdp.array_types import Floats, Ints
 from mdp.frequency_evidence import frequencies
 from mdp.outcome_classes import Observed

@@ -11,11 +11,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from envs.claimed_models import Claim, claim_of
-from envs.env_copies import copy_of, global_generators_apart
-from envs.model_sampling import Budget, sample
-from envs.odd_frequencies import odd_frequencies
-from envs.watched_env import SEED, DisagreementError, WatchedEnv
+from envs.checking.claimed_models import Claim, claim_of
+from envs.checking.env_copies import copy_of, global_generators_apart
+from envs.checking.model_sampling import Budget, sample
+from envs.checking.odd_frequencies import odd_frequencies
+from envs.checking.watched_env import SEED, DisagreementError, WatchedEnv
 from mdp.transition_model import TransitionModel
 
 Env = gym.Env[Any, Any]
@@ -74,8 +74,8 @@ def check_transition_model(env: Env, n_steps: int = N_STEPS) -> ModelCheck:
 
     Not found is what happens too seldom to be seen, what is hidden in states that neither episodes
     nor setting ``s`` lead to, and what changes after the check. The copy is a deep one, or another
-    environment made alike (see `envs.env_copies.copy_of`): the caller's episode and generators stay
-    as they are, but what the environment shares with its copies, such as an attribute of its class,
+    environment made alike (see `envs.checking.env_copies.copy_of`): the caller's episode and
+    generators stay as they are, but what the environment shares with its copies, such as an attribute of its class,
     is used. The same environment is always judged in the same way, unless it draws from a
     generator that `reset` does not seed.
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.companions import replay_buffer_of, statistics_of
-from pipeline.model_finding import model_at
-from pipeline.model_loading import agent_class, load_model, load_replay_buffer
-from pipeline.normalization import Statistics, normalising, read_statistics
-from pipeline.recorded_runs import check_digest, run_around
+from pipeline.models.companions import replay_buffer_of, statistics_of
+from pipeline.models.model_finding import model_at
+from pipeline.models.model_loading import agent_class, load_model, load_replay_buffer
+from pipeline.models.normalization import Statistics, normalising, read_statistics
+from pipeline.models.recorded_runs import check_digest, run_around
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from envs.watched_env import Steps, WatchedEnv, outcome_text, row_text
+from envs.checking.watched_env import Steps, WatchedEnv, outcome_text, row_text
 from mdp.array_types import Floats, Ints
 from mdp.frequency_evidence import Frequencies, frequencies
 

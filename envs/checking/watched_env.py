@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
 
-from envs.claimed_models import Claim
+from envs.checking.claimed_models import Claim
 from mdp.array_types import Ints
 from mdp.outcome_classes import Observed, OutcomeClasses
 

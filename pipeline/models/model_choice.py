@@ -4,11 +4,12 @@ What the environment is made of comes from, the first first:
 
 1. the request: agent, environment, arguments of the environment, statistics;
 2. for hand-written agents, the zip, which says what agent it holds;
-3. what the model's folder says, see `pipeline.recorded_runs`;
+3. what the model's folder says, see `pipeline.models.recorded_runs`;
 4. the entry of ``hyperparams/<algo>.yml``, apart from ``normalize``, where the folder says nothing.
 
 Statistics of VecNormalize are used wherever there are some that belong to the model, see
-`pipeline.companions`, since they lie there for no other reason than that it was trained on them.
+`pipeline.models.companions`, since they lie there for no other reason than that it was trained on
+them.
 """
 
 from __future__ import annotations
@@ -19,14 +20,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.agent_checks import check_algorithm
-from pipeline.companions import statistics_of
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
-from pipeline.model_finding import Which, model_at, model_of
-from pipeline.model_zips import hand_written_algorithm, telling_masks
+from pipeline.models.companions import statistics_of
+from pipeline.models.model_finding import Which, model_at, model_of
+from pipeline.models.model_zips import hand_written_algorithm, telling_masks
+from pipeline.models.normalization import normalising, read_statistics
+from pipeline.models.recorded_runs import RecordedRun, check_digest, recorded_run, run_around
 from pipeline.module_records import check_recorded
-from pipeline.normalization import normalising, read_statistics
-from pipeline.recorded_runs import RecordedRun, check_digest, recorded_run, run_around
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
 from pipeline.settings.hyperparams import split

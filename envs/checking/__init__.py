@@ -1,0 +1,1 @@
+"""Whether the model that an environment brings is what it does."""

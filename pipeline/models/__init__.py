@@ -1,0 +1,1 @@
+"""Models on disk: found, looked into, loaded, gone on with, and saved."""
