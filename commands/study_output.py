@@ -10,8 +10,8 @@ from rich.console import Console
 
 from commands.study_progress import StudyProgress
 from experiments.execution import RunFailure, available_cores, execute
+from experiments.planned_runs import PlannedRun
 from experiments.repair import move_damaged_aside
-from experiments.study_plan import PlannedRun
 from experiments.study_results import LeftOut, StudyResults, read_results
 from experiments.study_spec import StudySpec
 from pipeline.signs_of_life import Activity, doing

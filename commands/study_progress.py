@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 
 from experiments.execution import RunFailure
-from experiments.study_plan import PlannedRun
+from experiments.planned_runs import PlannedRun
 from pipeline.signs_of_life import (
     SECONDS_BETWEEN_LINES,
     SECONDS_BETWEEN_LOOKS,

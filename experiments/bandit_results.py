@@ -11,9 +11,9 @@ from experiments.bandit_batches import (
     read_run,
     stacked_statistics,
 )
+from experiments.planned_runs import PlannedRun
 from experiments.pull_statistics import PullStatistics
 from experiments.run_figures import read_outcome
-from experiments.study_plan import PlannedRun
 from pipeline.file_digests import DamagedFileError
 from pipeline.pull_recording import PULLS_FILE
 

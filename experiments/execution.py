@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from experiments.child_processes import StoppedError, TaskFailedError, local_executor, supervise
+from experiments.planned_runs import PlannedRun
 from experiments.run_in_child import (
     do_run,
     draft_path,
@@ -17,7 +18,6 @@ from experiments.run_in_child import (
     remove_dead_drafts,
     remove_draft,
 )
-from experiments.study_plan import PlannedRun
 from experiments.study_spec import file_name
 from pipeline.files import write_text
 

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.study_plan import PlannedRun
+from experiments.planned_runs import PlannedRun
 from experiments.study_results import LeftOut, read_run
 from experiments.study_spec import StudySpec
 from pipeline.file_digests import DamagedFileError

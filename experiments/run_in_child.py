@@ -12,8 +12,8 @@ from pathlib import Path
 from rich.console import Console
 
 from experiments.bandit_batches import do_batch
+from experiments.planned_runs import PlannedRun
 from experiments.repair import move_aside
-from experiments.study_plan import PlannedRun
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import portable_name, put_in_place
 from pipeline.run_folder import Run

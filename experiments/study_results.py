@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.bandit_results import batch_rows, read_pulls, run_regret
+from experiments.planned_runs import PlannedRun
 from experiments.pull_statistics import PullStatistics
 from experiments.run_figures import (
     Episodes,
@@ -19,7 +20,6 @@ from experiments.run_figures import (
     read_outcome,
     read_value_maps,
 )
-from experiments.study_plan import PlannedRun
 from experiments.study_spec import StudySpec
 from mdp.array_types import Floats
 from pipeline.file_digests import DamagedFileError

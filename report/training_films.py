@@ -6,8 +6,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from experiments.planned_runs import PlannedRun
 from experiments.run_figures import read_episodes
-from experiments.study_plan import PlannedRun
 from experiments.study_results import StudyResults
 from experiments.study_spec import file_name
 from pipeline.environments import MISTAKES

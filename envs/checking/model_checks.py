@@ -75,9 +75,9 @@ def check_transition_model(env: Env, n_steps: int = N_STEPS) -> ModelCheck:
     Not found is what happens too seldom to be seen, what is hidden in states that neither episodes
     nor setting ``s`` lead to, and what changes after the check. The copy is a deep one, or another
     environment made alike (see `envs.checking.env_copies.copy_of`): the caller's episode and
-    generators stay as they are, but what the environment shares with its copies, such as an attribute of its class,
-    is used. The same environment is always judged in the same way, unless it draws from a
-    generator that `reset` does not seed.
+    generators stay as they are, but what the environment shares with its copies, such as an
+    attribute of its class, is used. The same environment is always judged in the same way, unless
+    it draws from a generator that `reset` does not seed.
 
     Args:
         env: an environment that has ``P`` and ``initial_state_distrib``, wrapped or not.

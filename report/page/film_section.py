@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from experiments.analysis import StudyAnalysis
-from experiments.study_plan import PlannedRun
+from experiments.planned_runs import PlannedRun
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError
 from pipeline.evaluation.sampled import evaluation_seed

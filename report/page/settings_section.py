@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from experiments.execution import failure_log
-from experiments.study_plan import PlannedRun
+from experiments.planned_runs import PlannedRun
 from experiments.study_results import StudyResults
 from report.page.markup import setting
 from report.page.sections import Report, Section

@@ -1,0 +1,101 @@
+"""One run of a study, and whether its folder holds it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.file_digests import DamagedFileError
+from pipeline.run_folder import FINISHED, Run, environment_name
+from pipeline.train_spec import TrainSpec, completed
+
+# What a run of the same settings may differ in: where it is written, what is shown meanwhile, and
+# where the modules lie that its names come from.
+_MAY_DIFFER = (
+    "log_folder",
+    "tensorboard_log",
+    "gym_packages",
+    "user_modules",
+    "save_every_n_episodes",
+    "verbose",
+    "progress",
+    "log_interval",
+    "pictures",
+)
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a study.
+
+    Attributes:
+        agent: label of the agent.
+        environment: label of the environment.
+        seed: its seed.
+        spec: what to train.
+        path: its folder, there once it has finished.
+        is_batch: whether it stands for all seeds of a bandit agent, of which ``seed`` is the first.
+        n_runs: how many runs it stands for.
+    """
+
+    agent: str
+    environment: str
+    seed: int
+    spec: TrainSpec
+    path: Path
+    is_batch: bool = False
+    n_runs: int = 1
+
+    @property
+    def run(self) -> Run:
+        """The run folder."""
+        return Run(self.path, environment_name(self.spec.env_id))
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the folder holds this very run, to its end; what else it holds is not read."""
+        try:
+            info = self.run.read_info()
+        except DamagedFileError:
+            return False
+        if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
+            return False
+        spec = info.get("spec")
+        recorded = completed(spec if isinstance(spec, dict) else {})
+        wanted = self.spec.save_every_n_episodes
+        return _identity(recorded) == _identity(self.spec.as_data()) and (
+            wanted < 1 or self.is_batch or recorded["save_every_n_episodes"] == wanted
+        )
+
+    @property
+    def is_to_do(self) -> bool:
+        """Whether there is no such run; one that is damaged is there."""
+        if self.is_finished:
+            return False
+        try:
+            self.check_record()
+        except DamagedFileError:
+            return False
+        return True
+
+    def check_record(self) -> None:
+        """Make sure that the folder, where there is one, says which run it holds.
+
+        Raises:
+            DamagedFileError: if its ``run.json`` is missing or damaged.
+        """
+        path = self.run.info_path
+        if not (self.path.is_dir() and any(self.path.iterdir())):
+            return
+        if not path.exists():
+            raise DamagedFileError(path, "is missing")
+        if not self.run.recorded_spec():
+            raise DamagedFileError(path, "is damaged: it does not say what was asked for")
+
+
+def _identity(spec: Mapping[str, Any]) -> Any:
+    kept = {key: value for key, value in spec.items() if key not in _MAY_DIFFER}
+    return json.loads(json.dumps(kept))
