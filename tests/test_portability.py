@@ -43,12 +43,19 @@ GUARDED = {("experiments/run_in_child.py", "os.kill"): "asks _winapi on Windows,
 
 
 def name_of(function: ast.expr) -> str:
-    """``module.function`` where a name stands before the dot, else ``.method``."""
+    """``module.function`` where a name stands before the dot, else ``.method``.
+
+    A member of a zip is opened as bytes: ``archive`` counts as such a name.
+    """
     if isinstance(function, ast.Name):
         return function.id
     if not isinstance(function, ast.Attribute):
         return ""
-    is_module = isinstance(function.value, ast.Name) and function.value.id in {"os", "Image"}
+    is_module = isinstance(function.value, ast.Name) and function.value.id in {
+        "os",
+        "Image",
+        "archive",
+    }
     return f"{function.value.id if is_module else ''}.{function.attr}"
 
 
