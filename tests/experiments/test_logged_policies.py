@@ -164,6 +164,6 @@ def test_an_agent_that_has_to_be_told_what_is_allowed(log):
     rows = "".join(f"{i % 2},{i % 5},{i % 2},1,0.5\n" for i in range(20))
     path = log("age,visits,arm,reward,propensity\n" + rows)
     agent = load_algorithm("linucb")(env=SomeSoldOut(path), mask_actions=True)
-    message = "^runs/linucb cannot be judged on a log: mask_actions: predict needs action_masks"
+    message = "^runs/linucb cannot be judged on a log: LinUCB: which actions are valid"
     with pytest.raises(UserError, match=message):
         compare_policies(read_logged(path), [LoggedPolicy("runs/linucb", agent, None)])

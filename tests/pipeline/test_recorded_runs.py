@@ -275,7 +275,7 @@ APPLY = "!!python/object/apply:"
         (f"{APPLY}collections.OrderedDict [[[[1], 2]]]", "no OrderedDict of different keys"),
         (f"{APPLY}collections.OrderedDict {{a: 1}}", "no OrderedDict of different keys"),
         (f"{APPLY}collections.OrderedDict x", "no OrderedDict of different keys"),
-        (f"&a {APPLY}collections.OrderedDict [[[a, *a]]]", "recursive"),
+        (f"&a {APPLY}collections.OrderedDict [[[a, *a]]]", "nested too deeply"),
         ("[1, 2]", "must map names to values"),
         ("1: 2", "must map names to values"),
     ],
