@@ -108,6 +108,7 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
     add("--reward-log", metavar="DIR", help="write the returns there too, as Monitor's CSV files")
     add("--verbose", type=VERBOSITY, default=1, help="0 for no output (default: 1)")
+    add("--norm-reward", action="store_true", help="returns of rewards as training normalised them")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add(
         "--gym-packages",
@@ -122,8 +123,7 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
 
 def _add_flags_of_rl_zoo3(parser: argparse.ArgumentParser) -> None:
     """Flags of its command that have nothing to do here; `check_playing` says so."""
-    for flags in (["--norm-reward"], ["-P", "--progress"]):
-        parser.add_argument(*flags, action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("-P", "--progress", action="store_true", help=argparse.SUPPRESS)
     # It always does what this flag asks for, and so does this command.
     parser.add_argument("--custom-objects", action="store_true", help=argparse.SUPPRESS)
 
@@ -162,6 +162,7 @@ def main() -> int:
         render=args.render,
         film=film,
         monitor_folder=Path(args.reward_log) if args.reward_log else None,
+        norm_reward=args.norm_reward,
         num_threads=args.num_threads,
     )
     play(console, chosen, request)

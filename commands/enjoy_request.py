@@ -43,8 +43,6 @@ def check_playing(args: argparse.Namespace) -> None:
     Raises:
         UserError: if it is asked for.
     """
-    if args.norm_reward:
-        raise UserError("--norm-reward: returns are those of the environment, never normalised")
     if args.progress:
         raise UserError("-P: there is no bar; each episode is printed as it ends")
     if args.n_envs > 1 and (args.record is not None or args.render in ("human", "ansi")):

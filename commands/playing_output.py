@@ -19,6 +19,7 @@ from pipeline.evaluation.exact import exact_evaluator, model_refusal, why_not_ex
 from pipeline.filming import write_film
 from pipeline.models.model_choice import ChosenModel
 from pipeline.models.model_loading import load_to_play
+from pipeline.models.normalization import with_normalised_rewards
 from pipeline.playing import KEPT_MODES, FrameTaker, RenderMode, play_episodes, playing_env
 from pipeline.signs_of_life import Activity, doing
 from pipeline.train_spec import TrainSpec
@@ -37,6 +38,7 @@ class PlayingRequest:
             is a display to show it on.
         film: a file to write a film to, instead, or None.
         monitor_folder: where to write the returns of the episodes, or None.
+        norm_reward: count rewards as training normalised them.
         num_threads: torch threads; below 1 for PyTorch's own choice.
     """
 
@@ -47,6 +49,7 @@ class PlayingRequest:
     render: str | None = None
     film: Path | None = None
     monitor_folder: Path | None = None
+    norm_reward: bool = False
     num_threads: int = 1
 
     @property
@@ -114,6 +117,8 @@ def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None
     spec = chosen.spec
     with doing(console, "loading the agent"):
         env = playing_env(chosen, request.mode, request.n_envs, request.monitor_folder)
+        if request.norm_reward:
+            env = with_normalised_rewards(env)
         model = load_to_play(spec.algo, chosen.path, env, spec.device, spec.user_modules)
         env.seed(spec.seed)
     show = _Show(Activity(console, "playing"), request.mode, FrameTaker(env))

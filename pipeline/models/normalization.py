@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -94,6 +95,24 @@ def take_over(env: VecEnv, statistics: Statistics) -> None:
             )
         normalization.obs_rms = statistics.observations  # type: ignore[assignment]
     normalization.ret_rms = statistics.returns
+
+
+def with_normalised_rewards(env: VecEnv) -> VecEnv:
+    """The environments with rewards as training normalised them, episodes' returns too.
+
+    Raises:
+        UserError: if nothing normalises in ``env``.
+    """
+    from stable_baselines3.common.vec_env import VecMonitor, unwrap_vec_normalize
+
+    normalization = unwrap_vec_normalize(env)
+    if normalization is None:
+        raise UserError("--norm-reward: no statistics of VecNormalize belong to this model")
+    normalization.norm_reward = True
+    with warnings.catch_warnings():
+        # That the statistics of the Monitor inside are overwritten is what is wanted.
+        warnings.filterwarnings("ignore", "The environment is already wrapped with a `Monitor`")
+        return VecMonitor(env)
 
 
 def _plain(value: Any) -> Any:

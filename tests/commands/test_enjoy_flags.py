@@ -82,7 +82,6 @@ def test_nothing_is_said_with_verbose_0(type_command, lake):
 @pytest.mark.parametrize(
     ("flags", "answer"),
     [
-        (["--norm-reward"], "--norm-reward: returns are those of the environment, never norm"),
         (["-P"], "-P: there is no bar; each episode is printed as it ends"),
         (["--n-envs", "0"], "--n-envs: must be a whole number of at least 1, not '0'"),
         (["--n-envs", "2", "--render", "ansi"], "--render ansi shows one environment"),
@@ -185,3 +184,9 @@ def test_a_study_remembers_maps_by_their_contents(tmp_path, monkeypatch):
     study = StudySpec("s", "S", (AgentSpec("qlearning", "qlearning"),), (environment,), n_seeds=1)
     (planned,) = plan(study, tmp_path)
     assert planned.spec.as_data()["hyperparams"]["env_kwargs"]["desc"] == MAP.split()
+
+
+def test_normalised_returns_need_statistics(type_command, lake):
+    code, _, err = type_command(*lake, "--norm-reward")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "--norm-reward: no statistics of VecNormalize belong to this model" in err

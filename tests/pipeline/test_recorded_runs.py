@@ -15,12 +15,13 @@ import yaml
 from stable_baselines3 import A2C
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap_vec_normalize
 
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.models.model_choice import ModelRequest, choose_model
 from pipeline.models.model_loading import load_to_play
+from pipeline.models.normalization import with_normalised_rewards
 from pipeline.models.recorded_runs import recorded_run, run_around
 from pipeline.playing import play_episodes, playing_env
 from pipeline.run_folder import Run
@@ -82,6 +83,21 @@ def returns_of(request, n_episodes, n_envs=1):
     played = list(play_episodes(model, env, n_episodes))
     env.close()
     return played
+
+
+def test_returns_of_rewards_as_training_normalised_them(zoo):
+    request = ModelRequest(algo="a2c", env_id="CartPole-v1", log_folder=zoo)
+    chosen = choose_model(request)
+    env = with_normalised_rewards(playing_env(chosen, None))
+    normalization = unwrap_vec_normalize(env)
+    model = load_to_play("a2c", chosen.path, env, "cpu")
+    env.seed(0)
+    ((total, length),) = play_episodes(model, env, 1)
+    # Every reward of CartPole is 1, and the statistics stay as training left them.
+    one = float(normalization.normalize_reward(np.ones(1))[0])
+    assert one != 1.0
+    assert total == pytest.approx(length * one, rel=1e-5)
+    env.close()
 
 
 def hub(zoo, folder, *settings):
