@@ -57,8 +57,7 @@ GOALS = [
     Goal("CliffWalking-v1", "sarsa", -17, 1.0),
     Goal("Pendulum-v1", "sac", -200, 0.8),
     *(Goal("Pendulum-v1", algo, -200, 0.9) for algo in ("td3", "ppo")),
-    Goal("MountainCarContinuous-v0", "sac", 90, 0.9),
-    Goal("MountainCarContinuous-v0", "ppo", 80, 0.9),
+    *(Goal("MountainCarContinuous-v0", algo, 90, 0.9) for algo in ("sac", "ppo")),
 ]
 
 
