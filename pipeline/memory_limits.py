@@ -6,7 +6,6 @@ The figures are estimates from below: what is refused here could not have been t
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterable, Mapping
 from itertools import pairwise
 from typing import Any
@@ -15,22 +14,14 @@ from gymnasium import spaces
 
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import Hyperparams
+from safe_files.limits import memory_bytes
 
-_MEMORY_IF_UNKNOWN = 16 * 2**30  # bytes
 _BYTES_PER_ENVIRONMENT = 20_000  # CartPole with its Monitor takes more
 _BYTES_PER_WEIGHT = 16  # of 32 bits, with its gradient and two moments of Adam
 _BYTES_PER_PULL = 24  # the arm, the reward and the regret
 
 # What counts observations among the arguments of an agent's constructor.
 _BUFFERS = frozenset({"buffer_size", "n_steps", "n_delta"})
-
-
-def memory() -> int:
-    """Bytes of memory in this machine; where no system tells, a number that many have."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return _MEMORY_IF_UNKNOWN
 
 
 def observation_bytes(space: spaces.Space[Any]) -> int:
@@ -154,7 +145,7 @@ def _weights(layers: object) -> int:
 
 
 def _check(what: str, n_bytes: int, where: str) -> None:
-    present = memory()
+    present = memory_bytes()
     if n_bytes > present:
         raise UserError(
             f"{where}: {what} would take {_gigabytes(n_bytes)} of memory at least, "

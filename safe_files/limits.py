@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import os
+import sys
+
 # A model of a hundred million parameters is larger than any that these algorithms train.
 MAX_ARCHIVE_BYTES = 1 << 30
 MAX_MEMBERS = 64
@@ -21,3 +25,14 @@ MAX_WIDTH = 1024
 MAX_ROWS = 1_000_000_000
 MAX_STATISTICS_BYTES = 64 << 20
 MAX_BUFFER_BYTES = 32 << 30
+# Where no system tells; many machines have as much.
+MEMORY_IF_UNKNOWN = 16 << 30
+
+
+def memory_bytes() -> int:
+    """Bytes of memory in this machine."""
+    size = MEMORY_IF_UNKNOWN
+    if sys.platform != "win32":
+        with contextlib.suppress(ValueError, OSError):
+            size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return size

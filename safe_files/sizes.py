@@ -7,7 +7,6 @@ buffers too: a file of some bytes could ask for all the memory that there is.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 
-from safe_files.limits import MAX_ROWS, MAX_WIDTH
+from safe_files.limits import MAX_ROWS, MAX_WIDTH, memory_bytes
 from safe_files.refusals import UnsafeFileError
 from safe_files.tensors import tensors_in
 
@@ -84,11 +83,3 @@ def _check_buffers(settings: Mapping[str, Any], n_inputs: int) -> None:
                 f"give another {names[0]}",
                 names[0],
             )
-
-
-def memory_bytes() -> int:
-    """The memory of this machine; 8 GiB where it does not say."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (AttributeError, ValueError, OSError):
-        return 8 << 30

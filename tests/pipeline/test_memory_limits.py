@@ -10,10 +10,12 @@ from gymnasium import spaces
 from pipeline import memory_limits
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.memory_limits import check_agent, check_pulls, memory, observation_bytes
+from pipeline.memory_limits import check_agent, check_pulls, observation_bytes
 from pipeline.preparation import algorithm_kwargs
 from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.train_spec import TrainSpec
+from safe_files import limits
+from safe_files.limits import memory_bytes
 
 GIGABYTE = 2**30
 FOUR_FLOATS = spaces.Box(-1, 1, (4,), np.float32)  # 16 bytes
@@ -21,7 +23,7 @@ FOUR_FLOATS = spaces.Box(-1, 1, (4,), np.float32)  # 16 bytes
 
 @pytest.fixture(autouse=True)
 def one_gigabyte(monkeypatch):
-    monkeypatch.setattr(memory_limits, "memory", lambda: GIGABYTE)
+    monkeypatch.setattr(memory_limits, "memory_bytes", lambda: GIGABYTE)
 
 
 def spec_of(algo, entry, env_id="CartPole-v1"):
@@ -146,12 +148,10 @@ def test_pulls_of_a_batch():
 
 
 def test_where_the_system_does_not_tell(monkeypatch):
-    assert memory() > 2**28
+    assert memory_bytes() > 2**28
 
     def unknown(_):
         raise ValueError
 
-    monkeypatch.setattr(memory_limits.os, "sysconf", unknown)
-    assert memory() == 16 * GIGABYTE
-    monkeypatch.delattr(memory_limits.os, "sysconf")
-    assert memory() == 16 * GIGABYTE
+    monkeypatch.setattr(limits.os, "sysconf", unknown)
+    assert memory_bytes() == 16 * GIGABYTE
