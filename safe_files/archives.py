@@ -22,12 +22,12 @@ _DAMAGE = (
 )
 
 
-def read_members(content: bytes, expected: frozenset[str]) -> Mapping[str, bytes]:
+def read_members(content: bytes, expected: frozenset[str] | None = None) -> Mapping[str, bytes]:
     """The members of a zip, by their names.
 
     Args:
         content: the zip.
-        expected: the names that members may have.
+        expected: the names that members may have; None for any.
 
     Raises:
         UnsafeFileError: if it is no whole zip, unpacks to too much, or has other members.
@@ -36,7 +36,7 @@ def read_members(content: bytes, expected: frozenset[str]) -> Mapping[str, bytes
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
             names = [info.filename for info in infos]
-            strange = sorted(set(names) - expected)
+            strange = [] if expected is None else sorted(set(names) - expected)
             if strange:
                 raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
             if len(names) != len(set(names)) or len(names) > MAX_MEMBERS:

@@ -129,6 +129,7 @@ class BanditAlgorithm(LearningAlgorithm):
         self, contexts: Any, masks: Bools, rng: np.random.Generator
     ) -> tuple[Ints, Floats]:
         """As `_choose`, among the arms in ``masks``, of shape (n, arms)."""
+        # Never asked: with masks, a class that does not say this is refused when it is made.
         raise NotImplementedError
 
     @abstractmethod

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
 from collections.abc import Mapping
@@ -31,13 +30,10 @@ def check_model_file(path: Path) -> None:
     from safe_files.regular_files import read_file
 
     try:
-        content = read_file(path, MAX_ARCHIVE_BYTES)
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            names = frozenset(archive.namelist())
-        read_members(content, names)
+        names = read_members(read_file(path, MAX_ARCHIVE_BYTES)).keys()
     except FileNotFoundError:
         raise UserError(f"no such model file: {path}") from None
-    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError) as error:
+    except (OSError, ValueError) as error:
         raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
     if "data" not in names or not any(name.endswith(".pth") for name in names):
         raise UserError(f"{path} is no whole zip of an agent: it lacks parts that one has")
