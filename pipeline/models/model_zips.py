@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,10 @@ from pipeline.train_spec import TrainSpec
 
 # Folders of `agents` in which no agent has a zip with a pickle: known before any is imported.
 _JSON_FAMILIES = {"tabular", "bandits", "mabwiser"}
+
+# What the library raises at zips and JSON that are damaged, encrypted, nested without end, or of a
+# kind that it does not know.
+_DAMAGE = (OSError, ValueError, LookupError, RuntimeError, EOFError, zipfile.BadZipFile, zlib.error)
 
 
 def check_model_file(path: Path) -> None:
@@ -49,7 +54,7 @@ def plain_data(path: Path) -> dict[str, Any]:
             if archive.getinfo("data").file_size > MAX_SETTINGS_BYTES:
                 raise ValueError("its settings are too large")
             data = json.loads(archive.read("data"))
-    except (OSError, ValueError, LookupError, zipfile.BadZipFile, RecursionError) as error:
+    except _DAMAGE as error:
         raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
     if not isinstance(data, dict):
         raise UserError(f"{path} is no whole zip of an agent: its data maps no names to values")

@@ -17,6 +17,7 @@ from envs.wrappers import ActionMasks
 from pipeline.errors import UserError
 from pipeline.models.admitted_classes import own_classes
 from pipeline.models.model_loading import load_model, load_replay_buffer, load_to_play
+from pipeline.models.model_zips import check_model_file, hand_written_algorithm, plain_data
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.user_modules import import_typed
 
@@ -220,3 +221,20 @@ def test_classes_of_the_users_are_admitted_where_the_module_was_typed(own_folder
     # What is no part of a network may not be named, wherever it comes from.
     assert set(own_classes(load_algorithm("ppo"), modules)) >= {"mine.Net"}
     assert "mine.Job" not in own_classes(load_algorithm("mine_ppo"), modules)
+
+
+@pytest.mark.parametrize(
+    ("at", "value", "reason"), [(6, 1, "is encrypted"), (8, 99, "compression method")]
+)
+@pytest.mark.parametrize("read", [check_model_file, plain_data, hand_written_algorithm])
+def test_zips_that_cannot_be_unpacked_are_refused_in_one_line(tmp_path, read, at, value, reason):
+    path = tmp_path / "model.zip"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("data", "{}")
+        archive.writestr("policy.pth", b"")
+    content = bytearray(path.read_bytes())
+    # The same field stands in the member's own header and, two bytes further, in the zip's list.
+    content[at] = content[content.index(b"PK\x01\x02") + at + 2] = value
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=reason):
+        read(path)
