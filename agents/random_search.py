@@ -8,6 +8,8 @@ import sb3_contrib
 from stable_baselines3.common.callbacks import BaseCallback
 from torch.nn.utils import parameters_to_vector
 
+from agents.common.callback_horizons import tell_safe_moment
+
 
 class _TrainingStoppedError(Exception):
     """A callback asks for the end, in the midst of a candidate's episodes."""
@@ -26,6 +28,12 @@ class ARS(sb3_contrib.ARS):
     """
 
     _last_dones: Any = None
+    # Its rollouts begin in the midst of an update, whose directions are drawn by then.
+    tells_safe_moments = True
+
+    def _do_one_update(self, callback: BaseCallback, async_eval: Any) -> None:
+        tell_safe_moment(callback)
+        super()._do_one_update(callback, async_eval)
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
         """As `sb3_contrib.ARS.learn`, but for callbacks that ask for the end."""

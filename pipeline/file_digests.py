@@ -22,6 +22,7 @@ from safe_files.regular_files import opened, read_file
 
 RECORD = "run.json"
 FIELD = "files"
+STATE_FOLDER = "state"  # of what a run goes on from, which is no part of what it leaves
 LARGEST_RECORD = 64 << 20  # bytes
 LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
 _PIECE = 1 << 20  # bytes
@@ -99,6 +100,7 @@ class RecordedFiles:
 def digests_of(folder: Path) -> dict[str, str]:
     """The digests of all files of a run folder but ``run.json``, by relative name."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    paths = [path for path in paths if path.parent != folder / STATE_FOLDER]
     names = {path.relative_to(folder).as_posix(): path for path in paths}
     return {
         name: _digest(path, sys.maxsize)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
@@ -42,6 +42,8 @@ from pipeline.models.model_zips import telling_masks
 from pipeline.models.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
+from pipeline.resuming.resumed_logging import resumed_logger
+from pipeline.resuming.state_saver import StateKeeping, StateSaver
 from pipeline.run_folder import Run, environment_name
 from pipeline.settings import components
 from pipeline.settings.action_noise import action_noise, check_action_noise
@@ -68,6 +70,8 @@ class Training:
         eval_env: environments to evaluate on.
         evaluation: the evaluation callback, also part of ``callback``.
         callback: all callbacks.
+        saver: keeps the state, also part of ``callback``.
+        keeping: what becomes of it.
         pulls: keeps every pull, on bandits; else None, and where a compiled loop was asked for.
         refusal: why the model that the environment brings is not believed; None if it is.
     """
@@ -79,6 +83,8 @@ class Training:
     evaluation: EvaluationCallback
     display: ProgressDisplay
     callback: BaseCallback
+    saver: StateSaver
+    keeping: StateKeeping
     pulls: PullRecorder | None = None
     refusal: str | None = None
 
@@ -108,13 +114,20 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
 
 
 def set_up(
-    spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
+    spec: TrainSpec,
+    run: Run,
+    kwargs: dict[str, Any],
+    console: Console,
+    undo: ExitStack,
+    keeping: StateKeeping,
 ) -> Training:
     """Make all parts of the training, and add to ``undo`` how to remove them again."""
-    spec, env = _training_env(spec, run, undo)
+    spec, env = _training_env(spec, run, undo, appends=keeping.state is not None)
     model = _make_model(spec, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
+    elif keeping.state is not None:
+        model.set_logger(resumed_logger(model, keeping.state.note))
     n_eval_envs = min(spec.n_eval_envs, spec.eval_episodes) if takes_batches(model) else 1
     eval_env = make_evaluation_env(spec, n_eval_envs)
     undo.callback(eval_env.close)
@@ -122,7 +135,8 @@ def set_up(
     exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
-    callbacks = _named_callbacks(spec, run, model)
+    saver = StateSaver(run, keeping.interval, partial(_say, console), keeping.state)
+    callbacks = [saver, *_named_callbacks(spec, run, model)]
     pulls = _pull_recorder(model, run, console) if is_bandit else None
     if pulls is not None:
         callbacks.append(pulls)
@@ -132,9 +146,24 @@ def set_up(
     if spec.verbose > 0:
         callbacks.append(display)
     refusal = None if evaluation.value_maps is not None else model_refusal(spec)
+    saver.root = CallbackList(callbacks)
     return Training(
-        spec, run, model, eval_env, evaluation, display, CallbackList(callbacks), pulls, refusal
+        spec,
+        run,
+        model,
+        eval_env,
+        evaluation,
+        display,
+        saver.root,
+        saver,
+        keeping,
+        pulls,
+        refusal,
     )
+
+
+def _say(console: Console, line: str) -> None:
+    console.print(f"[dim]{escape(line)}[/]")
 
 
 def _exact_evaluator(
@@ -150,14 +179,19 @@ def _exact_evaluator(
     return None if reason else exact
 
 
-def _training_env(spec: TrainSpec, run: Run, undo: ExitStack) -> tuple[TrainSpec, VecEnv]:
-    """What the agent is trained on; and the spec, which follows one that goes on."""
+def _training_env(
+    spec: TrainSpec, run: Run, undo: ExitStack, appends: bool
+) -> tuple[TrainSpec, VecEnv]:
+    """What the agent is trained on; and the spec, which follows one that goes on.
+
+    With ``appends``, Monitor goes on in the files that are there.
+    """
     if spec.trained_agent is not None:
         spec = telling_masks(spec, spec.trained_agent)
     statistics = statistics_to_continue(spec)
     if statistics is not None:
         spec = continuing(spec, statistics)
-    env = make_training_env(spec, run.path)
+    env = make_training_env(appending(spec) if appends else spec, run.path)
     undo.callback(env.close)
     if statistics is not None:
         take_over(env, statistics)
@@ -206,6 +240,13 @@ def _pull_recorder(model: BaseAlgorithm, run: Run, console: Console) -> PullReco
         console.print("[dim]engine: compiled keeps no pulls, so that regret is not known[/]")
         return None
     return PullRecorder(run.path)
+
+
+def appending(spec: TrainSpec) -> TrainSpec:
+    """The spec, with Monitors that go on in the files that are there."""
+    hyperparams = spec.hyperparams
+    arguments = {**hyperparams.monitor_kwargs, "override_existing": False}
+    return replace(spec, hyperparams=replace(hyperparams, monitor_kwargs=arguments))
 
 
 def is_unread(spec: TrainSpec) -> bool:

@@ -13,13 +13,28 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.file_digests import FIELD, RECORD, RecordedFiles, digests_of, read_record, sealed
+from pipeline.file_digests import FIELD, RECORD, STATE_FOLDER, RecordedFiles, digests_of, read_record, sealed
 from pipeline.files import portable_name, write_json
 
 RUNNING = "running"
 FINISHED = "finished"
 INTERRUPTED = "interrupted"
 FAILED = "failed"
+
+# What ``run.json`` says of the end of a run.
+OUTCOME = (
+    "state",
+    "reason",
+    "n_timesteps",
+    "seconds",
+    "final",
+    "best_mean_return",
+    "best_timesteps",
+    "engine",
+    "regret",
+    "pulls",
+    FIELD,
+)
 
 
 class NoRunError(UserError):
@@ -147,6 +162,11 @@ class Run:
         return self.params_path / "vecnormalize.pkl"
 
     @property
+    def state_path(self) -> Path:
+        """The folder of the states that a training under way goes on from."""
+        return self.path / STATE_FOLDER
+
+    @property
     def info_path(self) -> Path:
         """What the run was asked for and what came out."""
         return self.path / RECORD
@@ -194,6 +214,11 @@ class Run:
     def update_info(self, **fields: Any) -> None:
         """Set fields of ``run.json``."""
         write_json(self.info_path, sealed({**self.read_info(), **fields}))
+
+    def reopen(self) -> None:
+        """Take out of ``run.json`` what came out so far: the run goes on."""
+        info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
+        write_json(self.info_path, {**info, "state": RUNNING})
 
     def end(self, **fields: Any) -> None:
         """Set fields of ``run.json``, the last file of a run, with the digests of all others."""

@@ -24,6 +24,9 @@ from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.pull_recording import PullSummary, summarise_pulls
+from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
+from pipeline.resuming.state_folder import remove_states
+from pipeline.resuming.state_saver import StateKeeping
 from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.run_record import recorded_versions, write_arguments, write_settings
 from pipeline.signs_of_life import Activity, doing
@@ -32,6 +35,7 @@ from pipeline.train_spec import TrainSpec
 FINAL_EVALUATION_EPISODES = 100
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
+NEW = StateKeeping()
 
 
 @dataclass(frozen=True)
@@ -63,14 +67,24 @@ class Outcome:
 
 
 def train(
-    spec: TrainSpec, console: Console, args: dict[str, Any], command: str, run: Run | None = None
+    spec: TrainSpec,
+    console: Console,
+    args: dict[str, Any],
+    command: str,
+    run: Run | None = None,
+    keeping: StateKeeping = NEW,
 ) -> Outcome:
     """Train the agent and leave a run folder: `prepare`, then `carry_out`."""
-    return carry_out(prepare(spec, console, args, command, run))
+    return carry_out(prepare(spec, console, args, command, run, keeping))
 
 
 def prepare(
-    spec: TrainSpec, console: Console, args: dict[str, Any], command: str, run: Run | None = None
+    spec: TrainSpec,
+    console: Console,
+    args: dict[str, Any],
+    command: str,
+    run: Run | None = None,
+    keeping: StateKeeping = NEW,
 ) -> Training:
     """Make the run folder and all parts of the training.
 
@@ -80,6 +94,7 @@ def prepare(
         args: the command's arguments, for the run folder.
         command: the command itself, likewise.
         run: the run folder, made already; by default a new one in the spec's log folder.
+        keeping: what becomes of the state of the training.
 
     Raises:
         UserError: if the spec does not work out; no folder is left behind then.
@@ -91,9 +106,14 @@ def prepare(
     if run is None:
         run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
     with ExitStack() as undo, _library_errors_in_one_line():
-        undo.callback(run.discard)
-        training = set_up(spec, run, kwargs, console, undo)
+        if not keeping.goes_on:
+            undo.callback(run.discard)
+        training = set_up(spec, run, kwargs, console, undo, keeping)
         spec = training.spec  # with what an agent that goes on has brought along
+        if keeping.goes_on:
+            run.reopen()
+            undo.pop_all()
+            return training
         write_settings(run, spec, command)
         write_arguments(run, spec, args)
         run.update_info(
@@ -137,6 +157,7 @@ def carry_out(training: Training) -> Outcome:
             finally:
                 training.display.close()
             seconds = time.monotonic() - started - seconds_compiling()
+        seconds += training.saver.seconds_before
         with doing(training.display.console, "saving what was learnt") as activity:
             return _finish(training, state, seconds, activity)
     except BaseException as error:
@@ -157,7 +178,7 @@ def _give_up(training: Training, error: BaseException) -> None:
         UserError: in that case, where the agent's settings are at fault.
     """
     run, model = training.run, training.model
-    has_begun = model.num_timesteps > model._num_timesteps_at_start
+    has_begun = training.keeping.goes_on or model.num_timesteps > model._num_timesteps_at_start
     if isinstance(error, ValueError | OSError) and not has_begun:
         run.discard()
         if isinstance(error, OSError):  # says for itself which file it was
@@ -174,6 +195,10 @@ def _learn(training: Training) -> None:
         kwargs["log_interval"] = None
     elif spec.log_interval != -1:
         kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
+    begun = training.keeping.state
+    before = 0 if begun is None else iterations_before(training.model, begun.note)
+    if before and (interval := kwargs.get("log_interval", 1)) is not None:
+        kwargs["log_interval"] = IterationInterval.after(before, interval)
     training.model.learn(
         spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
         callback=training.callback,
@@ -216,6 +241,8 @@ def _finish(training: Training, state: str, seconds: float, activity: Activity) 
         pulls=pulls,
     )
     _record(outcome)
+    if state == FINISHED and not training.keeping.stays:
+        remove_states(run.state_path)
     return outcome
 
 

@@ -50,6 +50,13 @@ class BlockCallback(BaseCallback):
         """Count ``n_calls`` calls that were left out, in which ``n_episodes`` ended."""
         self.n_calls += n_calls
 
+    def wants_position(self) -> bool:
+        """Whether, at the start of the next rollout, it reads or changes where environments are."""
+        return False
+
+    def at_safe_moment(self) -> None:
+        """Between two updates, with no step under way: told by agents whose rollouts lie inside."""
+
 
 class EpisodeBudget(BlockCallback):
     """End training after ``n_episodes``, counted over all environments.
@@ -135,6 +142,18 @@ def horizon(callback: BaseCallback) -> Horizon:
         min((h.calls for h in horizons), default=NEVER),
         min((h.episodes for h in horizons), default=NEVER),
     )
+
+
+def wants_position(callback: BaseCallback) -> bool:
+    """Whether one of the callbacks does, see `BlockCallback.wants_position`."""
+    return any(isinstance(m, BlockCallback) and m.wants_position() for m in members(callback))
+
+
+def tell_safe_moment(callback: BaseCallback) -> None:
+    """Call `BlockCallback.at_safe_moment` of each of the callbacks."""
+    for member in members(callback):
+        if isinstance(member, BlockCallback):
+            member.at_safe_moment()
 
 
 def pass_over(callback: BaseCallback, n_calls: int, n_episodes: int) -> None:

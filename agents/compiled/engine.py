@@ -8,7 +8,13 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.common.callback_horizons import EpisodeBudget, horizon, members, pass_over
+from agents.common.callback_horizons import (
+    EpisodeBudget,
+    horizon,
+    members,
+    pass_over,
+    wants_position,
+)
 from agents.compiled.compile_envs import World
 from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
 from agents.compiled.episodes import Episodes, record_in_monitors
@@ -77,12 +83,16 @@ class CompiledEngine:
                     if not self._run_block(total_timesteps) or interrupted():
                         break
             finally:
-                self._take_over_position()
-                self.states.write()
+                self._write()
 
     def _run_block(self, total_timesteps: int) -> bool:
         agent = self.agent
-        self.callback.on_rollout_start()
+        if wants_position(self.callback):
+            self._write()
+            self.callback.on_rollout_start()
+            self._read()
+        else:
+            self.callback.on_rollout_start()
         self.progress[0]["episodes"] = agent._episode_num
         ahead = horizon(self.callback)
         steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
@@ -172,6 +182,11 @@ class CompiledEngine:
     def _take_over_position(self) -> None:
         self.agent._last_obs = self.envs["obs"].copy()
         self.agent.take_over(self.envs, self.progress)
+
+    def _write(self) -> None:
+        """Put agent and environments where the records are."""
+        self._take_over_position()
+        self.states.write()
 
     def _read(self) -> None:
         """Copy the state of agent and environments into the records."""

@@ -57,6 +57,8 @@ class EnvStates:
             else:
                 record["state"] = base.s
             record["elapsed"] = _elapsed_steps(env)
+            record["episode_return"] = record["compensation"] = 0.0
+            self._unfinished[i] = []
             monitor = self.monitors[i]
             if monitor is not None and monitor.rewards:
                 for reward in monitor.rewards:

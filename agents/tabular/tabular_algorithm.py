@@ -84,6 +84,7 @@ class TabularAlgorithm(MaskKeeper):
     commit = no_commitment
 
     _rebuilt = (*MaskKeeper._rebuilt, "_in_use")
+    not_in_snapshots = ("_in_use",)
 
     def __init__(
         self,

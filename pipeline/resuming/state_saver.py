@@ -1,0 +1,215 @@
+"""Keeps the state of a training, and puts a training back into it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+from agents.common.callback_horizons import BlockCallback, Horizon
+from pipeline.errors import UserError, one_line
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.progress import ProgressDisplay
+from pipeline.resuming.global_generators import generator_states, set_generators
+from pipeline.resuming.log_positions import log_positions
+from pipeline.resuming.state_folder import SavedState, save_state
+from pipeline.run_folder import Run
+from snapshots.kinds import NotRecordableError
+from snapshots.recording import record
+from snapshots.restoring import NotRestorableError, restore
+
+# Saving may take this share of the time, where the user has not said how often.
+SHARE_OF_TIME = 0.02
+SHORTEST_INTERVAL = 1.0  # seconds
+
+
+@dataclass(frozen=True)
+class SaveInterval:
+    """How often to save the state.
+
+    Attributes:
+        seconds: between two states; 0 for as often as takes `SHARE_OF_TIME`.
+        steps: environment steps between them instead, counted over all environments; or 0.
+        is_off: to save none.
+    """
+
+    seconds: float = 0.0
+    steps: int = 0
+    is_off: bool = False
+
+
+@dataclass(frozen=True)
+class StateKeeping:
+    """What becomes of a training's state.
+
+    Attributes:
+        interval: how often it is saved.
+        state: what the training goes on from; None where it begins.
+        goes_on: whether the run folder is an earlier process's, also where that left no state.
+        stays: whether states are still there when the run is finished.
+    """
+
+    interval: SaveInterval = SaveInterval()
+    state: SavedState | None = None
+    goes_on: bool = False
+    stays: bool = False
+
+
+class StateSaver(BlockCallback):
+    """Saves all that a training consists of, between two updates; the first of the callbacks.
+
+    The state is that of the agent with its environments, of all other callbacks with the
+    environments that they evaluate on, and of the generators that libraries share.
+
+    Args:
+        run: whose folder the states go to.
+        root: all callbacks, this one among them.
+        interval: how often.
+        tell: told in one line why no state is kept, where that is so.
+        state: what the training goes on from, or None where it begins.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        interval: SaveInterval,
+        tell: Callable[[str], object],
+        state: SavedState | None = None,
+    ) -> None:
+        super().__init__()
+        self.run = run
+        self.root: BaseCallback = self
+        self.interval = interval
+        self.tell = tell
+        self.state = state
+        self.is_off = interval.is_off
+        note = {} if state is None else state.note
+        self.n_saved = int(note.get("number", 0))
+        self.n_rollouts = int(note.get("rollouts", 0))
+        self.seconds_before = float(note.get("seconds", 0.0))
+        self.steps_at_save = 0
+        self.saved_at = self.started = time.monotonic()
+        self.pause = interval.seconds or SHORTEST_INTERVAL
+
+    @property
+    def seconds(self) -> float:
+        """What the training has taken, in all processes that worked on it."""
+        return self.seconds_before + time.monotonic() - self.started
+
+    def horizon(self) -> Horizon:
+        if self.is_off or self.interval.steps < 1:
+            return Horizon()
+        steps = self.steps_at_save + self.interval.steps - self.model.num_timesteps
+        return Horizon(calls=max(-(-steps // self.training_env.num_envs), 1))
+
+    def wants_position(self) -> bool:
+        return self.state is not None or self._is_due()
+
+    def at_safe_moment(self) -> None:
+        if getattr(self.model, "tells_safe_moments", False):
+            self._act()
+
+    def _on_training_start(self) -> None:
+        self.steps_at_save = self.model.num_timesteps
+        self.saved_at = self.started = time.monotonic()
+
+    def _on_rollout_start(self) -> None:
+        if not getattr(self.model, "tells_safe_moments", False):
+            self._act()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _act(self) -> None:
+        if self.state is not None:
+            state, self.state = self.state, None
+            self._go_back_to(state)
+        elif self._is_due():
+            self.save()
+        self.n_rollouts += 1
+
+    def _is_due(self) -> bool:
+        if self.is_off:
+            return False
+        if self.interval.steps > 0:
+            return self.model.num_timesteps - self.steps_at_save >= self.interval.steps
+        return time.monotonic() - self.saved_at >= self.pause
+
+    def save(self) -> None:
+        """Save the state as it is, which must be a moment between two updates."""
+        begun = time.monotonic()
+        try:
+            self._write()
+        except NotRecordableError as error:
+            self._give_up(f"no state can be kept: {one_line(error)}")
+        except UserError as error:
+            self._give_up(f"no state can be kept: {error}")
+        except OSError as error:
+            self.tell(f"no state was saved: {self.run.state_path}: {error.strerror}")
+        self.saved_at = time.monotonic()
+        self.steps_at_save = self.model.num_timesteps
+        if self.interval.seconds == 0:
+            self.pause = max((self.saved_at - begun) / SHARE_OF_TIME, SHORTEST_INTERVAL)
+
+    def _give_up(self, reason: str) -> None:
+        self.is_off = True
+        self.tell(f"{reason}; if this run is cut off, --resume begins it anew")
+
+    def _write(self) -> None:
+        environment = self.training_env.unwrapped
+        if isinstance(environment, SubprocVecEnv):
+            raise NotRecordableError("--vec-env subproc", "environments are in other processes")
+        snapshot = record(self._roots(), _CONSTANTS)
+        note = {
+            "folder": self._folder_names(),
+            "log_folder": _log_folder(self.model),
+            "files": log_positions(self.run.path, _log_folder(self.model)),
+            "steps": self.model.num_timesteps,
+            "rollouts": self.n_rollouts,
+            "seconds": self.seconds,
+        }
+        save_state(self.run.state_path, self.n_saved + 1, snapshot, note)
+        self.n_saved += 1
+
+    def _roots(self) -> dict[str, Any]:
+        logger = self.model.logger
+        pending = [logger.name_to_value, logger.name_to_count, logger.name_to_excluded]
+        return {
+            "model": self.model,
+            "callbacks": self.root,
+            "pending": pending,
+            "generators": generator_states(),
+        }
+
+    def _go_back_to(self, state: SavedState) -> None:
+        roots = self._roots()
+        moved = dict(zip(state.note["folder"], self._folder_names(), strict=True))
+        try:
+            restore(state.snapshot, roots, moved)
+        except NotRestorableError as error:
+            raise UserError(
+                f"{self.run.state_path} does not fit what its settings make today: {error}"
+            ) from error
+        set_generators(roots["generators"])
+        self.steps_at_save = self.model.num_timesteps
+        self.saved_at = time.monotonic()
+
+    def _folder_names(self) -> list[str]:
+        """The run folder as it was given, and from the root."""
+        return [str(self.run.path), str(self.run.path.absolute())]
+
+
+def _log_folder(model: BaseAlgorithm) -> str | None:
+    folder = model.logger.dir
+    return None if folder is None else str(Path(folder).absolute())
+
+
+# What is made anew from the settings, and holds nothing that training changes.
+_CONSTANTS = (KVWriter, Logger, ExactEvaluator, ProgressDisplay, Run, StateSaver)

@@ -1,0 +1,156 @@
+"""Runs that were cut off: which there are, and what is needed to go on with one."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import UserError
+from pipeline.file_digests import RECORD, DamagedFileError
+from pipeline.resuming.log_positions import cut_back, remove_events
+from pipeline.resuming.state_folder import has_state, newest_state, remove_states
+from pipeline.resuming.state_saver import StateKeeping
+from pipeline.run_folder import FINISHED, Run, environment_name, numbered_runs
+from pipeline.run_record import recorded_versions
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec, completed
+from pipeline.user_modules import UserModule
+
+# What may be given anew, and what stands in no settings of a run.
+_SHOWN_ONLY = ("verbose", "progress", "log_folder", "gym_packages", "user_modules", "unique_id")
+
+
+def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
+    """The newest run of an agent on an environment that is not finished.
+
+    Raises:
+        UserError: if there is none.
+    """
+    name = environment_name(env_id)
+    runs = [Run(path, name) for _, path in numbered_runs(log_folder / algo, name)]
+    for run in reversed(runs):
+        if _may_go_on(run):
+            return run
+    there = f"all {len(runs)} are finished" if runs else "there is none at all"
+    raise UserError(f"no run of {algo} on {name} in {log_folder} was cut off: {there}")
+
+
+def run_of_spec(spec: TrainSpec, any_seed: bool) -> Run | None:
+    """The newest run of the very same settings, finished or not; None where there is none.
+
+    Args:
+        spec: the settings.
+        any_seed: whether the seed does not matter.
+    """
+    name = environment_name(spec.env_id)
+    wanted = _settings(spec.as_data(), any_seed)
+    for _, path in reversed(numbered_runs(spec.log_folder / spec.algo, name)):
+        run = Run(path, name)
+        try:
+            recorded = run.recorded_spec()
+        except DamagedFileError:
+            continue
+        if recorded and _settings(completed(recorded), any_seed) == wanted:
+            return run
+    return None
+
+
+def is_finished(run: Run) -> bool:
+    """Whether a run came to its end.
+
+    Raises:
+        UserError: if ``run.json`` is damaged.
+    """
+    return run.read_info().get("state") == FINISHED
+
+
+def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
+    """What a run was asked to do.
+
+    Args:
+        run: the run folder.
+        modules: those of the user's that were typed again.
+
+    Raises:
+        UserError: if the folder does not say, or needs a module that was not typed.
+    """
+    recorded = run.recorded_spec()
+    if not recorded:
+        raise UserError(f"{run.path} does not say what it was asked for: it is no run of ours")
+    data, typed = completed(recorded), tuple(modules)
+    missing = [name for name in data["gym_packages"] if name not in {m.name for m in typed}]
+    if missing:
+        raise UserError(f"the run needs --gym-packages {' '.join(missing)}: type it again")
+    paths = ("tensorboard_log", "trained_agent")
+    given = {name: None if data[name] is None else Path(data[name]) for name in paths}
+    raw = data.pop("hyperparams")
+    spec = TrainSpec(
+        **{
+            **data,
+            **given,
+            "hyperparams": split(raw),
+            "saved_hyperparams": raw,
+            "log_folder": run.path.parent.parent,
+            "gym_packages": tuple(module.name for module in typed),
+            "user_modules": typed,
+        }
+    )
+    return replace(spec, verbose=1, progress=False)
+
+
+def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> StateKeeping:
+    """Put the files of a run back to where its newest state was, or to its beginning.
+
+    Args:
+        run: the run folder.
+        keeping: what becomes of states from now on.
+        tell: told in one line what will not be as it was.
+
+    Raises:
+        UserError: if its states are all damaged or another user's, or its files are gone.
+    """
+    _tell_versions(run, tell)
+    state = newest_state(run.state_path, tell) if has_state(run.state_path) else None
+    if state is None:
+        _empty(run)
+    else:
+        cut_back(run.path, state.note["log_folder"], state.note["files"])
+    return replace(keeping, state=state, goes_on=True)
+
+
+def _may_go_on(run: Run) -> bool:
+    try:
+        return bool(run.recorded_spec()) and not is_finished(run)
+    except DamagedFileError:
+        return False
+
+
+def _settings(spec: Mapping[str, Any], any_seed: bool) -> Any:
+    left_out = (*_SHOWN_ONLY, "seed") if any_seed else _SHOWN_ONLY
+    return json.loads(json.dumps({k: v for k, v in spec.items() if k not in left_out}))
+
+
+def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
+    before, now = run.read_info().get("versions") or {}, recorded_versions()
+    changed = [f"{name} {before[name]} -> {now[name]}" for name in now if before.get(name, now[name]) != now[name]]
+    if changed:
+        tell(f"the run began with other versions, so that its result may differ: {', '.join(changed)}")
+
+
+def _empty(run: Run) -> None:
+    """Remove what a run has left that saved no state, but for what it was asked for."""
+    remove_states(run.state_path)
+    logged = run.read_info().get("tensorboard")
+    if isinstance(logged, str):
+        remove_events(logged)
+    for path in run.path.iterdir():
+        if path.name in (RECORD, run.env_name):
+            continue
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            path.unlink(missing_ok=True)

@@ -1,0 +1,141 @@
+"""What a value is to a snapshot: data, a holder of data, code that stays, or none of these."""
+
+from __future__ import annotations
+
+import io
+import logging
+import pathlib
+import re
+import sys
+import threading
+import types
+import weakref
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch as th
+
+# Attributes that belong to one process, or to one moment; by the names of the classes.
+_LEFT_OUT = {
+    "stable_baselines3.common.callbacks.BaseCallback": ("locals", "globals"),
+    "stable_baselines3.common.vec_env.base_vec_env.VecEnvWrapper": ("class_attributes",),
+}
+
+_LOCKS = (type(threading.Lock()), type(threading.RLock()))
+
+# What stays as it was built: code, and what belongs to the process rather than to the state.
+_CONSTANT_TYPES = (
+    type,
+    types.FunctionType,
+    types.BuiltinFunctionType,
+    types.MethodType,
+    types.MethodWrapperType,
+    types.MethodDescriptorType,
+    types.WrapperDescriptorType,
+    types.ModuleType,
+    types.MappingProxyType,
+    types.GenericAlias,
+    property,
+    staticmethod,
+    classmethod,
+    pathlib.PurePath,
+    re.Pattern,
+    io.IOBase,
+    logging.Logger,
+    threading.Thread,
+    threading.Event,
+    weakref.ref,
+    np.dtype,
+    np.ufunc,
+    th.dtype,
+    th.device,
+    th.layout,
+    *_LOCKS,
+)
+# Compiled functions, windows and their clocks, writers of rows: made anew when they are needed.
+_CONSTANT_MODULES = ("numba", "llvmlite", "pygame", "_csv", "moviepy", "tensorboard", "rich")
+
+# What a network said last: made anew before it is looked at again.
+TRANSIENT_TYPES = (th.distributions.Distribution,)
+
+_POINTER = 8  # bytes
+
+
+class NotRecordableError(Exception):
+    """An object holds what a snapshot cannot keep.
+
+    Attributes:
+        place: where it is, as ``model.env.envs[0].world``.
+        reason: why.
+    """
+
+    def __init__(self, place: str, reason: str) -> None:
+        super().__init__(f"{place}: {reason}")
+        self.place, self.reason = place, reason
+
+
+def is_constant(value: Any, more: tuple[type, ...] = ()) -> bool:
+    """Whether a value stays as it was built.
+
+    Args:
+        value: any.
+        more: further types of which that is so.
+    """
+    kind = type(value)
+    top = kind.__module__.partition(".")[0]
+    return isinstance(value, _CONSTANT_TYPES) or isinstance(value, more) or top in _CONSTANT_MODULES
+
+
+def is_transient(value: Any) -> bool:
+    """Whether a value is not needed any more at the moments at which states are taken."""
+    return isinstance(value, TRANSIENT_TYPES)
+
+
+def left_out(kind: type) -> frozenset[str]:
+    """Names of the attributes of a class that no snapshot keeps.
+
+    A class names its own in an attribute ``not_in_snapshots``.
+    """
+    names: set[str] = set()
+    for base in kind.__mro__:
+        names.update(_LEFT_OUT.get(f"{base.__module__}.{base.__qualname__}", ()))
+        names.update(vars(base).get("not_in_snapshots", ()))
+    return frozenset(names)
+
+
+def slots(kind: type) -> Iterator[str]:
+    """The names of the slots of a class and those above it, as attributes are called."""
+    for base in kind.__mro__:
+        declared = vars(base).get("__slots__", ())
+        for name in [declared] if isinstance(declared, str) else declared:
+            if name in ("__dict__", "__weakref__"):
+                continue
+            private = name.startswith("__") and not name.endswith("__")
+            yield f"_{base.__name__.lstrip('_')}{name}" if private else name
+
+
+def hides_state(kind: type) -> bool:
+    """Whether objects of a class hold more than attributes, as those written in C do."""
+    # An object's head, its attributes' dictionary and its weak references, and a pointer a slot.
+    plain = object.__basicsize__ + 2 * _POINTER + _POINTER * sum(1 for _ in slots(kind))
+    return kind.__itemsize__ > 0 or kind.__basicsize__ > plain
+
+
+def name_of(value: Any) -> str:
+    """Module and qualified name of a class or a function; empty where it has none."""
+    module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
+    return f"{module}:{name}" if isinstance(module, str) and isinstance(name, str) else ""
+
+
+def find(name: str) -> Any:
+    """The class or function of that name, in a module that is there already; None if there is none.
+
+    Args:
+        name: as `name_of` has it.
+    """
+    module, _, path = name.partition(":")
+    found: Any = sys.modules.get(module)
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    return found if name_of(found) == name else None
