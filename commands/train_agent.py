@@ -15,14 +15,15 @@ from commands.flag_values import (
     filled,
 )
 from commands.parsing import (
-    INTERRUPT,
     MODULES_HELP,
     OneLineParser,
     as_called,
     command_line,
+    exit_code,
     program_name,
 )
 from commands.streams import go_on_unread
+from pipeline.stopping import StopRequest, stops_noticed
 
 EPILOG = """\
 examples:
@@ -135,6 +136,11 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
 
 def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
+    with stops_noticed() as stop:
+        return _train(stop)
+
+
+def _train(stop: StopRequest) -> int:
     args = build_parser().parse_args()
     if args.list:
         from commands.listing import print_lists
@@ -153,13 +159,17 @@ def main() -> int:
     go_on_unread()
     console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
     print_header(console, spec)
-    with doing(console, "loading the libraries") as activity:
-        from pipeline.run_folder import INTERRUPTED
-        from pipeline.training import carry_out, prepare
+    # What is called here says for itself where it can be stopped; between its parts a stop would
+    # leave a run folder that nobody works on.
+    with stop.held():
+        with doing(console, "loading the libraries") as activity:
+            with stop.waiting(0.0):
+                from pipeline.run_folder import INTERRUPTED
+                from pipeline.training import carry_out, prepare
 
-        activity.now("making the environments and the agent")
-        training = prepare(spec, console, vars(args), command_line())
-    print_refusal(console, training.refusal)
-    outcome = carry_out(training)
-    print_outcome(console, spec, outcome)
-    return INTERRUPT if outcome.state == INTERRUPTED else 0
+            activity.now("making the environments and the agent")
+            training = prepare(spec, console, vars(args), command_line())
+        print_refusal(console, training.refusal)
+        outcome = carry_out(training)
+        print_outcome(console, spec, outcome)
+    return exit_code(stop.number) if outcome.state == INTERRUPTED else 0

@@ -43,6 +43,7 @@ from pipeline.models.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.run_folder import Run, environment_name
+from pipeline.safe_moments import StopAtSafeMoment
 from pipeline.settings import components
 from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import (
@@ -53,6 +54,7 @@ from pipeline.settings.algorithm_kwargs import (
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.signs_of_life import can_move
 from pipeline.train_spec import TrainSpec
+from pipeline.worker_processes import close_environments, end_workers_after_stop
 
 EVALUATIONS_PER_RUN = 20
 
@@ -111,18 +113,19 @@ def set_up(
     spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
 ) -> Training:
     """Make all parts of the training, and add to ``undo`` how to remove them again."""
+    undo.callback(end_workers_after_stop)
     spec, env = _training_env(spec, run, undo)
     model = _make_model(spec, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
     n_eval_envs = min(spec.n_eval_envs, spec.eval_episodes) if takes_batches(model) else 1
     eval_env = make_evaluation_env(spec, n_eval_envs)
-    undo.callback(eval_env.close)
+    undo.callback(close_environments, eval_env)
     is_bandit = are_bandits(env)
     exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
-    callbacks = _named_callbacks(spec, run, model)
+    callbacks = [StopAtSafeMoment(), *_named_callbacks(spec, run, model)]
     pulls = _pull_recorder(model, run, console) if is_bandit else None
     if pulls is not None:
         callbacks.append(pulls)
@@ -158,7 +161,7 @@ def _training_env(spec: TrainSpec, run: Run, undo: ExitStack) -> tuple[TrainSpec
     if statistics is not None:
         spec = continuing(spec, statistics)
     env = make_training_env(spec, run.path)
-    undo.callback(env.close)
+    undo.callback(close_environments, env)
     if statistics is not None:
         take_over(env, statistics)
     return spec, env
