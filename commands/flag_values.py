@@ -10,6 +10,7 @@ from decimal import Decimal
 
 from pipeline.errors import shown
 from pipeline.files import portable_name
+from pipeline.resuming.state_keeping import SaveInterval
 
 LARGEST = 10**12
 LONGEST_FOLDER_NAME = 200  # bytes
@@ -101,6 +102,32 @@ def folder_name(text: str) -> str:
             f"must be a name that every system takes, not {shown(text)}"
         )
     return text
+
+
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0}
+
+
+def save_interval(text: str) -> SaveInterval:
+    """How often to save a state: ``30s``, ``5m``, ``5000`` steps, ``auto`` or ``never``.
+
+    Raises:
+        argparse.ArgumentTypeError: for any other text.
+    """
+    if text in ("auto", "never"):
+        return SaveInterval(is_off=text == "never")
+    number, unit = (text[:-1], text[-1]) if text[-1:] in _UNITS else (text, "")
+    if unit:
+        try:
+            seconds = float(number) * _UNITS[unit]
+        except ValueError:
+            seconds = math.nan
+        if 0 < seconds < math.inf:
+            return SaveInterval(seconds=seconds)
+    elif (steps := _whole(text)) is not None and 1 <= steps <= LARGEST:
+        return SaveInterval(steps=steps)
+    raise argparse.ArgumentTypeError(
+        f"must be seconds as 30s, minutes as 5m, steps as 5000, auto or never, not {shown(text)}"
+    )
 
 
 COUNT = whole_number(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Any
 
 from commands.flag_values import (
     BUDGET,
@@ -13,16 +14,21 @@ from commands.flag_values import (
     THREADS,
     VERBOSITY,
     filled,
+    save_interval,
 )
 from commands.parsing import (
-    INTERRUPT,
     MODULES_HELP,
     OneLineParser,
     as_called,
     command_line,
+    exit_code,
     program_name,
 )
 from commands.streams import go_on_unread
+from pipeline.stopping import StopRequest, stops_noticed
+
+# The flags of a run that was cut off, by the names of their values.
+RESUMING = ("resume", "resume_or_start", "save_state_every", "keep_state")
 
 EPILOG = """\
 examples:
@@ -30,6 +36,7 @@ examples:
   python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
   python train.py --env CartPole-v1 --algo dqn -params learning_rate:1e-3 buffer_size:50000
   python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
+  python train.py --resume logs/ppo/Warehouse-v0_3
   python train.py --list
 """
 
@@ -48,7 +55,36 @@ def build_parser() -> argparse.ArgumentParser:
     add("--list", action="store_true", help="list agents and environments, and which fit which")
     _add_training_flags(parser)
     _add_output_flags(parser)
+    _add_resuming_flags(parser)
     return parser
+
+
+def _add_resuming_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("a run that was cut off").add_argument
+    add(
+        "--resume",
+        nargs="?",
+        const="",
+        metavar="RUN",
+        help="go on with this run folder, or with the newest of --algo and --env that is not "
+        "finished, to the result that it would have had undisturbed; budget, seed and settings "
+        "are the run's",
+    )
+    add(
+        "--resume-or-start",
+        action="store_true",
+        help="go on with the newest run of these very settings, begin one where there is none, and "
+        "do nothing where it is finished: for scripts that a queue starts again",
+    )
+    add(
+        "--save-state-every",
+        type=save_interval,
+        default="auto",
+        metavar="N",
+        help="save what to go on from every so often: 30s, 5m, 5000 (steps), never, or auto, "
+        "which takes about 2%% of the time (default)",
+    )
+    add("--keep-state", action="store_true", help="leave it in the folder of a finished run")
 
 
 def _add_training_flags(parser: argparse.ArgumentParser) -> None:
@@ -135,6 +171,11 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
 
 def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
+    with stops_noticed() as stop:
+        return _train(stop)
+
+
+def _train(stop: StopRequest) -> int:
     args = build_parser().parse_args()
     if args.list:
         from commands.listing import print_lists
@@ -143,9 +184,19 @@ def main() -> int:
         import_typed(args.gym_packages)
         print_lists()
         return 0
+    if args.resume is not None:
+        from commands.resume_training import resume_run
+
+        return resume_run(args, stop)
     from commands.train_request import train_spec
 
     spec = train_spec(args)
+    if args.resume_or_start:
+        from commands.resume_training import resume_same
+
+        code = resume_same(args, spec, stop)
+        if code is not None:
+            return code
     from commands.run_output import print_header, print_outcome, print_refusal
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
@@ -153,13 +204,24 @@ def main() -> int:
     go_on_unread()
     console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
     print_header(console, spec)
-    with doing(console, "loading the libraries") as activity:
-        from pipeline.run_folder import INTERRUPTED
-        from pipeline.training import carry_out, prepare
+    # What is called here says for itself where it can be stopped; between its parts a stop would
+    # leave a run folder that nobody works on.
+    with stop.held():
+        with doing(console, "loading the libraries") as activity:
+            with stop.waiting(0.0):
+                from pipeline.resuming.state_keeping import StateKeeping
+                from pipeline.run_folder import INTERRUPTED
+                from pipeline.training import carry_out, prepare
 
-        activity.now("making the environments and the agent")
-        training = prepare(spec, console, vars(args), command_line())
-    print_refusal(console, training.refusal)
-    outcome = carry_out(training)
-    print_outcome(console, spec, outcome)
-    return INTERRUPT if outcome.state == INTERRUPTED else 0
+            activity.now("making the environments and the agent")
+            keeping = StateKeeping(args.save_state_every, stays=args.keep_state)
+            training = prepare(spec, console, _recorded(args), command_line(), keeping=keeping)
+        print_refusal(console, training.refusal)
+        outcome = carry_out(training)
+        print_outcome(console, spec, outcome)
+    return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
+
+
+def _recorded(args: argparse.Namespace) -> dict[str, Any]:
+    """The arguments as a run folder keeps them; what goes on is no matter of the run's."""
+    return {name: value for name, value in vars(args).items() if name not in RESUMING}

@@ -17,6 +17,7 @@ from stable_baselines3.common.utils import ConstantSchedule
 from agents.common.callback_horizons import BlockCallback, Horizon
 from pipeline.models.companions import replay_buffer_path, statistics_path
 from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
+from pipeline.stopping import current
 
 
 class Checkpoint(BlockCallback):
@@ -37,10 +38,11 @@ class Checkpoint(BlockCallback):
     def save(self) -> None:
         """Write the agent as it is now."""
         path = self.save_path / f"rl_model_{self.num_timesteps}_steps.zip"
-        save_model(self.model, path)
-        save_normalization(self.model, statistics_path(path))
-        if self.with_replay_buffer:
-            save_replay_buffer(self.model, replay_buffer_path(path))
+        with current().held():
+            save_model(self.model, path)
+            save_normalization(self.model, statistics_path(path))
+            if self.with_replay_buffer:
+                save_replay_buffer(self.model, replay_buffer_path(path))
 
 
 class StepCheckpoint(Checkpoint):

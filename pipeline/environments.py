@@ -22,6 +22,7 @@ from pipeline.errors import UserError, one_line, shown, unknown
 from pipeline.memory_limits import check_environments, check_frame_stack
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
+from pipeline.worker_processes import shield_workers
 
 # Where neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
 # policy that runs in a circle would never end.
@@ -211,6 +212,8 @@ def _make_vec_env(
 
     check_environments(n_envs, spec.env_id)
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
+    if training and spec.vec_env == "subproc":
+        shield_workers()
 
     def make(**given: Any) -> gym.Env[Any, Any]:
         import_again(spec.user_modules)  # this may be another process

@@ -18,6 +18,7 @@ from pipeline.files import replacing
 from pipeline.models.companions import statistics_path
 from pipeline.models.model_saving import save_model, save_normalization
 from pipeline.run_folder import Run
+from pipeline.stopping import current
 
 
 class EvaluationCallback(EvalCallback):
@@ -106,8 +107,9 @@ class EvaluationCallback(EvalCallback):
             self.best_mean_reward = evaluation.mean_return
             self.best_timesteps = self.num_timesteps
             best = self.run.best_model_path
-            save_model(self.model, best)
-            save_normalization(self.model, statistics_path(best))
+            with current().held():
+                save_model(self.model, best)
+                save_normalization(self.model, statistics_path(best))
         return self._on_event() if self.callback is not None else True
 
     def take_statistics(self) -> None:

@@ -18,6 +18,8 @@ from typing import Any
 LONGEST_NAME = 100  # bytes
 
 _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
+# What `replacing` writes to.
+_DRAFT = re.compile(r"\..+\.[0-9a-f]{16}\.tmp", re.DOTALL)
 _DEVICE = re.compile(r"(con|prn|aux|nul|(con(in|out)\$)|(com|lpt)[0-9¹²³]) *(\.|$)", re.IGNORECASE)
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
@@ -70,6 +72,11 @@ def replacing(path: Path) -> Iterator[Path]:
         put_in_place(draft, path)
     finally:
         draft.unlink(missing_ok=True)
+
+
+def drafts_in(folder: Path) -> list[Path]:
+    """The files in a folder, and in those inside it, that `replacing` has begun to write."""
+    return [path for path in folder.rglob(".*.tmp") if _DRAFT.fullmatch(path.name)]
 
 
 def write_text(path: Path, text: str) -> None:

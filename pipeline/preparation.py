@@ -43,8 +43,10 @@ from pipeline.models.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.resuming.resumed_logging import resumed_logger
-from pipeline.resuming.state_saver import StateKeeping, StateSaver
+from pipeline.resuming.state_keeping import StateKeeping
+from pipeline.resuming.state_saver import StateSaver
 from pipeline.run_folder import Run, environment_name
+from pipeline.safe_moments import StopAtSafeMoment
 from pipeline.settings import components
 from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import (
@@ -55,6 +57,7 @@ from pipeline.settings.algorithm_kwargs import (
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.signs_of_life import can_move
 from pipeline.train_spec import TrainSpec
+from pipeline.worker_processes import close_environments, end_workers_after_stop
 
 EVALUATIONS_PER_RUN = 20
 
@@ -122,6 +125,7 @@ def set_up(
     keeping: StateKeeping,
 ) -> Training:
     """Make all parts of the training, and add to ``undo`` how to remove them again."""
+    undo.callback(end_workers_after_stop)
     spec, env = _training_env(spec, run, undo, appends=keeping.state is not None)
     model = _make_model(spec, env, kwargs)
     if is_unread(spec):
@@ -130,7 +134,7 @@ def set_up(
         model.set_logger(resumed_logger(model, keeping.state.note))
     n_eval_envs = min(spec.n_eval_envs, spec.eval_episodes) if takes_batches(model) else 1
     eval_env = make_evaluation_env(spec, n_eval_envs)
-    undo.callback(eval_env.close)
+    undo.callback(close_environments, eval_env)
     is_bandit = are_bandits(env)
     exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
@@ -192,7 +196,7 @@ def _training_env(
     if statistics is not None:
         spec = continuing(spec, statistics)
     env = make_training_env(appending(spec) if appends else spec, run.path)
-    undo.callback(env.close)
+    undo.callback(close_environments, env)
     if statistics is not None:
         take_over(env, statistics)
     return spec, env

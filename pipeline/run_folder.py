@@ -6,15 +6,26 @@ The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, so that its to
 
 from __future__ import annotations
 
+import errno
 import re
+import secrets
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.file_digests import FIELD, RECORD, STATE_FOLDER, RecordedFiles, digests_of, read_record, sealed
-from pipeline.files import portable_name, write_json
+from pipeline.file_digests import (
+    FIELD,
+    RECORD,
+    STATE_FOLDER,
+    RecordedFiles,
+    digests_of,
+    read_record,
+    sealed,
+)
+from pipeline.files import drafts_in, portable_name, write_json
+from pipeline.liveness import is_alive, mark
 
 RUNNING = "running"
 FINISHED = "finished"
@@ -25,6 +36,7 @@ FAILED = "failed"
 OUTCOME = (
     "state",
     "reason",
+    "stopped_by",
     "n_timesteps",
     "seconds",
     "final",
@@ -35,6 +47,10 @@ OUTCOME = (
     "pulls",
     FIELD,
 )
+# The field of ``run.json`` that says, while a run is running, which process is at work on it.
+PROCESS = "process"
+
+_TAKEN = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
 
 class NoRunError(UserError):
@@ -72,27 +88,25 @@ class Run:
     def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
         """Make the folder of a new run, with the first number that is free.
 
+        It says from its first moment on which process is at work on it.
+
         Raises:
             UserError: if the folder cannot be made.
         """
         name = environment_name(env_id)
         parent = log_folder / algo
+        draft = cls(parent / f".{name}.{secrets.token_hex(8)}.tmp", name)
         try:
-            parent.mkdir(parents=True, exist_ok=True)
+            draft.params_path.mkdir(parents=True)
+            draft.update_info(state=RUNNING)
             number = max((n for n, _ in numbered_runs(parent, name)), default=0) + 1
-            while True:
-                path = parent / f"{name}_{number}{suffix}"
-                try:
-                    # Making the folder is what claims the number: two runs never share one.
-                    path.mkdir()
-                    break
-                except FileExistsError:
-                    number += 1
-            run = cls(path, name)
-            run.params_path.mkdir()
+            # Renaming is what claims the number: two runs never share one.
+            while not _renamed(draft.path, path := parent / f"{name}_{number}{suffix}"):
+                number += 1
         except OSError as error:
+            draft.discard()
             raise UserError(f"cannot make a run folder in {parent}: {error.strerror}") from error
-        return run
+        return cls(path, name)
 
     @classmethod
     def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
@@ -202,6 +216,19 @@ class Run:
         except FileNotFoundError:
             return {}
 
+    @property
+    def state(self) -> str | None:
+        """What became of the run: one whose process is gone before its end was interrupted.
+
+        Raises:
+            UserError: if ``run.json`` is damaged.
+        """
+        info = self.read_info()
+        state = info.get("state")
+        if state == RUNNING and is_alive(info.get(PROCESS)) is False:
+            return INTERRUPTED
+        return state if isinstance(state, str) else None
+
     def recorded_spec(self) -> dict[str, Any]:
         """What ``run.json`` says was asked for; empty where it says nothing.
 
@@ -212,16 +239,22 @@ class Run:
         return spec if isinstance(spec, dict) else {}
 
     def update_info(self, **fields: Any) -> None:
-        """Set fields of ``run.json``."""
-        write_json(self.info_path, sealed({**self.read_info(), **fields}))
+        """Set fields of ``run.json``, which names this process while the run is running."""
+        info = {**self.read_info(), **fields}
+        info.pop(PROCESS, None)
+        if info.get("state") == RUNNING:
+            info[PROCESS] = mark()
+        write_json(self.info_path, sealed(info))
 
     def reopen(self) -> None:
         """Take out of ``run.json`` what came out so far: the run goes on."""
         info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
-        write_json(self.info_path, {**info, "state": RUNNING})
+        write_json(self.info_path, {**info, "state": RUNNING, PROCESS: mark()})
 
     def end(self, **fields: Any) -> None:
         """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
+        for draft in drafts_in(self.path):  # of a file that was not to be finished any more
+            draft.unlink(missing_ok=True)
         self.update_info(**fields, **{FIELD: digests_of(self.path)})
 
     @property
@@ -241,6 +274,17 @@ class Run:
                 folder.rmdir()
             except OSError:
                 return
+
+
+def _renamed(draft: Path, path: Path) -> bool:
+    """Rename a folder that holds something, unless something has the name already."""
+    try:
+        draft.rename(path)
+    except OSError as error:
+        if error.errno not in _TAKEN:
+            raise
+        return False
+    return True
 
 
 def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:

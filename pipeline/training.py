@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from signal import Signals
 from typing import Any
 from uuid import uuid4
 
@@ -14,28 +15,29 @@ from rich.console import Console
 
 from mdp.machine_code import compile_timer
 from pipeline.errors import UserError, one_line
-from pipeline.evaluation.exact import ExactEvaluator
-from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
-from pipeline.evaluation.value_maps import value_map
-from pipeline.models.companions import final_replay_buffer_path
-from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
-from pipeline.pictures.learning_curve import draw_learning_curve
-from pipeline.pictures.pull_curve import draw_pulls
-from pipeline.pictures.value_map import draw_value_map
+from pipeline.evaluation.sampled import Evaluation
+from pipeline.finishing import draw, judge, save
+from pipeline.leftovers import remove_leftovers
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
-from pipeline.pull_recording import PullSummary, summarise_pulls
+from pipeline.pull_recording import PullSummary
 from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
 from pipeline.resuming.state_folder import remove_states
-from pipeline.resuming.state_saver import StateKeeping
+from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.run_record import recorded_versions, write_arguments, write_settings
 from pipeline.signs_of_life import Activity, doing
+from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
+from pipeline.worker_processes import close_environments
 
-FINAL_EVALUATION_EPISODES = 100
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
 NEW = StateKeeping()
+
+# After a signal that asks to stop: how long the training may go on to where nothing is half done,
+# and when evaluating and drawing what was learnt has to be over.
+SECONDS_TO_A_SAFE_MOMENT = 1.0
+SECONDS_TO_THE_PICTURES = 1.6
 
 
 @dataclass(frozen=True)
@@ -98,17 +100,23 @@ def prepare(
 
     Raises:
         UserError: if the spec does not work out; no folder is left behind then.
+        Stopped: if a signal asks for it, likewise.
     """
     if spec.num_threads > 0:
         th.set_num_threads(spec.num_threads)
-    kwargs = algorithm_kwargs(spec)
+    stop = current()
+    with stop.waiting(0.0):
+        kwargs = algorithm_kwargs(spec)
+        if run is None:
+            remove_leftovers(spec.log_folder, spec.algo, spec.env_id)
     suffix = f"_{uuid4()}" if spec.unique_id else ""
-    if run is None:
-        run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
-    with ExitStack() as undo, _library_errors_in_one_line():
+    with stop.held(), ExitStack() as undo, _library_errors_in_one_line():
+        if run is None:
+            run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
         if not keeping.goes_on:
             undo.callback(run.discard)
-        training = set_up(spec, run, kwargs, console, undo, keeping)
+        with stop.waiting(0.0):
+            training = set_up(spec, run, kwargs, console, undo, keeping)
         spec = training.spec  # with what an agent that goes on has brought along
         if keeping.goes_on:
             run.reopen()
@@ -123,6 +131,7 @@ def prepare(
             versions=recorded_versions(),
             **({} if training.refusal is None else {"model_refused": training.refusal}),
         )
+        stop.raise_if_asked()
         undo.pop_all()
     return training
 
@@ -139,36 +148,52 @@ def _library_errors_in_one_line() -> Iterator[None]:
 def carry_out(training: Training) -> Outcome:
     """Train, and save, judge and draw what was learnt.
 
-    Ctrl-C ends the training early; what was learnt until then is saved all the same.
+    Ctrl-C ends the training early, and so do the other signals that `pipeline.stopping` notices;
+    what was learnt until then is saved all the same.
 
     Raises:
         UserError: if the agent finds at its first step that it cannot work so; no folder is left
             behind then.
+        KeyboardInterrupt: if it is stopped before that step, likewise.
     """
     model = training.model
+    with current().held():
+        try:
+            return _train_and_finish(training)
+        except BaseException as error:
+            _give_up(training, error)
+            raise
+        finally:
+            if hasattr(model, "_logger"):
+                model.logger.close()
+            close_environments(training.eval_env)
+            if model.env is not None:
+                close_environments(model.env)
+
+
+def _train_and_finish(training: Training) -> Outcome:
     started = time.monotonic()
     state = FINISHED
-    try:
-        with compile_timer() as seconds_compiling:
-            try:
+    with compile_timer() as seconds_compiling:
+        try:
+            with current().waiting(SECONDS_TO_A_SAFE_MOMENT):
                 _learn(training)
-            except KeyboardInterrupt:
-                state = INTERRUPTED
-            finally:
-                training.display.close()
-            seconds = time.monotonic() - started - seconds_compiling()
-        seconds += training.saver.seconds_before
-        with doing(training.display.console, "saving what was learnt") as activity:
-            return _finish(training, state, seconds, activity)
-    except BaseException as error:
-        _give_up(training, error)
-        raise
-    finally:
-        training.eval_env.close()
-        if hasattr(model, "_logger"):
-            model.logger.close()
-        if model.env is not None:
-            model.env.close()
+        except KeyboardInterrupt:
+            if not _has_begun(training):
+                raise
+            state = INTERRUPTED
+        finally:
+            training.display.close()
+        seconds = time.monotonic() - started - seconds_compiling()
+    seconds += training.saver.seconds_before
+    with doing(training.display.console, "saving what was learnt") as activity:
+        return _finish(training, state, seconds, activity)
+
+
+def _has_begun(training: Training) -> bool:
+    """Whether there is something that was learnt, by this process or the ones before it."""
+    model, is_back = training.model, training.saver.state is None
+    return is_back and model.num_timesteps > model._num_timesteps_at_start
 
 
 def _give_up(training: Training, error: BaseException) -> None:
@@ -177,15 +202,18 @@ def _give_up(training: Training, error: BaseException) -> None:
     Raises:
         UserError: in that case, where the agent's settings are at fault.
     """
-    run, model = training.run, training.model
-    has_begun = training.keeping.goes_on or model.num_timesteps > model._num_timesteps_at_start
-    if isinstance(error, ValueError | OSError) and not has_begun:
+    run = training.run
+    has_begun = training.keeping.goes_on or _has_begun(training)
+    if isinstance(error, ValueError | OSError | KeyboardInterrupt) and not has_begun:
         run.discard()
-        if isinstance(error, OSError):  # says for itself which file it was
+        if not isinstance(error, ValueError):  # an OSError says for itself which file it was
             return
         message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
         raise UserError(message) from error
-    run.update_info(state=FAILED, reason=one_line(error))
+    if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
+        run.update_info(state=INTERRUPTED)
+    else:
+        run.update_info(state=FAILED, reason=one_line(error))
 
 
 def _learn(training: Training) -> None:
@@ -211,24 +239,16 @@ def _learn(training: Training) -> None:
 def _finish(training: Training, state: str, seconds: float, activity: Activity) -> Outcome:
     """Save what was learnt, judge it, draw it; ``run.json`` says so when all else is there."""
     run, model, evaluation = training.run, training.model, training.evaluation
-    save_model(model, run.model_path)
-    save_normalization(model, run.vecnormalize_path)
-    if training.spec.save_replay_buffer:
-        save_replay_buffer(model, final_replay_buffer_path(run.path))
-    activity.now("evaluating the final policy")
-    if evaluation.is_asked_for and not evaluation.evaluations_timesteps:
-        # The run was shorter than the time to its first evaluation, or called no callback.
-        evaluation.init_callback(model)
-        evaluation.evaluate_now()
-    final = _final_evaluation(training) if state == FINISHED else None
-    title = f"{training.spec.algo} on {run.env_name}, seed {training.spec.seed}"
-    activity.now("drawing the pictures")
-    pulls = _keep_pulls(training, state, title)
-    if training.spec.pictures and (pulls is None or evaluation.evaluations_timesteps):
-        yardstick = None if final is None else final.yardstick
-        first_step, on_variant = model._num_timesteps_at_start, training.display.on_variant
-        draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
-    _keep_value_map(training, title)
+    pulls = save(training, state)
+    final: Evaluation | None = None
+    try:
+        with current().waiting(SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0):
+            activity.now("evaluating the final policy")
+            final = judge(training, state)
+            activity.now("drawing the pictures")
+            draw(training, final)
+    except KeyboardInterrupt:
+        state = INTERRUPTED
     outcome = Outcome(
         run,
         state,
@@ -248,7 +268,7 @@ def _finish(training: Training, state: str, seconds: float, activity: Activity) 
 
 def _record(outcome: Outcome) -> None:
     """Write what came out into ``run.json``, the last file of a run."""
-    pulls = outcome.pulls
+    pulls, number = outcome.pulls, current().number
     outcome.run.end(
         state=outcome.state,
         n_timesteps=outcome.n_steps,
@@ -257,45 +277,6 @@ def _record(outcome: Outcome) -> None:
         best_mean_return=outcome.best_return,
         best_timesteps=outcome.best_timesteps,
         engine=outcome.engine,
+        **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),
         **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
-    )
-
-
-def _keep_pulls(training: Training, state: str, title: str) -> PullSummary | None:
-    """Sum up and draw the pulls, on bandits."""
-    recorder = training.pulls
-    if recorder is None or not recorder.n_calls:
-        return None
-    if state == INTERRUPTED:
-        recorder.write()  # as it does by itself where the training was not interrupted
-    arrays = recorder.arrays()
-    if training.spec.pictures:
-        draw_pulls(training.run.pulls_picture_path, title, arrays)
-    return summarise_pulls(arrays)
-
-
-def _keep_value_map(training: Training, title: str) -> None:
-    """Record and draw the final policy, where evaluation is on and knows a map."""
-    model, maps = training.model, training.evaluation.value_maps
-    if maps is None or not training.evaluation.is_asked_for:
-        return
-    maps.finish(model, model.num_timesteps)
-    found = value_map(maps.evaluator, model) if training.spec.pictures else None
-    if found is not None:
-        draw_value_map(training.run.value_map_path, title, found)
-
-
-def _final_evaluation(training: Training) -> Evaluation | None:
-    """Exact, or by episodes that were used for nothing else; none where evaluation is off."""
-    evaluator = training.evaluation.evaluator
-    if not training.evaluation.is_asked_for:
-        return None
-    training.evaluation.take_statistics()
-    if isinstance(evaluator, ExactEvaluator):
-        return evaluator(training.model)
-    return evaluate(
-        training.model,
-        training.eval_env,
-        FINAL_EVALUATION_EPISODES,
-        evaluation_seed(training.spec.seed, 2),
     )

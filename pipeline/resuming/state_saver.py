@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +12,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from agents.common.callback_horizons import BlockCallback, Horizon
+from agents.common.callback_horizons import Horizon
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
 from pipeline.resuming.log_positions import log_positions
+from pipeline.resuming.state_keeping import SaveInterval
 from pipeline.resuming.state_folder import SavedState, save_state
 from pipeline.run_folder import Run
+from pipeline.safe_moments import StopAtSafeMoment
+from pipeline.stopping import current
 from snapshots.kinds import NotRecordableError
 from snapshots.recording import record
 from snapshots.restoring import NotRestorableError, restore
@@ -30,39 +32,7 @@ SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
 
 
-@dataclass(frozen=True)
-class SaveInterval:
-    """How often to save the state.
-
-    Attributes:
-        seconds: between two states; 0 for as often as takes `SHARE_OF_TIME`.
-        steps: environment steps between them instead, counted over all environments; or 0.
-        is_off: to save none.
-    """
-
-    seconds: float = 0.0
-    steps: int = 0
-    is_off: bool = False
-
-
-@dataclass(frozen=True)
-class StateKeeping:
-    """What becomes of a training's state.
-
-    Attributes:
-        interval: how often it is saved.
-        state: what the training goes on from; None where it begins.
-        goes_on: whether the run folder is an earlier process's, also where that left no state.
-        stays: whether states are still there when the run is finished.
-    """
-
-    interval: SaveInterval = SaveInterval()
-    state: SavedState | None = None
-    goes_on: bool = False
-    stays: bool = False
-
-
-class StateSaver(BlockCallback):
+class StateSaver(StopAtSafeMoment):
     """Saves all that a training consists of, between two updates; the first of the callbacks.
 
     The state is that of the agent with its environments, of all other callbacks with the
@@ -110,11 +80,16 @@ class StateSaver(BlockCallback):
         return Horizon(calls=max(-(-steps // self.training_env.num_envs), 1))
 
     def wants_position(self) -> bool:
-        return self.state is not None or self._is_due()
+        return self.state is not None or self._is_due() or current().number is not None
 
     def at_safe_moment(self) -> None:
         if getattr(self.model, "tells_safe_moments", False):
             self._act()
+
+    def before_stopping(self) -> None:
+        """Save the state that the run is to go on from, unless a second signal is in a hurry."""
+        if not (self.is_off or current().is_urgent):
+            self.save()
 
     def _on_training_start(self) -> None:
         self.steps_at_save = self.model.num_timesteps
@@ -133,6 +108,7 @@ class StateSaver(BlockCallback):
             self._go_back_to(state)
         elif self._is_due():
             self.save()
+        self.stop_if_asked()
         self.n_rollouts += 1
 
     def _is_due(self) -> bool:

@@ -13,7 +13,7 @@ from pipeline.errors import UserError
 from pipeline.file_digests import RECORD, DamagedFileError
 from pipeline.resuming.log_positions import cut_back, remove_events
 from pipeline.resuming.state_folder import has_state, newest_state, remove_states
-from pipeline.resuming.state_saver import StateKeeping
+from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_folder import FINISHED, Run, environment_name, numbered_runs
 from pipeline.run_record import recorded_versions
 from pipeline.settings.hyperparams import split

@@ -130,7 +130,7 @@ def test_the_end_is_judged_on_the_statistics_of_the_end(tmp_path, monkeypatch):
         judged.append(round(env.obs_rms.count))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pipeline.training.evaluate", note)
+    monkeypatch.setattr("pipeline.finishing.evaluate", note)
     with pytest.raises(KeyboardInterrupt):
         train_to(tmp_path, "a2c", {**A2C, "normalize": True}, eval_freq=80)
     assert judged == [202]

@@ -1,0 +1,137 @@
+"""``train --resume`` and ``--resume-or-start``: going on with a run that was cut off."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from commands.parsing import command_line, exit_code
+from pipeline.errors import UserError
+from pipeline.run_folder import Run
+from pipeline.stopping import StopRequest
+from pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from pipeline.preparation import Training
+
+# What may be given beside --resume: how it is shown, kept and imported, and not what is done.
+_MAY_BE_GIVEN = (
+    "resume",
+    "save_state_every",
+    "keep_state",
+    "log_folder",
+    "gym_packages",
+    "verbose",
+    "progress",
+    "list",
+)
+
+
+def resume_run(args: argparse.Namespace, stop: StopRequest) -> int:
+    """Go on with the run that the arguments name; the exit code.
+
+    Raises:
+        UserError: if there is none, it cannot go on, or another process is at work on it.
+    """
+    _check_given(args)
+    from pipeline.models.recorded_runs import run_in
+    from pipeline.resuming.unfinished_runs import newest_unfinished, recorded_training
+    from pipeline.user_modules import import_typed
+
+    if args.resume:
+        path = Path(args.resume)
+        if not path.is_dir():
+            raise UserError(f"{path}: there is no such run folder")
+        run = run_in(path)
+    else:
+        run = newest_unfinished(Path(args.log_folder), args.algo, args.env)
+    modules = import_typed(args.gym_packages)
+    return _go_on(args, run, recorded_training(run, modules), stop)
+
+
+def resume_same(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int | None:
+    """Go on with the newest run of the very same settings; the exit code, or None without one.
+
+    Raises:
+        UserError: if it cannot go on, or another process is at work on it.
+    """
+    from pipeline.resuming.unfinished_runs import recorded_training, run_of_spec
+
+    run = run_of_spec(spec, any_seed=args.seed < 0)
+    if run is None:
+        return None
+    return _go_on(args, run, recorded_training(run, spec.user_modules), stop)
+
+
+def _check_given(args: argparse.Namespace) -> None:
+    """Refuse what stands in the run folder already.
+
+    Raises:
+        UserError: naming the flag.
+    """
+    from commands.train_agent import build_parser
+
+    parser = build_parser()
+    allowed = {*_MAY_BE_GIVEN, *(() if args.resume else ("algo", "env"))}
+    for action in parser._actions:
+        given = getattr(args, action.dest, action.default)
+        if action.dest not in allowed and given != action.default:
+            flag = action.option_strings[-1]
+            raise UserError(f"{flag} cannot be given with --resume: it is as the run has it")
+
+
+def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
+    from commands.run_output import print_header, print_outcome
+    from commands.streams import go_on_unread
+    from commands.terminal import TextConsole
+    from pipeline.resuming.state_folder import remove_states
+    from pipeline.resuming.unfinished_runs import is_finished
+    from pipeline.signs_of_life import doing
+
+    spec = replace(spec, verbose=args.verbose, progress=args.progress)
+    go_on_unread()
+    console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
+    if is_finished(run):
+        if not args.keep_state:
+            remove_states(run.state_path)
+        console.print(f"{run.path} is finished already", markup=False, highlight=False)
+        return 0
+    print_header(console, spec)
+    with stop.held():
+        with doing(console, "loading the libraries") as activity:
+            with stop.waiting(0.0):
+                from pipeline.resuming.claims import claimed
+                from pipeline.run_folder import INTERRUPTED
+                from pipeline.training import carry_out
+
+            activity.now("making the environments and the agent")
+            lock = ExitStack()
+            lock.enter_context(claimed(run))
+        with lock:
+            outcome = carry_out(_prepared(args, run, spec, console))
+        print_outcome(console, spec, outcome)
+    return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
+
+
+def _prepared(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console) -> Training:
+    """The run, set up to go on from its newest state."""
+    from pipeline.resuming.state_keeping import StateKeeping
+    from pipeline.resuming.unfinished_runs import go_on
+    from pipeline.signs_of_life import doing
+    from pipeline.training import prepare
+
+    def say(line: str) -> None:
+        console.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+
+    with doing(console, "making the environments and the agent"):
+        keeping = go_on(run, StateKeeping(args.save_state_every, stays=args.keep_state), say)
+        if keeping.state is None:
+            say("no state was saved: the run begins anew")
+        else:
+            say(f"going on from step {keeping.state.note['steps']:,}")
+        return prepare(spec, console, {}, command_line(), run, keeping)

@@ -1,0 +1,83 @@
+"""What is done with a training that has come to its end: saved, judged, drawn."""
+
+from __future__ import annotations
+
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
+from pipeline.evaluation.value_maps import value_map
+from pipeline.models.companions import final_replay_buffer_path
+from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
+from pipeline.pictures.learning_curve import draw_learning_curve
+from pipeline.pictures.pull_curve import draw_pulls
+from pipeline.pictures.value_map import draw_value_map
+from pipeline.preparation import Training
+from pipeline.pull_recording import PullSummary, summarise_pulls
+from pipeline.run_folder import FINISHED, INTERRUPTED
+from pipeline.stopping import current
+
+FINAL_EVALUATION_EPISODES = 100
+
+
+def save(training: Training, state: str) -> PullSummary | None:
+    """Save what was learnt, and what was pulled; the figures on the latter."""
+    run, model, recorder = training.run, training.model, training.pulls
+    save_model(model, run.model_path)
+    save_normalization(model, run.vecnormalize_path)
+    if training.spec.save_replay_buffer and not current().is_urgent:
+        save_replay_buffer(model, final_replay_buffer_path(run.path))
+    if recorder is None or not recorder.n_calls:
+        return None
+    if state == INTERRUPTED:
+        recorder.write()  # as it does by itself where the training was not interrupted
+    return summarise_pulls(recorder.arrays())
+
+
+def judge(training: Training, state: str) -> Evaluation | None:
+    """The last evaluations: one that counts as of training, where there is none, and the final."""
+    evaluation = training.evaluation
+    if evaluation.is_asked_for and not evaluation.evaluations_timesteps:
+        # The run was shorter than the time to its first evaluation, or called no callback.
+        evaluation.init_callback(training.model)
+        evaluation.evaluate_now()
+    return _final_evaluation(training) if state == FINISHED else None
+
+
+def draw(training: Training, final: Evaluation | None) -> None:
+    """Draw the pulls, the learning curve and the map of the final policy, where there are such."""
+    run, spec, recorder = training.run, training.spec, training.pulls
+    title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
+    has_pulls = recorder is not None and recorder.n_calls > 0
+    if spec.pictures and recorder is not None and has_pulls:
+        draw_pulls(run.pulls_picture_path, title, recorder.arrays())
+    if spec.pictures and (not has_pulls or training.evaluation.evaluations_timesteps):
+        yardstick = None if final is None else final.yardstick
+        first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant
+        draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
+    _keep_value_map(training, title)
+
+
+def _keep_value_map(training: Training, title: str) -> None:
+    """Record and draw the final policy, where evaluation is on and knows a map."""
+    model, maps = training.model, training.evaluation.value_maps
+    if maps is None or not training.evaluation.is_asked_for:
+        return
+    maps.finish(model, model.num_timesteps)
+    found = value_map(maps.evaluator, model) if training.spec.pictures else None
+    if found is not None:
+        draw_value_map(training.run.value_map_path, title, found)
+
+
+def _final_evaluation(training: Training) -> Evaluation | None:
+    """Exact, or by episodes that were used for nothing else; none where evaluation is off."""
+    evaluator = training.evaluation.evaluator
+    if not training.evaluation.is_asked_for:
+        return None
+    training.evaluation.take_statistics()
+    if isinstance(evaluator, ExactEvaluator):
+        return evaluator(training.model)
+    return evaluate(
+        training.model,
+        training.eval_env,
+        FINAL_EVALUATION_EPISODES,
+        evaluation_seed(training.spec.seed, 2),
+    )
