@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from commands.parsing import command_line, exit_code
+from commands.streams import go_on_unread
+from commands.train_flags import build_parser
 from pipeline.errors import UserError
 from pipeline.run_folder import Run
 from pipeline.stopping import StopRequest
@@ -74,8 +76,6 @@ def _check_given(args: argparse.Namespace) -> None:
     Raises:
         UserError: naming the flag.
     """
-    from commands.train_agent import build_parser
-
     parser = build_parser()
     allowed = {*_MAY_BE_GIVEN, *(() if args.resume else ("algo", "env"))}
     for action in parser._actions:
@@ -87,9 +87,7 @@ def _check_given(args: argparse.Namespace) -> None:
 
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
     from commands.run_output import print_header, print_outcome
-    from commands.streams import go_on_unread
     from commands.terminal import TextConsole
-    from pipeline.resuming.state_folder import remove_states
     from pipeline.resuming.unfinished_runs import is_finished
     from pipeline.signs_of_life import doing
 
@@ -97,10 +95,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
     go_on_unread()
     console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
     if is_finished(run):
-        if not args.keep_state:
-            remove_states(run.state_path)
-        console.print(f"{run.path} is finished already", markup=False, highlight=False)
-        return 0
+        return _nothing_to_do(args, run, console)
     print_header(console, spec)
     with stop.held():
         with doing(console, "loading the libraries") as activity:
@@ -116,6 +111,15 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
             outcome = carry_out(_prepared(args, run, spec, console))
         print_outcome(console, spec, outcome)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
+
+
+def _nothing_to_do(args: argparse.Namespace, run: Run, console: Console) -> int:
+    from pipeline.resuming.state_folder import remove_states
+
+    if not args.keep_state:  # of a process that was killed just before it did that
+        remove_states(run.state_path)
+    console.print(f"{run.path} is finished already", markup=False, highlight=False)
+    return 0
 
 
 def _prepared(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console) -> Training:

@@ -1,172 +1,17 @@
-"""``train.py``: its flags, and what it does."""
+"""``train.py``: what it does."""
 
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from commands.flag_values import (
-    BUDGET,
-    COUNT,
-    INTERVAL,
-    LOG_INTERVAL,
-    SEED,
-    THREADS,
-    VERBOSITY,
-    filled,
-    save_interval,
-)
-from commands.parsing import (
-    MODULES_HELP,
-    OneLineParser,
-    as_called,
-    command_line,
-    exit_code,
-    program_name,
-)
+from commands.parsing import command_line, exit_code
 from commands.streams import go_on_unread
+from commands.train_flags import RESUMING, build_parser
 from pipeline.stopping import StopRequest, stops_noticed
 
-# The flags of a run that was cut off, by the names of their values.
-RESUMING = ("resume", "resume_or_start", "save_state_every", "keep_state")
-
-EPILOG = """\
-examples:
-  python train.py --env Warehouse-v0 --algo ppo
-  python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
-  python train.py --env CartPole-v1 --algo dqn -params learning_rate:1e-3 buffer_size:50000
-  python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
-  python train.py --resume logs/ppo/Warehouse-v0_3
-  python train.py --list
-"""
-
-
-def build_parser() -> argparse.ArgumentParser:
-    """The flags, with the names and meanings that rl_zoo3 gives them."""
-    parser = OneLineParser(
-        prog=program_name(),
-        description="Train an agent and leave a run folder with its models, curves and settings.",
-        epilog=as_called(EPILOG),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    add = parser.add_argument
-    add("--algo", default="ppo", help="agent (default: ppo; see --list)")
-    add("--env", default="CartPole-v1", help="environment id (default: CartPole-v1; see --list)")
-    add("--list", action="store_true", help="list agents and environments, and which fit which")
-    _add_training_flags(parser)
-    _add_output_flags(parser)
-    _add_resuming_flags(parser)
-    return parser
-
-
-def _add_resuming_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("a run that was cut off").add_argument
-    add(
-        "--resume",
-        nargs="?",
-        const="",
-        metavar="RUN",
-        help="go on with this run folder, or with the newest of --algo and --env that is not "
-        "finished, to the result that it would have had undisturbed; budget, seed and settings "
-        "are the run's",
-    )
-    add(
-        "--resume-or-start",
-        action="store_true",
-        help="go on with the newest run of these very settings, begin one where there is none, and "
-        "do nothing where it is finished: for scripts that a queue starts again",
-    )
-    add(
-        "--save-state-every",
-        type=save_interval,
-        default="auto",
-        metavar="N",
-        help="save what to go on from every so often: 30s, 5m, 5000 (steps), never, or auto, "
-        "which takes about 2%% of the time (default)",
-    )
-    add("--keep-state", action="store_true", help="leave it in the folder of a finished run")
-
-
-def _add_training_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("how long, and on what settings").add_argument
-    add("-n", "--n-timesteps", type=BUDGET, default=-1, metavar="N", help="environment steps")
-    add("--n-episodes", type=BUDGET, default=-1, metavar="N", help="episodes instead of steps")
-    add("--seed", type=SEED, default=-1, help="seed of everything (default: a random one)")
-    add(
-        "-params",
-        "--hyperparams",
-        nargs="+",
-        default=[],
-        metavar="KEY:VALUE",
-        help="hyperparameters to change, e.g. learning_rate:0.01",
-    )
-    add(
-        "-conf",
-        "--conf-file",
-        type=filled,
-        metavar="YAML",
-        help="hyperparameters from another file",
-    )
-    add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add(
-        "--eval-env-kwargs",
-        nargs="+",
-        default=[],
-        metavar="KEY:VALUE",
-        help="environment arguments for evaluation alone",
-    )
-    add(
-        "--gym-packages",
-        nargs="+",
-        type=filled,
-        default=[],
-        metavar="MODULE",
-        help=MODULES_HELP,
-    )
-    add(
-        "-i",
-        "--trained-agent",
-        default="",
-        metavar="ZIP",
-        help="go on with this agent (a zip or run folder) for -n further steps, in a new run "
-        "folder: its statistics, replay buffer, step counter and schedules go on, and "
-        "hyperparameters are those given here, or of the file",
-    )
-    add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
-    add("--device", default="auto", help="torch device (default: auto)")
-    add("--num-threads", type=THREADS, default=1, help="torch threads (1); -1 leaves it to torch")
-
-
-def _add_output_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("evaluation and output").add_argument
-    add("--eval-freq", type=INTERVAL, metavar="N", help="steps between evaluations; -1 for none")
-    add(
-        "--eval-episodes",
-        type=COUNT,
-        default=20,
-        metavar="N",
-        help="episodes of each (default: 20)",
-    )
-    add("--n-eval-envs", type=COUNT, default=10, metavar="N", help="environments for it (10)")
-    add("--save-freq", type=INTERVAL, default=-1, metavar="N", help="steps between checkpoints")
-    add("--save-replay-buffer", action="store_true", help="save it too, where the agent has one")
-    add("-f", "--log-folder", type=filled, default="logs", help="folder above all runs (logs)")
-    add("-uuid", "--uuid", action="store_true", help="add a unique id to the run folder's name")
-    add("-tb", "--tensorboard-log", default="", metavar="DIR", help="write TensorBoard logs there")
-    add(
-        "--log-interval",
-        type=LOG_INTERVAL,
-        default=-1,
-        metavar="N",
-        help="episodes (PPO, A2C: rollouts) between log records; -2 for none",
-    )
-    add(
-        "--verbose",
-        type=VERBOSITY,
-        default=1,
-        help="0 silent, 1 progress and summary (default), 2 the library's tables as well",
-    )
-    add("-P", "--progress", action="store_true", help="a live bar even without a terminal")
+if TYPE_CHECKING:
+    from pipeline.train_spec import TrainSpec
 
 
 def main() -> int:
@@ -178,12 +23,7 @@ def main() -> int:
 def _train(stop: StopRequest) -> int:
     args = build_parser().parse_args()
     if args.list:
-        from commands.listing import print_lists
-        from pipeline.user_modules import import_typed
-
-        import_typed(args.gym_packages)
-        print_lists()
-        return 0
+        return _list(args)
     if args.resume is not None:
         from commands.resume_training import resume_run
 
@@ -197,6 +37,19 @@ def _train(stop: StopRequest) -> int:
         code = resume_same(args, spec, stop)
         if code is not None:
             return code
+    return _begin(args, spec, stop)
+
+
+def _list(args: argparse.Namespace) -> int:
+    from commands.listing import print_lists
+    from pipeline.user_modules import import_typed
+
+    import_typed(args.gym_packages)
+    print_lists()
+    return 0
+
+
+def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     from commands.run_output import print_header, print_outcome, print_refusal
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing

@@ -11,29 +11,24 @@ from gymnasium import spaces
 from rich.console import Console
 from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.common.callback_horizons import EpisodeBudget
-from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
 from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
     trains_on_variant,
 )
-from pipeline.errors import UserError
 from pipeline.evaluation.exact import (
     ExactEvaluator,
     exact_evaluator,
     model_refusal,
     why_not_exact,
 )
-from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
-from pipeline.evaluation.value_maps import ValueMapRecorder
+from pipeline.evaluation.sampled import takes_batches
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
 from pipeline.models.continuation import continuing, load_to_continue, statistics_to_continue
@@ -46,8 +41,6 @@ from pipeline.resuming.resumed_logging import resumed_logger
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.run_folder import Run, environment_name
-from pipeline.safe_moments import StopAtSafeMoment
-from pipeline.settings import components
 from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import (
     build_algorithm_kwargs,
@@ -57,9 +50,13 @@ from pipeline.settings.algorithm_kwargs import (
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.signs_of_life import can_move
 from pipeline.train_spec import TrainSpec
+from pipeline.training_callbacks import (
+    all_callbacks,
+    evaluation_callback,
+    named_callbacks,
+    pull_recorder,
+)
 from pipeline.worker_processes import close_environments, end_workers_after_stop
-
-EVALUATIONS_PER_RUN = 20
 
 
 @dataclass(frozen=True)
@@ -138,19 +135,12 @@ def set_up(
     is_bandit = are_bandits(env)
     exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
-    evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
+    evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
     saver = StateSaver(run, keeping.interval, partial(_say, console), keeping.state)
-    callbacks = [saver, *_named_callbacks(spec, run, model)]
-    pulls = _pull_recorder(model, run, console) if is_bandit else None
-    if pulls is not None:
-        callbacks.append(pulls)
-    callbacks.append(evaluation)
-    if spec.hyperparams.n_episodes is not None:
-        callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
-    if spec.verbose > 0:
-        callbacks.append(display)
+    pulls = pull_recorder(model, run, console) if is_bandit else None
+    named = named_callbacks(spec, run, model)
+    saver.root = all_callbacks(spec, [saver, *named, *filter(None, [pulls]), evaluation], display)
     refusal = None if evaluation.value_maps is not None else model_refusal(spec)
-    saver.root = CallbackList(callbacks)
     return Training(
         spec,
         run,
@@ -202,50 +192,6 @@ def _training_env(
     return spec, env
 
 
-def _evaluation(
-    spec: TrainSpec,
-    run: Run,
-    eval_env: VecEnv,
-    n_envs: int,
-    is_bandit: bool,
-    exact: ExactEvaluator | None,
-    display: ProgressDisplay,
-) -> EvaluationCallback:
-    """The evaluations during training: exact ones where they can be."""
-    seed = evaluation_seed(spec.seed, 1)
-    sampled = partial(evaluate, env=eval_env, n_episodes=spec.eval_episodes, seed=seed)
-    return EvaluationCallback(
-        run,
-        eval_env,
-        exact or sampled,
-        *_evaluation_intervals(spec, n_envs, is_judged_by_regret=exact is None and is_bandit),
-        value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
-        during=display.doing,
-    )
-
-
-def _named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[BaseCallback]:
-    """The callbacks that the hyperparameters name, and the checkpoints that are asked for."""
-    callbacks: list[BaseCallback] = components.callbacks(
-        spec.hyperparams.callback, spec.gym_packages, run.path
-    )
-    _check_callbacks(spec, model, callbacks)
-    if spec.save_freq > 0:
-        callbacks.append(StepCheckpoint(spec.save_freq, run.path, spec.save_replay_buffer))
-    if spec.save_every_n_episodes > 0:
-        every = spec.save_every_n_episodes
-        callbacks.append(EpisodeCheckpoint(every, run.path, spec.save_replay_buffer))
-    return callbacks
-
-
-def _pull_recorder(model: BaseAlgorithm, run: Run, console: Console) -> PullRecorder | None:
-    """What keeps every pull, unless a compiled loop was asked for, which does not stop at each."""
-    if getattr(model, "engine", None) == "compiled":
-        console.print("[dim]engine: compiled keeps no pulls, so that regret is not known[/]")
-        return None
-    return PullRecorder(run.path)
-
-
 def appending(spec: TrainSpec) -> TrainSpec:
     """The spec, with Monitors that go on in the files that are there."""
     hyperparams = spec.hyperparams
@@ -256,24 +202,6 @@ def appending(spec: TrainSpec) -> TrainSpec:
 def is_unread(spec: TrainSpec) -> bool:
     """Whether nobody reads the library's log, so that its figures need not be worked out."""
     return spec.tensorboard_log is None and spec.verbose < 2
-
-
-def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
-    """Refuse now what would end the training half-way."""
-    for callback in callbacks:
-        if isinstance(callback, ExponentialExploration):
-            callback.check_model(model)
-    by_episodes = spec.hyperparams.n_episodes is not None
-    if by_episodes and isinstance(model, OnPolicyAlgorithm) and _has_moving_schedule(model):
-        raise UserError(
-            f"the schedules of {spec.algo} run by steps: give n_timesteps instead of n_episodes, "
-            "or constant values"
-        )
-
-
-def _has_moving_schedule(model: BaseAlgorithm) -> bool:
-    schedules = [getattr(model, name, None) for name in ("lr_schedule", "clip_range")]
-    return any(callable(s) and s(1.0) != s(0.0) for s in schedules)
 
 
 def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlgorithm:
@@ -308,17 +236,3 @@ def _new_model(
     if "seed" not in taken:
         model.set_random_seed(common["seed"])
     return model
-
-
-def _evaluation_intervals(
-    spec: TrainSpec, n_envs: int, is_judged_by_regret: bool
-) -> tuple[int, int]:
-    """Calls of `VecEnv.step`, and episodes, between two evaluations; 0 for none."""
-    if spec.eval_freq is not None:
-        return (max(spec.eval_freq // n_envs, 1), 0) if spec.eval_freq > 0 else (0, 0)
-    if is_judged_by_regret:
-        # An episode to evaluate on may have other arms, and says less than the pulls of training.
-        return 0, 0
-    if spec.hyperparams.n_timesteps is not None:
-        return max(spec.hyperparams.n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1), 0
-    return 0, -(-(spec.hyperparams.n_episodes or 1) // EVALUATIONS_PER_RUN)

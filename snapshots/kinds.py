@@ -84,7 +84,7 @@ def is_constant(value: Any, more: tuple[type, ...] = ()) -> bool:
     """
     kind = type(value)
     top = kind.__module__.partition(".")[0]
-    return isinstance(value, _CONSTANT_TYPES) or isinstance(value, more) or top in _CONSTANT_MODULES
+    return isinstance(value, (*_CONSTANT_TYPES, *more)) or top in _CONSTANT_MODULES
 
 
 def is_transient(value: Any) -> bool:

@@ -113,7 +113,8 @@ class _Recorder:
     def _node(self, value: Any) -> dict[str, Any]:
         for types, describe in _DESCRIPTIONS:
             if isinstance(value, types):
-                return describe(self, value)
+                described: dict[str, Any] = describe(self, value)
+                return described
         if is_constant(value, self._constants):
             is_found_by_name = isinstance(value, type | FunctionType | BuiltinFunctionType)
             return {"kind": "constant", "class": name_of(value) if is_found_by_name else ""}

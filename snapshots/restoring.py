@@ -5,7 +5,6 @@ from __future__ import annotations
 import array
 import functools
 import os
-import random
 from collections import OrderedDict, defaultdict, deque
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -14,17 +13,20 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
+from snapshots.filling import (
+    NotRestorableError,
+    fill_array,
+    fill_generator,
+    fill_random,
+    fill_random_state,
+    fill_tensor,
+    fill_torch_generator,
+)
 from snapshots.kinds import find, hides_state, is_transient, left_out, name_of, slots
 from snapshots.recording import REFERENCE, Snapshot
 
 # Of a snapshot that fits, every value was there when it was taken.
 _MISSING: Any = object()
-
-_BIT_GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
-
-
-class NotRestorableError(Exception):
-    """A snapshot does not fit what was built anew."""
 
 
 def restore(
@@ -88,7 +90,8 @@ class _Restorer:
         return [self.value(cell, old) for cell, old in zip(cells, known, strict=False)]
 
     def _held(self, node: dict[str, Any]) -> NDArray[Any]:
-        return self._snapshot.arrays[node["array"]]
+        array: NDArray[Any] = self._snapshot.arrays[node["array"]]
+        return array
 
     def _class(self, node: dict[str, Any], existing: Any) -> Any:
         """The class that a node names: that of what is there, or one that is imported already."""
@@ -162,9 +165,9 @@ class _Restorer:
         kind = self._class(node, existing)
         before = existing if isinstance(existing, tuple) else ()
         values = self._values(node["items"], before)
-        if type(existing) is kind and len(before) == len(values):
-            if all(new is old for new, old in zip(values, before, strict=True)):
-                return existing
+        is_same = type(existing) is kind and len(before) == len(values)
+        if is_same and all(new is old for new, old in zip(values, before, strict=True)):
+            return existing
         if hasattr(kind, "_fields"):
             return tuple.__new__(kind, values)
         return kind(values)
@@ -198,15 +201,7 @@ class _Restorer:
         return result
 
     def _ndarray(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        held = self._held(node)
-        is_same = isinstance(existing, np.ndarray) and existing.dtype == held.dtype
-        if not is_same or existing.shape != held.shape:
-            return held.copy()
-        if existing.flags.writeable:
-            existing[...] = held
-            return existing
-        # A constant of the environment, most likely: others may hold it too.
-        return existing if existing.tobytes() == held.tobytes() else held.copy()
+        return fill_array(self._held(node), existing)
 
     def _objects(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         shape = tuple(node["shape"])
@@ -239,14 +234,9 @@ class _Restorer:
         return self._class(node, existing)[node["name"]]
 
     def _tensor(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        held, kind = self._held(node), getattr(th, node["type"])
-        plain = th.from_numpy(held.copy()).view(kind).reshape(node["shape"])
-        is_same = isinstance(existing, th.Tensor) and existing.dtype == kind
-        if not is_same or list(existing.shape) != node["shape"]:
-            return plain.requires_grad_(node["is_trained"]) if node["is_trained"] else plain
-        with th.no_grad():
-            existing.copy_(plain)
-        return existing
+        return fill_tensor(
+            self._held(node), node["type"], node["shape"], node["is_trained"], existing
+        )
 
     def _optimizer(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         if not isinstance(existing, th.optim.Optimizer):
@@ -255,43 +245,18 @@ class _Restorer:
         return existing
 
     def _torch_generator(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        result = existing if isinstance(existing, th.Generator) else th.Generator()
-        result.set_state(th.from_numpy(self._held(node).copy()))
-        return result
+        return fill_torch_generator(self._held(node), existing)
 
     def _generator(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        seeds = self.value(node["seeds"])
-        is_same = isinstance(existing, np.random.Generator) and seeds == _seeds_of(existing)
-        result = existing if is_same else _generator(node["class"], seeds)
-        result.bit_generator.state = self.value(node["state"])
-        return result
+        return fill_generator(
+            node["class"], self.value(node["seeds"]), self.value(node["state"]), existing
+        )
 
     def _random_state(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        is_same = isinstance(existing, np.random.RandomState)
-        result = existing if is_same else np.random.RandomState()  # noqa: NPY002  # as recorded
-        result.set_state(self.value(node["state"]))
-        return result
+        return fill_random_state(self.value(node["state"]), existing)
 
     def _random(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        result = existing if isinstance(existing, random.Random) else random.Random()  # noqa: S311
-        result.setstate(self.value(node["state"]))
-        return result
-
-
-def _seeds_of(generator: np.random.Generator) -> Any:
-    seeds = generator.bit_generator.seed_seq
-    return seeds.state if isinstance(seeds, np.random.SeedSequence) else None
-
-
-def _generator(name: str, seeds: dict[str, Any] | None) -> np.random.Generator:
-    if name not in _BIT_GENERATORS:
-        raise NotRestorableError(f"there is no bit generator {name}")
-    source = getattr(np.random, name)
-    return np.random.Generator(source() if seeds is None else source(_sequence(seeds)))
-
-
-def _sequence(seeds: dict[str, Any]) -> np.random.SeedSequence:
-    return np.random.SeedSequence(**seeds)
+        return fill_random(self.value(node["state"]), existing)
 
 
 _Filler = Callable[[_Restorer, int, dict[str, Any], Any], Any]

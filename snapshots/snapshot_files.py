@@ -61,9 +61,10 @@ def write_snapshot(path: Path, snapshot: Snapshot, note: dict[str, Any], key: by
     with path.open("wb") as file:
         file.write(MAGIC)
         file.write(bytes(_CODE_BYTES))
-        for part in (len(text).to_bytes(8, "little"), text, *(p.data for p in parts if p.nbytes)):
-            code.update(part)
-            file.write(part)
+        contents: list[bytes | memoryview[Any]] = [part.data for part in parts if part.nbytes]
+        for content in (len(text).to_bytes(8, "little"), text, *contents):
+            code.update(content)
+            file.write(content)
         file.seek(_CODE_AT)
         file.write(code.digest())
         file.flush()
@@ -129,5 +130,6 @@ def _as_descr(described: Any) -> Any:
     if isinstance(described, str):
         return described
     return [
-        (name, _as_descr(kind), *(tuple(shape) for shape in more)) for name, kind, *more in described
+        (name, _as_descr(kind), *(tuple(shape) for shape in more))
+        for name, kind, *more in described
     ]

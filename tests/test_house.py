@@ -19,6 +19,7 @@ from packaging.version import Version
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = (
     "safe_files",
+    "snapshots",
     "mdp",
     "verdicts",
     "envs",

@@ -82,7 +82,7 @@ def _check_gone(run: Run, record: Any) -> None:
     if alive is None:
         raise UserError(
             f"{run.path}: process {pid} on {host} may be at work on it, which cannot be told from "
-            f"here; if it is not, remove {run.state_path / _CLAIM} and {PROCESS!r} in {run.info_path}"
+            f"here; if it is not, remove {run.state_path / _CLAIM}"
         )
 
 

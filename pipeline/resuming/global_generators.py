@@ -11,7 +11,9 @@ import torch as th
 
 def generator_states() -> dict[str, Any]:
     """Where they are."""
-    cuda = [state.numpy() for state in th.cuda.get_rng_state_all()] if th.cuda.is_available() else []
+    cuda = (
+        [state.numpy() for state in th.cuda.get_rng_state_all()] if th.cuda.is_available() else []
+    )
     return {
         "python": random.getstate(),
         "numpy": np.random.get_state(legacy=False),  # noqa: NPY002  # libraries draw from it

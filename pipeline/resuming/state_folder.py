@@ -1,112 +1,28 @@
-"""The states of a run that is under way, in its folder: the newest two, so that one is whole."""
+"""The folder in a run's in which its states lie: the newest two, so that one is whole."""
 
 from __future__ import annotations
 
-import os
 import shutil
-import sys
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from pipeline.errors import UserError
-from pipeline.files import replacing
-from snapshots.recording import Snapshot
-from snapshots.snapshot_files import BadSnapshotError, read_snapshot, write_snapshot
-from snapshots.user_key import user_key
-
-APPLICATION = "yardstick"
 GENERATIONS = 2
 
 
-@dataclass(frozen=True)
-class SavedState:
-    """A state that was read back.
-
-    Attributes:
-        snapshot: of the training.
-        note: what else was written down.
-    """
-
-    snapshot: Snapshot
-    note: dict[str, Any]
+def state_file(folder: Path, number: int) -> Path:
+    """Where the state of that number lies, in place of the one before the last."""
+    return folder / f"{'odd' if number % GENERATIONS else 'even'}.state"
 
 
-def state_key() -> bytes:
-    """The key under which this user's states are written.
-
-    Raises:
-        UserError: if there is none and none can be made.
-    """
-    try:
-        return user_key(APPLICATION)
-    except OSError as error:
-        raise UserError(f"the key to saved states: {error}") from error
-
-
-def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, Any]) -> None:
-    """Write the state of that number in place of the one before the last.
-
-    Raises:
-        OSError: if it cannot be written; the last one is there still.
-    """
-    folder.mkdir(exist_ok=True)
-    with replacing(_path(folder, number)) as draft:
-        write_snapshot(draft, snapshot, {**note, "number": number}, user_key(APPLICATION))
-    flush_folder(folder)
+def state_files(folder: Path) -> list[Path]:
+    """Where states may lie."""
+    return [state_file(folder, number) for number in range(GENERATIONS)]
 
 
 def has_state(folder: Path) -> bool:
     """Whether there is a file that may be a state."""
-    return any(path.is_file() for path in _paths(folder))
-
-
-def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | None:
-    """The newest state that is whole, or None where there is none at all.
-
-    Args:
-        folder: the states'.
-        tell: told of one that is not.
-
-    Raises:
-        UserError: if there are some, and none is whole or this user's.
-    """
-    key, found, reasons = state_key(), [], []
-    for path in _paths(folder):
-        try:
-            found.append(SavedState(*read_snapshot(path, key)))
-        except FileNotFoundError:
-            continue
-        except (OSError, BadSnapshotError, MemoryError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            reasons.append(f"{path}: {reason}")
-    if reasons and not found:
-        raise UserError(f"{reasons[0]}; remove {folder} to begin the run anew")
-    for reason in reasons:
-        tell(f"{reason}; the state before it is taken")
-    return max(found, key=lambda state: int(state.note["number"]), default=None)
+    return any(path.is_file() for path in state_files(folder))
 
 
 def remove_states(folder: Path) -> None:
     """Remove all states."""
     shutil.rmtree(folder, ignore_errors=True)
-
-
-def flush_folder(folder: Path) -> None:
-    """Let names that were changed in a folder reach the disk, where the system knows how to."""
-    if sys.platform == "win32":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def _path(folder: Path, number: int) -> Path:
-    return folder / f"{'odd' if number % GENERATIONS else 'even'}.state"
-
-
-def _paths(folder: Path) -> list[Path]:
-    return [_path(folder, number) for number in range(GENERATIONS)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pipeline.resuming.state_folder import SavedState
+    from pipeline.resuming.saved_states import SavedState
 
 
 @dataclass(frozen=True)

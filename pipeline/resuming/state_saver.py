@@ -18,14 +18,15 @@ from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
 from pipeline.resuming.log_positions import log_positions
+from pipeline.resuming.saved_states import SavedState, save_state
 from pipeline.resuming.state_keeping import SaveInterval
-from pipeline.resuming.state_folder import SavedState, save_state
 from pipeline.run_folder import Run
 from pipeline.safe_moments import StopAtSafeMoment
 from pipeline.stopping import current
+from snapshots.filling import NotRestorableError
 from snapshots.kinds import NotRecordableError
 from snapshots.recording import record
-from snapshots.restoring import NotRestorableError, restore
+from snapshots.restoring import restore
 
 # Saving may take this share of the time, where the user has not said how often.
 SHARE_OF_TIME = 0.02

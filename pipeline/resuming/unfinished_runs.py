@@ -12,7 +12,7 @@ from typing import Any
 from pipeline.errors import UserError
 from pipeline.file_digests import RECORD, DamagedFileError
 from pipeline.resuming.log_positions import cut_back, remove_events
-from pipeline.resuming.state_folder import has_state, newest_state, remove_states
+from pipeline.resuming.state_folder import has_state, remove_states
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_folder import FINISHED, Run, environment_name, numbered_runs
 from pipeline.run_record import recorded_versions
@@ -113,6 +113,8 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
     Raises:
         UserError: if its states are all damaged or another user's, or its files are gone.
     """
+    from pipeline.resuming.saved_states import newest_state  # it takes PyTorch
+
     _tell_versions(run, tell)
     state = newest_state(run.state_path, tell) if has_state(run.state_path) else None
     if state is None:
@@ -136,9 +138,14 @@ def _settings(spec: Mapping[str, Any], any_seed: bool) -> Any:
 
 def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
     before, now = run.read_info().get("versions") or {}, recorded_versions()
-    changed = [f"{name} {before[name]} -> {now[name]}" for name in now if before.get(name, now[name]) != now[name]]
+    changed = [
+        f"{name} {before[name]} -> {now[name]}"
+        for name in now
+        if before.get(name, now[name]) != now[name]
+    ]
     if changed:
-        tell(f"the run began with other versions, so that its result may differ: {', '.join(changed)}")
+        what = ", ".join(changed)
+        tell(f"the run began with other versions, so that its result may differ: {what}")
 
 
 def _empty(run: Run) -> None:

@@ -1,0 +1,93 @@
+"""States of a run that is under way: written, and read back."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pipeline.errors import UserError
+from pipeline.files import replacing
+from pipeline.resuming.state_folder import state_file, state_files
+from snapshots.recording import Snapshot
+from snapshots.snapshot_files import BadSnapshotError, read_snapshot, write_snapshot
+from snapshots.user_key import user_key
+
+APPLICATION = "yardstick"
+
+
+@dataclass(frozen=True)
+class SavedState:
+    """A state that was read back.
+
+    Attributes:
+        snapshot: of the training.
+        note: what else was written down.
+    """
+
+    snapshot: Snapshot
+    note: dict[str, Any]
+
+
+def state_key() -> bytes:
+    """The key under which this user's states are written.
+
+    Raises:
+        UserError: if there is none and none can be made.
+    """
+    try:
+        return user_key(APPLICATION)
+    except OSError as error:
+        raise UserError(f"the key to saved states: {error}") from error
+
+
+def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, Any]) -> None:
+    """Write the state of that number in place of the one before the last.
+
+    Raises:
+        OSError: if it cannot be written; the last one is there still.
+    """
+    folder.mkdir(exist_ok=True)
+    with replacing(state_file(folder, number)) as draft:
+        write_snapshot(draft, snapshot, {**note, "number": number}, user_key(APPLICATION))
+    flush_folder(folder)
+
+
+def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | None:
+    """The newest state that is whole, or None where there is none at all.
+
+    Args:
+        folder: the states'.
+        tell: told of one that is not.
+
+    Raises:
+        UserError: if there are some, and none is whole or this user's.
+    """
+    key, found, reasons = state_key(), [], []
+    for path in state_files(folder):
+        try:
+            found.append(SavedState(*read_snapshot(path, key)))
+        except FileNotFoundError:
+            continue
+        except (OSError, BadSnapshotError, MemoryError) as error:
+            reason = error.strerror if isinstance(error, OSError) else error
+            reasons.append(f"{path}: {reason}")
+    if reasons and not found:
+        raise UserError(f"{reasons[0]}; remove {folder} to begin the run anew")
+    for reason in reasons:
+        tell(f"{reason}; the state before it is taken")
+    return max(found, key=lambda state: int(state.note["number"]), default=None)
+
+
+def flush_folder(folder: Path) -> None:
+    """Let names that were changed in a folder reach the disk, where the system knows how to."""
+    if sys.platform == "win32":
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
