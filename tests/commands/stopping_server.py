@@ -104,7 +104,11 @@ def in_fork(folder, **request):
 
 def main():
     """Answer requests until there are no more."""
-    import pipeline.training  # noqa: F401  # what takes long
+    # What takes long.
+    import matplotlib.backends.backend_agg
+    import matplotlib.figure  # noqa: F401
+
+    import pipeline.training  # noqa: F401
 
     for line in sys.stdin:
         print(json.dumps(in_fork(**json.loads(line))), flush=True)  # noqa: T201
