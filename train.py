@@ -1,7 +1,10 @@
 """Train an agent on an environment: ``python train.py --env Warehouse-v0 --algo ppo``."""
 
-from commands.parsing import run_command
-from commands.train_agent import main
+try:
+    from commands.parsing import run_command
+    from commands.train_agent import main
+except KeyboardInterrupt:  # before there is anything to be stopped
+    raise SystemExit(130) from None
 
 if __name__ == "__main__":
     run_command(main)

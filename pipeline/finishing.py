@@ -33,12 +33,19 @@ def save(training: Training, state: str) -> PullSummary | None:
 
 
 def judge(training: Training, state: str) -> Evaluation | None:
-    """The last evaluations: one that counts as of training, where there is none, and the final."""
-    evaluation = training.evaluation
-    if evaluation.is_asked_for and not evaluation.evaluations_timesteps:
+    """Evaluate what is not evaluated yet; the final evaluation, where the training was not cut off.
+
+    It is exact, or by episodes that were used for nothing else.
+    """
+    evaluation, model = training.evaluation, training.model
+    if not evaluation.is_asked_for:
+        return None
+    if not evaluation.evaluations_timesteps:
         # The run was shorter than the time to its first evaluation, or called no callback.
-        evaluation.init_callback(training.model)
+        evaluation.init_callback(model)
         evaluation.evaluate_now()
+    if evaluation.value_maps is not None:
+        evaluation.value_maps.finish(model, model.num_timesteps)
     return _final_evaluation(training) if state == FINISHED else None
 
 
@@ -53,25 +60,15 @@ def draw(training: Training, final: Evaluation | None) -> None:
         yardstick = None if final is None else final.yardstick
         first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant
         draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
-    _keep_value_map(training, title)
+    maps = training.evaluation.value_maps
+    if spec.pictures and maps is not None and training.evaluation.is_asked_for:
+        found = value_map(maps.evaluator, training.model)
+        if found is not None:
+            draw_value_map(run.value_map_path, title, found)
 
 
-def _keep_value_map(training: Training, title: str) -> None:
-    """Record and draw the final policy, where evaluation is on and knows a map."""
-    model, maps = training.model, training.evaluation.value_maps
-    if maps is None or not training.evaluation.is_asked_for:
-        return
-    maps.finish(model, model.num_timesteps)
-    found = value_map(maps.evaluator, model) if training.spec.pictures else None
-    if found is not None:
-        draw_value_map(training.run.value_map_path, title, found)
-
-
-def _final_evaluation(training: Training) -> Evaluation | None:
-    """Exact, or by episodes that were used for nothing else; none where evaluation is off."""
+def _final_evaluation(training: Training) -> Evaluation:
     evaluator = training.evaluation.evaluator
-    if not training.evaluation.is_asked_for:
-        return None
     training.evaluation.take_statistics()
     if isinstance(evaluator, ExactEvaluator):
         return evaluator(training.model)

@@ -3,7 +3,7 @@
 import os
 import signal
 import threading
-import time
+from contextlib import closing, contextmanager, nullcontext
 
 import numpy as np
 import pytest
@@ -35,16 +35,60 @@ def test_the_first_interrupt_waits_and_the_second_does_not():
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
-def test_a_handler_of_ones_own_is_called_afterwards():
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_handler_of_ones_own_is_called_at_once_and_what_it_raises_waits(number):
     order = []
-    previous = signal.signal(signal.SIGINT, lambda *_: order.append("handled"))
+
+    def handle(given, frame):
+        order.append(given)
+        raise RuntimeError("handled")
+
+    def work():
+        with interrupts_held() as waiting:
+            signal.raise_signal(number)
+            order.append(waiting())
+
+    previous = signal.signal(number, handle)
     try:
-        with interrupts_held():
-            signal.raise_signal(signal.SIGINT)
-            order.append("inside")
+        with pytest.raises(RuntimeError, match="handled"):
+            work()
+        assert order == [number, True]
+        assert signal.getsignal(number) is handle
     finally:
-        signal.signal(signal.SIGINT, previous)
-    assert order == ["inside", "handled"]
+        signal.signal(number, previous)
+
+
+def test_a_handler_that_raises_nothing_stops_nothing():
+    """What it raises on a second signal does not wait, even if that is its first exception."""
+    handled = []
+
+    def handle(number, frame):
+        handled.append(number)
+        if len(handled) > 1:
+            raise KeyboardInterrupt
+
+    seen = []
+
+    def work():
+        with interrupts_held() as waiting:
+            signal.raise_signal(signal.SIGTERM)
+            seen.append(waiting())
+            signal.raise_signal(signal.SIGTERM)
+            seen.append("not reached")
+
+    previous = signal.signal(signal.SIGTERM, handle)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            work()
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+    assert seen == [False]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_the_system_does_by_itself_is_left_to_it(number):
+    with interrupts_held():
+        assert signal.getsignal(number) is signal.SIG_DFL
 
 
 def test_other_threads_hold_nothing():
@@ -60,16 +104,37 @@ def test_other_threads_hold_nothing():
     assert waiting == [False]
 
 
-def train_until_interrupted(model, seconds):
+class Interrupter(BlockCallback):
+    """Lets an interrupt come some time after a block of steps has begun, from another thread.
+
+    Args:
+        n_calls: calls to wait for before that, so that some training has been done by then.
+        seconds: from then on.
+    """
+
+    def __init__(self, n_calls, seconds):
+        super().__init__()
+        self.after = n_calls
+        self.timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+
+    def horizon(self):
+        return Horizon(calls=max(self.after - self.n_calls, 1))
+
+    def _on_step(self):
+        if self.n_calls >= self.after and self.timer.ident is None:
+            self.timer.start()
+        return True
+
+
+def train_until_interrupted(model, n_calls, seconds):
     """Train without end until an interrupt comes; whether it was one that ended the training."""
-    timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+    interrupter = Interrupter(n_calls, seconds)
     try:
-        timer.start()
-        model.learn(10**9, reset_num_timesteps=False, log_interval=20)
+        model.learn(10**9, interrupter, reset_num_timesteps=False, log_interval=20)
     except KeyboardInterrupt:
         return True
     finally:
-        timer.join()
+        interrupter.timer.join()
     return False
 
 
@@ -105,39 +170,42 @@ def check(model, folder):
     assert model._last_obs.tolist() == [env.unwrapped.s for env in model.env.envs]
 
 
+@contextmanager
 def made(folder=None, n_envs=N_ENVS):
     folder = None if folder is None else str(folder)
     env = make_vec_env("FrozenLake-v1", n_envs, seed=0, monitor_dir=folder)
-    return load_algorithm("sarsa")(env=env, seed=0, engine="compiled")
+    with closing(env):
+        yield load_algorithm("sarsa")(env=env, seed=0, engine="compiled")
 
 
 def test_interrupts_at_any_moment(tmp_path):
-    # Twice, so that all is compiled before the first interrupt comes.
-    model = made(tmp_path).learn(100).learn(50, reset_num_timesteps=False)
     rng = np.random.default_rng(0)
-    for seconds in rng.uniform(0.0, 0.004, 40):
-        before, started = model.num_timesteps, time.monotonic()
-        assert train_until_interrupted(model, seconds)
-        assert time.monotonic() - started < 5
-        check(model, tmp_path)
-        model.learn(50, reset_num_timesteps=False)
-        check(model, tmp_path)
-        assert model.num_timesteps >= before + 50
-    assert model.num_timesteps > 10_000
-    model.env.close()
+    with made(tmp_path) as model:
+        # Twice, so that all is compiled before the first interrupt comes.
+        model.learn(100).learn(50, reset_num_timesteps=False)
+        # However busy the machine is, these many steps are done before it.
+        for n_calls, seconds in zip(
+            rng.integers(1, 400, 40).tolist(), rng.uniform(0.0, 0.004, 40), strict=True
+        ):
+            before = model.num_timesteps
+            assert train_until_interrupted(model, n_calls, seconds)
+            assert model.num_timesteps >= before + n_calls * N_ENVS
+            check(model, tmp_path)
+            after = model.num_timesteps
+            model.learn(50, reset_num_timesteps=False)
+            check(model, tmp_path)
+            assert model.num_timesteps == after + 50
+        assert model.num_timesteps > 10_000
 
 
 @pytest.mark.parametrize("n_envs", [1, N_ENVS])
 def test_an_interrupted_training_is_one_that_a_callback_stopped(n_envs):
     states = []
     for interrupts in (False, True):
-        model = made(n_envs=n_envs)
-        if interrupts:
-            with pytest.raises(KeyboardInterrupt):
+        with made(n_envs=n_envs) as model:
+            with pytest.raises(KeyboardInterrupt) if interrupts else nullcontext():
                 model.learn(10_000, callback=Stop(interrupts))
-        else:
-            model.learn(10_000, callback=Stop(interrupts))
-        assert model.num_timesteps == 21 * n_envs
-        model.learn(400, reset_num_timesteps=False)
-        states.append((model.policy.q_table.tobytes(), model.rng.bit_generator.state))
+            assert model.num_timesteps == 21 * n_envs
+            model.learn(400, reset_num_timesteps=False)
+            states.append((model.policy.q_table.tobytes(), model.rng.bit_generator.state))
     assert states[0] == states[1]

@@ -128,10 +128,10 @@ def test_the_end_is_judged_on_the_statistics_of_the_end(tmp_path, monkeypatch):
 
     def note(model, env, n_episodes, seed, deterministic=True):
         judged.append(round(env.obs_rms.count))
-        raise KeyboardInterrupt
+        raise RuntimeError("judged")
 
     monkeypatch.setattr("pipeline.finishing.evaluate", note)
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(RuntimeError, match="judged"):
         train_to(tmp_path, "a2c", {**A2C, "normalize": True}, eval_freq=80)
     assert judged == [202]
 

@@ -1,6 +1,7 @@
 """Run folders: each run has one of its own, and is found again."""
 
 import json
+import shutil
 import subprocess
 import sys
 import threading
@@ -11,6 +12,7 @@ import pytest
 
 from pipeline import run_folder
 from pipeline.errors import UserError
+from pipeline.liveness import mark
 from pipeline.run_folder import NoRunError, Run, environment_name, numbered_runs
 
 ROOT = Path(run_folder.__file__).parent.parent
@@ -32,7 +34,7 @@ def test_runs_are_numbered_from_one(tmp_path):
 def test_a_claimed_folder_holds_the_folder_of_its_settings(tmp_path):
     run = Run.claim(tmp_path, "sarsa", "Taxi-v4")
     assert run.path == tmp_path / "sarsa" / "Taxi-v4_1"
-    assert [path.name for path in run.path.iterdir()] == ["Taxi-v4"]
+    assert sorted(path.name for path in run.path.iterdir()) == ["Taxi-v4", "run.json"]
     assert run.params_path.is_dir()
 
 
@@ -191,8 +193,7 @@ def test_no_run_yet_says_what_to_train(tmp_path):
 
 def test_a_number_that_there_is_not_names_those_that_there_are(tmp_path):
     claim_names(tmp_path, "Taxi-v4", 3)
-    (tmp_path / "sarsa" / "Taxi-v4_2" / "Taxi-v4").rmdir()
-    (tmp_path / "sarsa" / "Taxi-v4_2").rmdir()
+    shutil.rmtree(tmp_path / "sarsa" / "Taxi-v4_2")
     with pytest.raises(UserError, match=r"no run 2 of sarsa on Taxi-v4 in .*: there is 1, 3$"):
         Run.find(tmp_path, "sarsa", "Taxi-v4", 2)
 
@@ -226,10 +227,11 @@ def test_checkpoints_are_ordered_by_steps(tmp_path):
     assert run.checkpoints() == [run.checkpoint_path(n) for n in (30, 200, 1000)]
 
 
-def test_info_is_empty_at_first_and_grows(tmp_path):
+def test_info_names_the_process_while_it_is_at_work(tmp_path):
     run = Run.claim(tmp_path, "sarsa", "Taxi-v4")
-    assert run.read_info() == {}
-    run.update_info(state="running", seed=3)
+    assert run.read_info() == {"state": "running", "process": mark()}
+    run.update_info(seed=3)
+    assert run.read_info() == {"state": "running", "seed": 3, "process": mark()}
     run.update_info(state="finished", final={"mean_return": 7.5})
     expected = {"state": "finished", "seed": 3, "final": {"mean_return": 7.5}}
     assert run.read_info() == json.loads(run.info_path.read_text()) == expected
