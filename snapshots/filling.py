@@ -23,9 +23,11 @@ def fill_array(held: NDArray[Any], existing: Any) -> NDArray[Any]:
         return held.copy()
     if existing.flags.writeable:
         existing[...] = held
-        return existing
-    # A constant of the environment, most likely: others may hold it too.
-    return existing if existing.tobytes() == held.tobytes() else held.copy()
+    elif existing.tobytes() != held.tobytes():
+        return held.copy()
+    # Others may hold it too.
+    found: NDArray[Any] = existing
+    return found
 
 
 def fill_tensor(
@@ -36,10 +38,11 @@ def fill_tensor(
     plain = th.from_numpy(held.copy()).view(kind).reshape(shape)
     is_same = isinstance(existing, th.Tensor) and existing.dtype == kind
     if not is_same or list(existing.shape) != shape:
-        return plain.requires_grad_() if is_trained else plain
+        return plain.requires_grad_(is_trained)
+    found: th.Tensor = existing
     with th.no_grad():
-        existing.copy_(plain)
-    return existing
+        found.copy_(plain)
+    return found
 
 
 def fill_torch_generator(held: NDArray[np.uint8], existing: Any) -> th.Generator:

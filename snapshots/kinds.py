@@ -117,6 +117,9 @@ def slots(kind: type) -> Iterator[str]:
 
 def hides_state(kind: type) -> bool:
     """Whether objects of a class hold more than attributes, as those written in C do."""
+    declares_slots = any("__slots__" in vars(base) for base in kind.__mro__)
+    if kind is not object and not kind.__dictoffset__ and not declares_slots:
+        return True  # no class of Python's has nowhere to put its attributes
     # An object's head, its attributes' dictionary and its weak references, and a pointer a slot.
     plain = object.__basicsize__ + 2 * _POINTER + _POINTER * sum(1 for _ in slots(kind))
     return kind.__itemsize__ > 0 or kind.__basicsize__ > plain

@@ -3,6 +3,7 @@
 import dataclasses
 import os
 import sys
+import tempfile
 from types import SimpleNamespace
 
 import hypothesis
@@ -13,6 +14,10 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 os.environ["MPLBACKEND"] = "Agg"
 for library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):
     os.environ[f"{library}_NUM_THREADS"] = "1"
+
+# The key to saved states is the user's own, which tests leave alone.
+CONFIGURATION = tempfile.TemporaryDirectory(prefix="yardstick-tests-")
+os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
 
 # No deadline: the first example of a compiled function pays for its compilation. In CI the examples
 # are the same every time, so that a failure there can be repeated.

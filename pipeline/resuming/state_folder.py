@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 GENERATIONS = 2
 
@@ -26,3 +30,9 @@ def has_state(folder: Path) -> bool:
 def remove_states(folder: Path) -> None:
     """Remove all states."""
     shutil.rmtree(folder, ignore_errors=True)
+
+
+def settings_digest(spec: Mapping[str, Any]) -> str:
+    """What tells a run's settings from others'."""
+    text = json.dumps(spec, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -19,6 +19,7 @@ from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
 from pipeline.resuming.log_positions import log_positions
 from pipeline.resuming.saved_states import SavedState, save_state
+from pipeline.resuming.state_folder import settings_digest
 from pipeline.resuming.state_keeping import SaveInterval
 from pipeline.run_folder import Run
 from pipeline.safe_moments import StopAtSafeMoment
@@ -151,6 +152,7 @@ class StateSaver(StopAtSafeMoment):
             "steps": self.model.num_timesteps,
             "rollouts": self.n_rollouts,
             "seconds": self.seconds,
+            "spec": settings_digest(self.run.recorded_spec()),
         }
         save_state(self.run.state_path, self.n_saved + 1, snapshot, note)
         self.n_saved += 1

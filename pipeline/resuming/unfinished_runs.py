@@ -12,7 +12,7 @@ from typing import Any
 from pipeline.errors import UserError
 from pipeline.file_digests import RECORD, DamagedFileError
 from pipeline.resuming.log_positions import cut_back, remove_events
-from pipeline.resuming.state_folder import has_state, remove_states
+from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_folder import FINISHED, Run, environment_name, numbered_runs
 from pipeline.run_record import recorded_versions
@@ -120,6 +120,8 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
     if state is None:
         _empty(run)
     else:
+        if state.note["spec"] != settings_digest(run.recorded_spec()):
+            raise UserError(f"{run.state_path} holds the state of a run of other settings")
         cut_back(run.path, state.note["log_folder"], state.note["files"])
     return replace(keeping, state=state, goes_on=True)
 

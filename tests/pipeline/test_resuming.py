@@ -1,0 +1,333 @@
+"""A training that is cut off and gone on with ends in the bits of one that nobody disturbed."""
+
+import io
+import json
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch as th
+from rich.console import Console
+
+from agents import ALGORITHMS
+from pipeline.errors import UserError
+from pipeline.resuming import saved_states
+from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
+from pipeline.resuming.state_saver import StateSaver
+from pipeline.resuming.unfinished_runs import go_on, newest_unfinished, recorded_training
+from pipeline.run_folder import Run
+from pipeline.settings.hyperparam_entries import override, read_hyperparams
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+from pipeline.training import carry_out, prepare, train
+
+GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
+ARMS, LINEAR = "BernoulliBandit-v0", "LinearBandit-v0"
+SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
+EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
+
+# Every agent, and the settings whose state is kept in a place of its own.
+TRAININGS = [
+    (GRID, "qlearning", 600, {"engine": "compiled"}),
+    (GRID, "qlearning", 600, {"engine": "interpreted", "n_envs": 3}),
+    (GRID, "sarsa", 600, {"engine": "compiled", "n_envs": 3}),
+    (GRID, "sarsa", 600, {"engine": "interpreted"}),
+    ("Warehouse-v0", "expected_sarsa", 600, {"mask_actions": True}),
+    (GRID, "double_qlearning", 600, {"learning_rate": "lin_0.5"}),
+    (LEFT_RIGHT, "qlearning", 600, {"engine": "compiled"}),
+    (GRID, "value_iteration", 300, {}),
+    (GRID, "optimal", 300, {}),
+    (GRID, "random", 300, {}),
+    (LEFT_RIGHT, "angle", 300, {}),
+    (LEFT_RIGHT, "dqn", 300, {**EAGER, "n_steps": 3, "exploration_fraction": 0.5}),
+    ("Warehouse-v0", "double_dqn", 300, {**EAGER, "mask_actions": True}),
+    ("Warehouse-v0", "deep_qlearning", 200, {}),
+    (LEFT_RIGHT, "ppo", 600, {**SMALL, "learning_rate": "lin_0.001", "clip_range": "lin_0.2"}),
+    (SWING, "ppo", 600, {**SMALL, "use_sde": True, "normalize": True, "frame_stack": 2}),
+    (LEFT_RIGHT, "a2c", 300, {}),
+    (SWING, "sac", 200, {**EAGER, "use_sde": True, "normalize": True}),
+    (SWING, "td3", 200, {**EAGER, "noise_type": "ornstein-uhlenbeck", "noise_std": 0.1}),
+    (SWING, "ddpg", 200, {**EAGER, "noise_type": "normal", "noise_std": 0.1}),
+    (LEFT_RIGHT, "qrdqn", 200, EAGER),
+    (SWING, "tqc", 150, EAGER),
+    (SWING, "crossq", 150, EAGER),
+    (LEFT_RIGHT, "trpo", 400, {"n_steps": 64, "batch_size": 32, "n_envs": 1}),
+    (SWING, "ars", 8000, {"n_delta": 2, "n_top": 1, "n_envs": 1, "normalize": True}),
+    (LEFT_RIGHT, "ppo_lstm", 400, SMALL),
+    ("Warehouse-v0", "ppo_mask", 400, SMALL),
+    *((ARMS, name, 300, {}) for name in ("epsilon_greedy", "boltzmann", "ucb", "kl_ucb")),
+    *((ARMS, name, 300, {}) for name in ("gradient_bandit", "exp3", "thompson")),
+    *((LINEAR, name, 300, {}) for name in ("linucb", "lin_thompson", "lin_epsilon_greedy")),
+    *((ARMS, f"mabwiser_{name}", 200, {}) for name in ("epsilon_greedy", "ucb1", "thompson")),
+    (LINEAR, "mabwiser_linucb", 200, {}),
+]
+
+
+class CutOffError(BaseException):
+    """The end of a process, in which nothing can be done any more."""
+
+
+def spec_of(folder, env_id, algo, n_timesteps, settings, **more):
+    entry = read_hyperparams(algo, env_id, None) if settings is not EAGER else {}
+    raw = override({**entry, "n_timesteps": n_timesteps}, settings)
+    raw.pop("n_episodes", None)
+    common = {"seed": 3, "log_folder": folder, "verbose": 0, "pictures": False}
+    return TrainSpec(algo, env_id, split(raw), raw, **{**common, **more})
+
+
+def training_of(spec, keeping, run=None):
+    return prepare(spec, Console(quiet=True), {}, "", run, keeping)
+
+
+def undisturbed(spec):
+    return train(spec, Console(quiet=True), {}, "", keeping=StateKeeping(SaveInterval(is_off=True)))
+
+
+def until_cut_off(training, monkeypatch, n_states=2, steps=7):
+    """Train until so many states were saved, and some calls more."""
+    last, calls = training.saver.n_saved + n_states, [steps]
+
+    def on_step(saver):
+        calls[0] -= saver.n_saved >= last
+        if calls[0] < 0:
+            raise CutOffError
+        return True
+
+    with monkeypatch.context() as context:
+        context.setattr("pipeline.training._give_up", lambda *_: None)
+        context.setattr(StateSaver, "_on_step", on_step)
+        with pytest.raises(CutOffError):
+            carry_out(training)
+
+
+def cut_off(spec, monkeypatch, every=None):
+    """A run whose process ended, with two states or more in its folder."""
+    every = every or spec.hyperparams.n_timesteps // 6
+    training = training_of(spec, StateKeeping(SaveInterval(steps=every)))
+    until_cut_off(training, monkeypatch)
+    return training.run
+
+
+def gone_on(run, interval=SaveInterval(is_off=True), modules=()):
+    spec = replace(recorded_training(run, modules), verbose=0, pictures=False)
+    keeping = go_on(run, StateKeeping(interval), pytest.fail)
+    assert keeping.state is not None
+    return carry_out(training_of(spec, keeping, run))
+
+
+def content(path):
+    """What a file of a run says, but for moments and durations."""
+    if path.suffix == ".zip":
+        with zipfile.ZipFile(path) as members:
+            tensors = {n: members.read(n) for n in members.namelist() if n.endswith(".pth")}
+        return {name: bits(th.load(io.BytesIO(data))) for name, data in tensors.items()}
+    if path.suffix == ".npz":
+        return {name: array.tobytes() for name, array in np.load(path).items()}
+    if path.name.endswith("monitor.csv"):
+        return [line.split(",")[:2] for line in path.read_text().splitlines()[1:]]
+    if path.name == "run.json":
+        info = json.loads(path.read_text())
+        return {key: info[key] for key in info if key not in ("seconds", "files", "spec")}
+    if path.suffix in (".png", ".pkl"):
+        return None
+    return path.read_bytes()
+
+
+def bits(value):
+    if isinstance(value, th.Tensor):
+        return value.detach().numpy().tobytes()
+    if isinstance(value, dict):
+        return {name: bits(held) for name, held in value.items()}
+    return [bits(held) for held in value] if isinstance(value, list | tuple) else value
+
+
+def assert_same(run, other):
+    names, others = (
+        {str(path.relative_to(folder.path)) for path in folder.path.rglob("*") if path.is_file()}
+        for folder in (run, other)
+    )
+    assert names == others
+    for name in names:
+        assert content(run.path / name) == content(other.path / name), name
+
+
+@pytest.mark.parametrize(("env_id", "algo", "steps", "settings"), TRAININGS)
+def test_the_result_is_that_of_an_undisturbed_run(
+    tmp_path, monkeypatch, env_id, algo, steps, settings
+):
+    whole = undisturbed(spec_of(tmp_path / "whole", env_id, algo, steps, settings))
+    run = cut_off(spec_of(tmp_path / "parts", env_id, algo, steps, settings), monkeypatch)
+    outcome = gone_on(run)
+    assert outcome.n_steps == whole.n_steps
+    assert_same(whole.run, run)
+    assert not run.state_path.exists()
+
+
+def test_every_agent_is_tried():
+    assert {algo for _, algo, _, _ in TRAININGS} == set(ALGORITHMS)
+
+
+def test_a_state_makes_the_difference(tmp_path, monkeypatch):
+    """Of generators that are not put back, the weights tell."""
+    spec = spec_of(tmp_path / "whole", LEFT_RIGHT, "dqn", 300, EAGER)
+    whole = undisturbed(spec)
+    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
+    monkeypatch.setattr("pipeline.resuming.state_saver.set_generators", lambda _: None)
+    gone_on(run)
+    assert content(whole.run.model_path) != content(run.model_path)
+
+
+@pytest.mark.parametrize("algo", ["qlearning", "dqn"])
+def test_budgets_in_episodes_callbacks_and_checkpoints(tmp_path, monkeypatch, algo):
+    settings = {"n_episodes": 30, "callback": [{"pipeline.callbacks.EpisodeCheckpoint": {}}]}
+    settings["callback"][0]["pipeline.callbacks.EpisodeCheckpoint"]["every_n_episodes"] = 7
+    if algo == "dqn":
+        settings |= {**EAGER, "callback": [*settings["callback"], EXPLORATION]}
+    raw = {**read_hyperparams(algo, GRID, None), **settings}
+    raw.pop("n_timesteps", None)
+    spec = spec_of(tmp_path / "whole", GRID, algo, 1, settings, save_freq=50)
+    spec = replace(spec, hyperparams=split(raw), saved_hyperparams=raw)
+    whole = undisturbed(spec)
+    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch, every=20)
+    gone_on(run)
+    assert len(run.checkpoints()) > 3
+    assert_same(whole.run, run)
+
+
+EXPLORATION = "pipeline.callbacks.ExponentialExploration"
+
+
+def events(folder):
+    """What TensorBoard reads of a folder, but for speeds and durations."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    reader = EventAccumulator(str(folder))
+    reader.Reload()
+    names = [name for name in reader.Tags()["scalars"] if not name.startswith("time/")]
+    return {name: [(e.step, e.value) for e in reader.Scalars(name)] for name in names}
+
+
+@pytest.mark.parametrize(("algo", "interval"), [("ppo", -1), ("ppo", 3), ("dqn", -1)])
+def test_logs_go_on_in_their_folder(tmp_path, monkeypatch, algo, interval):
+    settings = SMALL if algo == "ppo" else EAGER
+    spec = spec_of(tmp_path / "whole", LEFT_RIGHT, algo, 1500, settings, log_interval=interval)
+    undisturbed(replace(spec, tensorboard_log=tmp_path / "log"))
+    parts = replace(spec, log_folder=tmp_path / "parts", tensorboard_log=tmp_path / "other")
+    run = cut_off(parts, monkeypatch)
+    gone_on(run)
+    whole, resumed = (events(tmp_path / n / LEFT_RIGHT / f"{algo}_1") for n in ("log", "other"))
+    assert len(whole) > 5
+    assert resumed == whole
+    assert [path.name for path in (tmp_path / "other" / LEFT_RIGHT).iterdir()] == [f"{algo}_1"]
+
+
+def test_it_can_be_cut_off_again_and_again(tmp_path, monkeypatch):
+    spec = spec_of(tmp_path / "whole", LEFT_RIGHT, "dqn", 600, EAGER)
+    whole = undisturbed(spec)
+    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
+    for _ in range(2):
+        again = replace(recorded_training(run, ()), verbose=0, pictures=False)
+        keeping = go_on(run, StateKeeping(SaveInterval(steps=50)), pytest.fail)
+        until_cut_off(training_of(again, keeping, run), monkeypatch)
+    gone_on(run)
+    assert_same(whole.run, run)
+
+
+def test_the_older_state_serves_where_the_newest_is_damaged(tmp_path, monkeypatch):
+    spec = spec_of(tmp_path / "whole", GRID, "qlearning", 600, {})
+    whole = undisturbed(spec)
+    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
+    newest = max(run.state_path.glob("*.state"), key=lambda path: path.stat().st_mtime_ns)
+    newest.write_bytes(newest.read_bytes()[:-5])
+    told = []
+    keeping = go_on(run, StateKeeping(SaveInterval(is_off=True)), told.append)
+    again = replace(recorded_training(run, ()), verbose=0, pictures=False)
+    carry_out(training_of(again, keeping, run))
+    assert len(told) == 1
+    assert "the state before it is taken" in told[0]
+    assert_same(whole.run, run)
+
+
+def test_a_strangers_state_is_refused(tmp_path, monkeypatch):
+    run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "another user"))
+    before = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+    with pytest.raises(UserError, match="another user or machine made it"):
+        go_on(run, StateKeeping(), pytest.fail)
+    assert before == {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
+
+
+def test_a_state_beside_other_settings_is_refused(tmp_path, monkeypatch):
+    run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
+    other = cut_off(spec_of(tmp_path, GRID, "sarsa", 600, {}), monkeypatch)
+    for path in other.state_path.iterdir():
+        (run.state_path / path.name).write_bytes(path.read_bytes())
+    with pytest.raises(UserError, match="of other settings"):
+        go_on(run, StateKeeping(), pytest.fail)
+
+
+def test_without_a_state_the_run_begins_anew(tmp_path, monkeypatch):
+    spec = spec_of(tmp_path / "whole", LEFT_RIGHT, "dqn", 300, EAGER)
+    whole = undisturbed(spec)
+    run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
+    for path in run.state_path.iterdir():
+        path.unlink()
+    keeping = go_on(run, StateKeeping(), pytest.fail)
+    assert keeping.state is None
+    again = replace(recorded_training(run, ()), verbose=0, pictures=False)
+    carry_out(training_of(again, keeping, run))
+    assert_same(whole.run, run)
+
+
+def test_what_cannot_be_kept_is_said_once(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr("pipeline.preparation._say", lambda _, line: told.append(line))
+    spec = spec_of(tmp_path, LEFT_RIGHT, "ppo", 400, SMALL, vec_env="subproc")
+    train(spec, Console(quiet=True), {}, "", keeping=StateKeeping(SaveInterval(steps=50)))
+    assert len(told) == 1
+    assert "environments are in other processes" in told[0]
+    assert "begins it anew" in told[0]
+
+
+def test_a_disk_that_is_full_ends_no_training(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(saved_states, "write_snapshot", full)
+    spec = spec_of(tmp_path, GRID, "qlearning", 600, {})
+    keeping = StateKeeping(SaveInterval(steps=200))
+    outcome = train(spec, Console(quiet=True), {}, "", keeping=keeping)
+    assert outcome.state == "finished"
+
+
+def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
+    """However long a state takes, the next is saved fifty times as long after it."""
+    clock = [0.0]
+    monkeypatch.setattr("pipeline.resuming.state_saver.time.monotonic", lambda: clock[0])
+    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+
+    def write(self):
+        clock[0] += 0.5
+
+    monkeypatch.setattr(StateSaver, "_write", write)
+    monkeypatch.setattr(StateSaver, "is_off", False, raising=False)
+    saver.model = type("Model", (), {"num_timesteps": 0})()
+    saver.save()
+    assert saver.pause == 25.0
+    clock[0] += 24.9
+    assert not saver.wants_position()
+    clock[0] += 0.2
+    assert saver.wants_position()
+
+
+def test_the_newest_unfinished_run(tmp_path, monkeypatch):
+    spec = spec_of(tmp_path, GRID, "qlearning", 300, {})
+    first = cut_off(spec, monkeypatch)
+    undisturbed(spec)
+    assert newest_unfinished(tmp_path, "qlearning", GRID).path == first.path
+    gone_on(first)
+    with pytest.raises(UserError, match="all 2 are finished"):
+        newest_unfinished(tmp_path, "qlearning", GRID)
+    with pytest.raises(UserError, match="none at all"):
+        newest_unfinished(tmp_path, "sarsa", GRID)
