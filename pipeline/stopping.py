@@ -186,9 +186,9 @@ _current: list[StopRequest] = []
 _noticed: list[int] = []
 
 
-def was_asked() -> bool:
-    """Whether a signal has asked this process to stop, in whatever `stops_noticed`."""
-    return bool(_noticed)
+def n_stops() -> int:
+    """How many of the `stops_noticed` of this process a signal has asked to stop."""
+    return len(_noticed)
 
 
 def current() -> StopRequest:
