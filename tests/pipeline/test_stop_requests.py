@@ -1,5 +1,6 @@
 """What asks a process to stop is held, waits, and is not forgotten."""
 
+import ctypes
 import os
 import pickle
 import signal
@@ -101,6 +102,19 @@ def test_what_swallows_a_stop_is_told_again():
 
     with stops_noticed() as stop:
         assert stopped(work)[1] < LONG
+
+
+def test_a_failure_that_comes_of_a_swallowed_stop_is_a_stop(capsys):
+    """In Numba's compiler it is raised where C code has called Python, and is lost there."""
+
+    def work():
+        with stop.waiting(0.0):
+            ctypes.CFUNCTYPE(None)(send)()
+            raise RuntimeError("no compiled object yet")
+
+    with stops_noticed() as stop:
+        stopped(work)
+    assert capsys.readouterr().err == ""
 
 
 def test_what_a_library_made_of_a_stop_is_a_stop():
