@@ -18,9 +18,14 @@ LONG = 30.0  # seconds: nothing here waits so long
 
 @pytest.fixture(autouse=True)
 def handlers_are_as_before():
-    before = [signal.getsignal(number) for number in SIGNALS]
+    """And by default, whatever the tests were started under."""
+    by_default = [
+        signal.default_int_handler if n == signal.SIGINT else signal.SIG_DFL for n in SIGNALS
+    ]
+    before = [signal.signal(*pair) for pair in zip(SIGNALS, by_default, strict=True)]
     yield
-    assert [signal.getsignal(number) for number in SIGNALS] == before
+    after = [signal.signal(*pair) for pair in zip(SIGNALS, before, strict=True)]
+    assert after == by_default
     assert current().number is None
 
 
