@@ -21,7 +21,6 @@ from pipeline.errors import UserError, one_line, visible
 from pipeline.stopping import default_for_signals, n_stops
 
 MISTAKE = 2
-INTERRUPT = 130
 
 # The command that installing the project brings, and its own commands: the scripts of a checkout.
 NAME = "yardstick"
