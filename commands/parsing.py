@@ -18,10 +18,9 @@ from typing import Any, NoReturn
 
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
-from pipeline.stopping import default_for_signals, was_asked
+from pipeline.stopping import default_for_signals, n_stops
 
 MISTAKE = 2
-INTERRUPT = 130
 
 # The command that installing the project brings, and its own commands: the scripts of a checkout.
 NAME = "yardstick"
@@ -102,12 +101,13 @@ def run_command(main: Callable[[], int]) -> NoReturn:
     """
     print_on_any_terminal()
     codes: list[int] = []
+    before = n_stops()
     atexit.register(_leave, codes)  # before the libraries', so that it is called after them
     with standard_streams() as output:
         code = _exit_code(main)
         if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
             code = code or MISTAKE
-    if was_asked():
+    if n_stops() > before:
         default_for_signals()  # what is left to do would tell of a further one in a traceback
         codes.append(code)
     sys.exit(code)

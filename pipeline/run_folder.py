@@ -6,7 +6,7 @@ The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, so that its to
 
 from __future__ import annotations
 
-import errno
+import os
 import re
 import secrets
 import shutil
@@ -24,7 +24,7 @@ from pipeline.file_digests import (
     read_record,
     sealed,
 )
-from pipeline.files import drafts_in, portable_name, write_json
+from pipeline.files import drafts_in, portable_name, put_in_place, write_json
 from pipeline.liveness import is_alive, mark
 
 RUNNING = "running"
@@ -49,8 +49,6 @@ OUTCOME = (
 )
 # The field of ``run.json`` that says, while a run is running, which process is at work on it.
 PROCESS = "process"
-
-_TAKEN = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
 
 class NoRunError(UserError):
@@ -278,12 +276,14 @@ class Run:
 
 def _renamed(draft: Path, path: Path) -> bool:
     """Rename a folder that holds something, unless something has the name already."""
-    try:
-        draft.rename(path)
-    except OSError as error:
-        if error.errno not in _TAKEN:
-            raise
+    if os.path.lexists(path):
         return False
+    try:
+        put_in_place(draft, path)
+    except OSError:
+        if os.path.lexists(path):  # since a moment ago
+            return False
+        raise
     return True
 
 

@@ -18,6 +18,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 # Those that a platform lacks are left out: Windows has no SIGHUP.
 SIGNALS = tuple(
@@ -88,7 +89,7 @@ class StopRequest:
 
         Raises:
             Stopped: when the time is over, also at the beginning of the ``with`` statement; and
-                in the place of any exception that a library made of it.
+                in the place of any exception that comes of it, as of a library that swallowed it.
         """
         before = self._patience, self._reminds
         self._patience, self._reminds, self._raised_at = seconds, True, -math.inf
@@ -97,9 +98,10 @@ class StopRequest:
                 self.raise_if_asked()
             yield
         except Exception as error:
-            if (stop := _stop_behind(error)) is None:
+            was_raised_here = self._raised_at > -math.inf
+            if self.number is None or not (was_raised_here or _is_of_a_stop(error)):
                 raise
-            raise Stopped(stop.number) from error
+            raise Stopped(self.number) from error
         finally:
             self._patience, self._reminds = before
 
@@ -170,25 +172,25 @@ class StopRequest:
             self._is_over = True
 
 
-def _stop_behind(error: BaseException) -> Stopped | None:
-    """The stop that an exception was made of, or raised while it was being handled."""
+def _is_of_a_stop(error: BaseException) -> bool:
+    """Whether an exception was made of a stop, or raised while one was being handled."""
     seen: set[int] = set()
     cause: BaseException | None = error
     while cause is not None and id(cause) not in seen:
         if isinstance(cause, Stopped):
-            return cause
+            return True
         seen.add(id(cause))
         cause = cause.__cause__ or cause.__context__
-    return None
+    return False
 
 
 _current: list[StopRequest] = []
 _noticed: list[int] = []
 
 
-def was_asked() -> bool:
-    """Whether a signal has asked this process to stop, in whatever `stops_noticed`."""
-    return bool(_noticed)
+def n_stops() -> int:
+    """How many of the `stops_noticed` of this process a signal has asked to stop."""
+    return len(_noticed)
 
 
 def current() -> StopRequest:
@@ -209,10 +211,17 @@ def stops_noticed() -> Iterator[StopRequest]:
     if _current or threading.current_thread() is not threading.main_thread():
         yield current()
         return
-    request = StopRequest()
+    request, tell = StopRequest(), sys.unraisablehook
     before = {number: signal.getsignal(number) for number in SIGNALS}
     _current.append(request)
+
+    def tell_others(unraisable: Any) -> None:
+        if not isinstance(unraisable.exc_value, Stopped):
+            tell(unraisable)
+
     try:
+        # What C code calls back cannot raise, as in Numba's compiler: it will be told again.
+        sys.unraisablehook = tell_others
         for number, handler in before.items():
             if handler in (signal.SIG_DFL, signal.default_int_handler):
                 signal.signal(number, request.notice)
@@ -220,6 +229,7 @@ def stops_noticed() -> Iterator[StopRequest]:
     finally:
         request._patience = math.inf  # before a call, in which a signal could still be handled
         request.end()
+        sys.unraisablehook = tell
         for number, handler in before.items():
             if handler is not None:
                 signal.signal(number, handler)

@@ -8,7 +8,7 @@ from typing import Literal
 from pipeline.errors import UserError
 from pipeline.models.model_zips import check_model_file
 from pipeline.models.recorded_runs import run_in
-from pipeline.run_folder import Run
+from pipeline.run_folder import INTERRUPTED, Run
 
 Which = Literal["final", "best", "last checkpoint"] | int
 
@@ -50,6 +50,8 @@ def model_of(run: Run, which: Which = "final") -> Path:
     if not path.exists():
         known = ", ".join(path.stem.split("_")[-2] for path in run.checkpoints())
         reason = "its training may not have ended"
+        if run.state == INTERRUPTED:
+            reason = "its training was cut off before it was written"
         if isinstance(which, int) and known:
             reason = f"there are checkpoints after {known} steps"
         raise UserError(f"{run.path} holds no {path.name}: {reason}")

@@ -27,8 +27,10 @@ def do(words, plan, ignored=()):
     from pipeline import stopping
 
     stopping.SECONDS_OF_ONE_REQUEST = 0.0  # here they are meant one by one
-    for name in ignored:
-        signal.signal(signal.Signals[name], signal.SIG_IGN)
+    for number in stopping.SIGNALS:  # whatever the tests were started under
+        is_ignored = number.name in ignored
+        default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+        signal.signal(number, signal.SIG_IGN if is_ignored else default)
     for moment, (owner, name, condition) in moments().items():
         if moment in plan:
             signalling(owner, name, condition, list(plan[moment]))

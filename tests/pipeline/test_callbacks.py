@@ -202,6 +202,7 @@ def test_files_are_there_after_each_evaluation(run):
         "Warehouse-v0",
         "best_model.zip",
         "evaluations.npz",
+        "run.json",
     ]
 
 

@@ -153,6 +153,7 @@ def test_the_picture_of_a_run(run):
         "FrozenLake-v1",
         "evaluations.npz",
         "learning_curve.png",
+        "run.json",
     ]
 
 
