@@ -15,6 +15,7 @@ from typing import Any, NoReturn
 
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
+from pipeline.stopping import Stopped
 
 MISTAKE = 2
 INTERRUPT = 130
@@ -113,9 +114,9 @@ def _exit_code(main: Callable[[], int]) -> int:
     except OSError as error:
         place = f": {error.filename}" if error.filename else ""
         message = f"{error.strerror or one_line(error)}{place}"
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print(f"{program}: interrupted", file=sys.stderr)
-        return INTERRUPT
+        return 128 + stop.number if isinstance(stop, Stopped) else INTERRUPT
     print(f"{program}: error: {visible(message)}", file=sys.stderr)
     return MISTAKE
 

@@ -165,10 +165,26 @@ def test_what_is_there_is_not_run_again(type_command, folder):
     assert first.items() <= extended.items()
     assert sorted(rows(study)["seed"]) == [0, 0, 1, 1, 2, 2]
 
-    code, out, _ = type_command(*PAIR, "--seeds", 3, "-params", "gamma:0.9")
-    assert (code, "6 runs, 0 of them there already" in out) == (0, True)
-    assert set(records(study)) == set(extended)
-    assert not set(records(study).values()) & set(extended.values())
+
+def test_finished_runs_of_other_settings_are_replaced_only_when_asked(type_command, folder):
+    study = folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
+    assert type_command(*PAIR, "--seeds", 2)[0] == 0
+    first = records(study)
+    other = [*PAIR, "--seeds", 2, "-params", "gamma:0.9"]
+    code, out, err = type_command(*other)
+    assert (code, out.count("\n"), err.count("\n")) == (2, 1, 1)
+    assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now)" in err
+    assert "--name NAME" in err
+    assert records(study) == first
+
+    code, out, _ = type_command(*other, "--replace")
+    assert (code, "4 runs, 0 of them there already" in out) == (0, True)
+    assert set(records(study)) == set(first)
+    assert not set(records(study).values()) & set(first.values())
+    place = study / "replaced" / "1"
+    assert f"4 runs that are done again: what was there is in {place.relative_to(folder)}" in out
+    place.rename(place.parent / "runs")
+    assert records(place.parent) == first
 
 
 def test_the_same_seed_gives_the_same_run_as_train_py(type_command, folder, monkeypatch):
@@ -277,7 +293,11 @@ def test_a_killed_driver_leaves_no_orphans_and_no_drafts(folder):
     process.kill()
     process.communicate()
     wait_for(lambda: not any(map(is_alive, started)))
-    wait_for(lambda: not study.exists())
+    # Of the driver itself its lock is left, which nobody heeds.
+    wait_for(lambda: [path.name for path in study.iterdir()] == [".lock"])
+    (folder / "mark").touch()
+    assert finish(*SLOW)[0] == 0
+    assert sorted(path.name for path in study.iterdir()) == ["curves.csv.gz", "runs", "summary.csv"]
 
 
 def test_ctrl_c_ends_with_130_and_goes_on_afterwards(folder):
