@@ -11,11 +11,12 @@ import shlex
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from signal import SIGINT, Signals
 from typing import Any, NoReturn
 
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
-from pipeline.stopping import Stopped
+from pipeline.stopping import default_for_signals
 
 MISTAKE = 2
 INTERRUPT = 130
@@ -102,6 +103,8 @@ def run_command(main: Callable[[], int]) -> NoReturn:
         code = _exit_code(main)
         if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
             code = code or MISTAKE
+    if code > 128:  # the rest is Python's own, and tells of a further signal in a traceback
+        default_for_signals()
     sys.exit(code)
 
 
@@ -115,10 +118,17 @@ def _exit_code(main: Callable[[], int]) -> int:
         place = f": {error.filename}" if error.filename else ""
         message = f"{error.strerror or one_line(error)}{place}"
     except KeyboardInterrupt as stop:
-        print(f"{program}: interrupted", file=sys.stderr)
-        return 128 + stop.number if isinstance(stop, Stopped) else INTERRUPT
+        number = getattr(stop, "number", SIGINT)
+        how = "interrupted" if number == SIGINT else f"ended by {Signals(number).name}"
+        print(f"{program}: {how}", file=sys.stderr)
+        return exit_code(number)
     print(f"{program}: error: {visible(message)}", file=sys.stderr)
     return MISTAKE
+
+
+def exit_code(number: int | None) -> int:
+    """The exit code that shells give a process that a signal has ended; None stands for Ctrl-C."""
+    return 128 + (number or SIGINT)
 
 
 def _run_to_the_last_word(main: Callable[[], int]) -> int:

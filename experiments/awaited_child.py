@@ -69,7 +69,9 @@ def _read(last_words: Connection) -> str:
         with contextlib.suppress(EOFError, OSError):
             while last_words.poll(0) and (piece := os.read(last_words.fileno(), 1 << 16)):
                 text += piece
-    return text.decode(errors="replace")
+    # Python also lists all modules in C, which is a page of them and tells nothing.
+    lines = text.decode(errors="replace").splitlines(keepends=True)
+    return "".join(line for line in lines if not line.startswith("Extension modules: "))
 
 
 def kill(child: BaseProcess) -> None:

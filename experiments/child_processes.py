@@ -25,7 +25,7 @@ from typing import Any
 
 from experiments.awaited_child import RAISED, RETURNED, awaited, kill
 from experiments.run_limits import RunLimits
-from experiments.task_in_child import answer_from_child
+from experiments.task_in_child import LEFT_TO_SUPERVISOR, answer_from_child
 from pipeline.stopping import current
 
 PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
@@ -103,7 +103,7 @@ def supervise(
         if kind == RAISED:
             raise TaskFailedError(*answer)
     how, last_words = answer
-    details = f"{last_words}{how}, {tries} times"
+    details = f"{last_words}{how}, {tries} times\n"
     raise TaskDiedError(f"its process died {tries} times ({how})", details)
 
 
@@ -193,13 +193,13 @@ def _start_fork_server(warm_ups: str) -> None:
 
 
 def _ensure_fork_server() -> None:
-    """Start it again where it was killed; it ignores Ctrl-C while it imports."""
+    """Start it where it is not there; signals to all processes at once leave it as it is."""
     if sys.platform != "win32":
         from multiprocessing import forkserver, resource_tracker
 
         # It lets SIGINT through again after its own start, so that has to come first.
         resource_tracker.ensure_running()
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_SUPERVISOR)
         try:
             pid = _server_pid()
             forkserver.ensure_running()

@@ -99,7 +99,7 @@ def take_over(draft: Path) -> bool:
             continue
         if holds_state(left) and _is_dead(left):
             with contextlib.suppress(OSError):  # another was faster
-                left.rename(draft)
+                left.replace(draft)
                 return True
     return False
 

@@ -108,7 +108,7 @@ def resident_memory(pid: int) -> int:
             command = ["ps", "-o", "rss=", "-p", str(pid)]  # macOS has no /proc
             ps = subprocess.run(command, capture_output=True, check=True)  # noqa: S603  # a number
             return int(ps.stdout) * 1024
-        found = re.search(r"^VmRSS:\s*(\d+) kB", status.read_text(), re.MULTILINE)
+        found = re.search(r"^VmRSS:\s*(\d+) kB", status.read_text(encoding="utf-8"), re.MULTILINE)
     except (OSError, ValueError, subprocess.CalledProcessError):
         return 0
     return int(found[1]) * 1024 if found else 0

@@ -13,10 +13,13 @@ import traceback
 from collections.abc import Callable
 from multiprocessing.connection import Connection, wait
 from multiprocessing.reduction import ForkingPickler
+from types import FrameType
 from typing import Any
 
 # What reaches a whole group of processes at once; the supervisor decides what it means.
-_LEFT_TO_SUPERVISOR = ("SIGINT", "SIGTERM", "SIGHUP")
+LEFT_TO_SUPERVISOR = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
 
 
 def answer_from_child(sender: Connection, last_words: Connection, task: bytes) -> None:
@@ -27,9 +30,7 @@ def answer_from_child(sender: Connection, last_words: Connection, task: bytes) -
         last_words: takes the traceback where the process crashes, or is about to be ended.
         task: function, arguments, and what to call if the supervisor dies first, pickled.
     """
-    for name in _LEFT_TO_SUPERVISOR:
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+    leave_signals_to_supervisor()
     _say_last_words(last_words)
     # Only now is the task unpacked: in a process that begins anew, its imports take seconds.
     try:
@@ -41,6 +42,18 @@ def answer_from_child(sender: Connection, last_words: Connection, task: bytes) -
     with contextlib.suppress(BrokenPipeError):
         sender.send(answer)
     sender.close()
+
+
+def leave_signals_to_supervisor() -> None:
+    """Do nothing when such a signal comes; programs that this process starts get it as usual."""
+    for number in LEFT_TO_SUPERVISOR:
+        signal.signal(number, _do_nothing)  # and not SIG_IGN, which they would inherit
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_SUPERVISOR)
+
+
+def _do_nothing(number: int, frame: FrameType | None) -> None:
+    """Handle a signal."""
 
 
 def _words(error: BaseException) -> str:

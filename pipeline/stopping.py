@@ -59,6 +59,7 @@ class StopRequest:
         self.n_asked = 0
         self._asked_at = self._signalled_at = self._raised_at = -math.inf
         self._patience = 0.0  # seconds
+        self._reminds = False
         self._is_reminder = False
         self._is_over = False
         self._reminding = threading.Lock()
@@ -89,7 +90,8 @@ class StopRequest:
             Stopped: when the time is over, also at the beginning of the ``with`` statement; and
                 in the place of any exception that a library made of it.
         """
-        before, self._patience, self._raised_at = self._patience, seconds, -math.inf
+        before = self._patience, self._reminds
+        self._patience, self._reminds, self._raised_at = seconds, True, -math.inf
         try:
             if self._is_due():
                 self.raise_if_asked()
@@ -99,7 +101,7 @@ class StopRequest:
                 raise
             raise Stopped(stop.number) from error
         finally:
-            self._patience = before
+            self._patience, self._reminds = before
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -153,10 +155,10 @@ class StopRequest:
             with self._reminding:
                 if self._is_over:
                     return
-                if self._is_due() and not self._is_reminder:
+                if self._reminds and self._is_due() and not self._is_reminder:
                     self._is_reminder = True
                     if sys.platform == "win32":
-                        _thread.interrupt_main(self.number)
+                        _thread.interrupt_main(signal.Signals(self.number))
                     else:  # unlike the other, this also ends a wait for input or another process
                         signal.pthread_kill(threading.main_thread().ident or 0, self.number)
             time.sleep(_SECONDS_BETWEEN_LOOKS)

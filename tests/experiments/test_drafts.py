@@ -164,7 +164,7 @@ def test_another_process_was_faster(tmp_path, dead_pid, monkeypatch):
     def gone(path, target):
         raise FileNotFoundError(path)
 
-    monkeypatch.setattr(Path, "rename", gone)
+    monkeypatch.setattr(Path, "replace", gone)
     assert not take_over(draft.with_name(f"{owner_of(os.getpid())}@{HERE}@{RUN}"))
 
 
