@@ -79,7 +79,7 @@ def holds_state(draft: Path) -> bool:
 
 def _drafts(root: Path) -> list[Path]:
     with contextlib.suppress(OSError):
-        return sorted((root / FOLDER).iterdir())
+        return sorted(path for path in (root / FOLDER).iterdir() if path.is_dir())
     return []
 
 

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import secrets
 from pathlib import Path
 
 SECONDS_BETWEEN_SIGNS = 5.0
+
+# What is written beside its place for an instant, here and by `pipeline.files.replacing`.
+_FOR_AN_INSTANT = re.compile(r"\..*[0-9a-f]{16}(\.dead)?\.tmp")
+_SECONDS_OF_AN_INSTANT = 5.0
 
 
 def give_sign(path: Path) -> None:
@@ -45,3 +50,16 @@ def _now_in(folder: Path) -> float:
     finally:
         with contextlib.suppress(OSError):
             probe.unlink()
+
+
+def remove_remains(root: Path) -> None:
+    """Remove what processes that were killed have left half written, in a folder or one below."""
+    for path in [*root.glob(".*.tmp"), *root.glob("*/.*.tmp")]:
+        with contextlib.suppress(OSError):
+            if _FOR_AN_INSTANT.fullmatch(path.name) and (
+                seconds_silent(path) > _SECONDS_OF_AN_INSTANT
+            ):
+                if path.is_dir():
+                    path.rmdir()
+                else:
+                    path.unlink()

@@ -18,8 +18,12 @@ def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
         for package, version in info.get("versions", {}).items():
             counts.setdefault(package, Counter())[version] += info.get("n_runs", 1)
     mixed = [
-        f"{package} {', '.join(f'{version} ({n} runs)' for version, n in sorted(found.items()))}"
+        f"{package} {', '.join(_counted(*item) for item in sorted(found.items()))}"
         for package, found in counts.items()
         if len(found) > 1
     ]
     return f"runs were done with different versions: {'; '.join(mixed)}" if mixed else ""
+
+
+def _counted(version: str, n_runs: int) -> str:
+    return f"{version} ({n_runs} run{'' if n_runs == 1 else 's'})"

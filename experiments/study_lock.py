@@ -18,7 +18,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from experiments.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign, last_sign, seconds_silent
+from experiments.folder_clock import (
+    SECONDS_BETWEEN_SIGNS,
+    give_sign,
+    last_sign,
+    remove_remains,
+    seconds_silent,
+)
 from pipeline import liveness
 from pipeline.errors import UserError, visible
 from pipeline.signs_of_life import Heartbeat
@@ -51,12 +57,14 @@ def study_lock(
     path, token = root / NAME, secrets.token_hex(16)
     try:
         _take(path, token, say)
+        remove_remains(root)
         heart = Heartbeat(lambda: _beat(path, token, on_loss), SECONDS_BETWEEN_SIGNS)
         heart.start()
         try:
             yield
         finally:
             heart.stop()
+            remove_remains(root)
             if _read(path).get("token") == token:
                 path.unlink(missing_ok=True)
     finally:
@@ -73,31 +81,30 @@ def _make_folders(root: Path) -> list[Path]:
 
 
 def _take(path: Path, token: str, say: Callable[[str], object]) -> None:
-    draft = path.with_name(f"{NAME}.{token}.tmp")
     mark = {**liveness.mark(), "token": token, "since": time.strftime("%Y-%m-%d %H:%M:%S")}
-    draft.write_text(json.dumps(mark), encoding="utf-8")
-    try:
-        while not _link(draft, path):
-            owner = _read(path)
-            if _is_at_work(path, owner, say):
-                raise StudyInUseError(_words(path.parent, owner))
-            _remove_dead(path, owner)
-    finally:
-        draft.unlink(missing_ok=True)
+    while not _appears(path, json.dumps(mark)):
+        owner = _read(path)
+        if _is_at_work(path, owner, say):
+            raise StudyInUseError(_words(path.parent, owner))
+        _remove_dead(path, owner)
 
 
-def _link(draft: Path, path: Path) -> bool:
+def _appears(path: Path, content: str) -> bool:
     """Let the lock appear, whole; whether it was not there."""
+    draft = path.with_name(f"{NAME}.{secrets.token_hex(8)}.tmp")
     try:
+        draft.write_text(content, encoding="utf-8")
         os.link(draft, path)
     except FileExistsError:
         return False
     except OSError:  # a file system without links: the lock is empty for an instant
         try:
             with path.open("x", encoding="utf-8") as file:
-                file.write(draft.read_text(encoding="utf-8"))
+                file.write(content)
         except FileExistsError:
             return False
+    finally:
+        draft.unlink(missing_ok=True)
     return True
 
 

@@ -131,19 +131,40 @@ def test_of_many_at_once_one_gets_the_lock_of_the_dead(tmp_path):
 
 def test_who_was_killed_while_removing_a_lock_is_in_nobodys_way(tmp_path, monkeypatch):
     path = leave_lock(tmp_path, FOREIGN, seconds=61)
-    remove, monkeypatch_sleep = locks._remove_dead, []
-    monkeypatch.setattr(locks.Path, "unlink", lambda *args, **options: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        remove(path, FOREIGN)
-    monkeypatch.undo()
+
+    def be_killed(folder):
+        raise SystemExit
+
+    with monkeypatch.context() as patch:
+        patch.setattr(locks.Path, "unlink", lambda path, **options: be_killed(path))
+        patch.setattr(locks.Path, "rmdir", be_killed)
+        with pytest.raises(SystemExit):
+            locks._remove_dead(path, FOREIGN)
+    (grave,) = tmp_path.glob("*.dead.tmp")
     assert path.exists()
-    digest = next(iter(tmp_path.glob("*.dead.tmp")), path.with_name(f"{NAME}.x.dead.tmp"))
-    digest.mkdir(exist_ok=True)
-    then = digest.stat().st_mtime - 9
-    os.utime(digest, (then, then))
-    monkeypatch.setattr(time, "sleep", monkeypatch_sleep.append)
+    then = grave.stat().st_mtime - 9
+    os.utime(grave, (then, then))
     with lock(tmp_path):
         pass
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_the_killed_have_half_written_is_removed(tmp_path):
+    half = f".summary.csv.{'0a' * 8}.tmp"
+    names = [half, f".{'0a' * 8}.tmp", f"{NAME}.{'0a' * 8}.tmp", f"figures/{half}", "figures/fresh"]
+    kept = [".mine.tmp", f"runs/agent/{half}", f".new.{'0b' * 8}.tmp", "figures/fresh"]
+    for name in {*names, *kept}:
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+        if "0b" not in name:
+            os.utime(path, (1, 1))
+    with lock(tmp_path):
+        pass
+    found = {
+        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
+    }
+    assert found == set(kept)
 
 
 def test_without_links_it_works_too(tmp_path, monkeypatch):
