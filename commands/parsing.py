@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import atexit
 import codecs
+import contextlib
 import importlib.util
 import io
 import os
@@ -16,7 +18,7 @@ from typing import Any, NoReturn
 
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
-from pipeline.stopping import default_for_signals
+from pipeline.stopping import default_for_signals, n_stops
 
 MISTAKE = 2
 INTERRUPT = 130
@@ -99,13 +101,26 @@ def run_command(main: Callable[[], int]) -> NoReturn:
     code 2. A reader of the output who goes away is no mistake: see `commands.streams`.
     """
     print_on_any_terminal()
+    codes: list[int] = []
+    before = n_stops()
+    atexit.register(_leave, codes)  # before the libraries', so that it is called after them
     with standard_streams() as output:
         code = _exit_code(main)
         if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
             code = code or MISTAKE
-    if code > 128:  # the rest is Python's own, and tells of a further signal in a traceback
-        default_for_signals()
+    if n_stops() > before:
+        default_for_signals()  # what is left to do would tell of a further one in a traceback
+        codes.append(code)
     sys.exit(code)
+
+
+def _leave(codes: list[int]) -> None:
+    """Leave at once where a signal asked for it: to take the libraries down costs a second."""
+    if codes:
+        with contextlib.suppress(OSError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(codes[0])
 
 
 def _exit_code(main: Callable[[], int]) -> int:

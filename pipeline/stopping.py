@@ -132,6 +132,7 @@ class StopRequest:
         self._signalled_at = now
         if self.number is None:
             self.number, self.n_asked, self._asked_at = number, 1, now
+            _noticed.append(number)
             # A thread of `threading` takes locks that the interrupted code may hold.
             _thread.start_new_thread(self._remind, ())
         elif is_another:
@@ -182,6 +183,12 @@ def _stop_behind(error: BaseException) -> Stopped | None:
 
 
 _current: list[StopRequest] = []
+_noticed: list[int] = []
+
+
+def n_stops() -> int:
+    """How many of the `stops_noticed` of this process a signal has asked to stop."""
+    return len(_noticed)
 
 
 def current() -> StopRequest:
