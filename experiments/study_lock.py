@@ -103,6 +103,9 @@ def _appears(path: Path, content: str) -> bool:
                 file.write(content)
         except FileExistsError:
             return False
+        except OSError:  # the disk is full
+            path.unlink(missing_ok=True)
+            raise
     finally:
         draft.unlink(missing_ok=True)
     return True

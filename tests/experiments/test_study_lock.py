@@ -177,6 +177,18 @@ def test_without_links_it_works_too(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_where_nothing_can_be_written_no_lock_is_left(tmp_path, monkeypatch):
+    def full(path, *args, **options):
+        path.touch()
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(locks.Path, "write_text", full)
+    monkeypatch.setattr(locks.Path, "open", full)
+    with pytest.raises(OSError, match="No space left"), lock(tmp_path):
+        never()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_who_was_taken_for_dead_learns_of_it(tmp_path, monkeypatch):
     monkeypatch.setattr(locks, "SECONDS_BETWEEN_SIGNS", 0.01)
     lost = threading.Event()
