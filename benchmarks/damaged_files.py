@@ -29,8 +29,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from experiments.drafts import draft_path
 from experiments.planned_runs import PlannedRun
-from experiments.run_in_child import do_run, draft_path
+from experiments.run_in_child import do_run
 from experiments.study_plan import plan
 from experiments.study_results import read_run
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec

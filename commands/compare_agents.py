@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import _thread
 import argparse
+import signal
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from commands.flag_values import (
     COUNT,
     COUNT_OR_NONE,
     JOBS,
+    RUN_MEMORY,
+    RUN_TIMEOUT,
     filled,
     folder_name,
     number_at_least_zero,
@@ -16,6 +24,16 @@ from commands.flag_values import (
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
 from commands.streams import go_on_unread
+from pipeline.errors import UserError
+from pipeline.signs_of_life import doing
+from pipeline.stopping import stops_noticed
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from experiments.planned_runs import PlannedRun
+    from experiments.run_limits import RunLimits
+    from experiments.study_spec import StudySpec
 
 SEEDS = whole_number(1, 1_000_000)
 
@@ -77,6 +95,7 @@ def build_parser() -> argparse.ArgumentParser:
         dest="is_quick",
         help="few seeds and a small budget, for a first look",
     )
+    _add_run_flags(parser)
     _add_output_flags(parser)
     _add_log_flags(parser)
     return parser
@@ -86,6 +105,19 @@ def _add_log_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
     add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
     add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
+
+
+def _add_run_flags(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument_group("runs").add_argument
+    add("-j", "--jobs", type=JOBS, default=0, metavar="N", help="runs at once (default: all cores)")
+    add("--run-timeout", type=RUN_TIMEOUT, metavar="TIME", help="end a run after, say, 10m")
+    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes, say, 4GB")
+    add("--repair", action="store_true", help="do damaged runs again; their folders are kept")
+    add(
+        "--replace",
+        action="store_true",
+        help="do finished runs of other settings again; their folders are kept",
+    )
 
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:
@@ -104,11 +136,9 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="film an episode every N of them",
     )
-    add("-j", "--jobs", type=JOBS, default=0, metavar="N", help="runs at once (default: all cores)")
     add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
     add("-f", "--log-folder", type=filled, default="logs/studies", help="folder above all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
-    add("--repair", action="store_true", help="do damaged runs again; their folders are kept")
     add("--no-report", action="store_true", help="tables alone: no figures and no page")
 
 
@@ -119,26 +149,72 @@ def main() -> int:
         from commands.compare_on_log import compare_on_log
 
         return compare_on_log(args)
+    with stops_noticed(), _no_other_exit():
+        return _compare(args)
+
+
+@contextmanager
+def _no_other_exit() -> Iterator[None]:
+    """Let no environment or module of the user's end the command as if all were done."""
+    try:
+        yield
+    except SystemExit as stop:
+        code = "" if stop.code is None else f": {stop.code}"
+        raise UserError(f"a module or environment asked the program to exit{code}") from stop
+
+
+def _compare(args: argparse.Namespace) -> int:
+    """Do a study, as the only one that does."""
     from commands.study_request import study_spec
 
     study = study_spec(args)
     from commands.terminal import table_console
-    from experiments.study_plan import check_settings, plan
-    from pipeline.signs_of_life import doing
+    from experiments.child_processes import end_server, stop_all
+    from experiments.run_limits import RunLimits
+    from experiments.study_lock import study_lock
+    from experiments.study_plan import plan
 
     go_on_unread()
     root = Path(args.log_folder) / study.name
+    limits = RunLimits(study.run_timeout, study.run_memory)
     planned = plan(study, root)
     console = table_console()
     console.print(study.title, style="bold", markup=False, highlight=False)
+    say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+
+    def stop() -> None:
+        say(f"{root}: another driver has taken this one for dead; this one stops")
+        stop_all()
+        _thread.interrupt_main(signal.SIGTERM)
+
+    with study_lock(root, stop, say):
+        try:
+            return _do_study(args, study, planned, console, limits)
+        except KeyboardInterrupt:
+            end_server()
+            raise
+
+
+def _do_study(
+    args: argparse.Namespace,
+    study: StudySpec,
+    planned: Sequence[PlannedRun],
+    console: Console,
+    limits: RunLimits,
+) -> int:
+    root = Path(args.log_folder) / study.name
     if args.repair:
         from commands.study_output import repair
 
         repair(console, study, planned)
     with doing(console, "looking for runs that are there") as activity:
         from experiments.child_processes import start_server
+        from experiments.replaced_runs import check_settings_kept
+        from experiments.study_plan import check_settings
         from experiments.warm_ups import warm_ups
 
+        if not args.replace:
+            check_settings_kept(planned, root)
         if any(run.is_to_do for run in planned):
             start_server(warm_ups(planned))  # it imports the libraries while this process does
         activity.now("loading the libraries")
@@ -153,4 +229,5 @@ def main() -> int:
         command_line(),
         n_workers=max(args.jobs, 0),
         with_page=not args.no_report,
+        limits=limits,
     )

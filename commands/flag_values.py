@@ -7,12 +7,15 @@ import decimal
 import math
 from collections.abc import Callable, Mapping
 from decimal import Decimal
+from typing import TypeVar
 
+from experiments import run_limits
 from pipeline.errors import shown
 from pipeline.files import portable_name
 from pipeline.resuming.state_keeping import SaveInterval
 
 LARGEST = 10**12
+Amount = TypeVar("Amount", int, float)
 LONGEST_FOLDER_NAME = 200  # bytes
 _NO_FOLDER_NAME = {"", ".", ".."}
 _NOT_IN_FOLDER_NAMES = set("/\\\0\n")
@@ -78,6 +81,18 @@ def number_at_least_zero(text: str) -> float:
     return number
 
 
+def quantity(read: Callable[[str], Amount]) -> Callable[[str], Amount]:
+    """A reader of amounts with units, of one that raises ValueError; for argparse."""
+
+    def read_flag(text: str) -> Amount:
+        try:
+            return read(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from error
+
+    return read_flag
+
+
 def filled(text: str) -> str:
     """A text that is not empty.
 
@@ -141,4 +156,6 @@ LOG_INTERVAL = whole_number(1, besides={-1: "the library's default", -2: "no log
 SEED = whole_number(0, 2**32 - 1, besides={-1: "a random one"})
 THREADS = whole_number(1, 1024, besides={-1: "PyTorch's own choice", 0: "likewise"})
 VERBOSITY = whole_number(0, 2)
+RUN_TIMEOUT = quantity(run_limits.seconds)
+RUN_MEMORY = quantity(run_limits.memory)
 JOBS = whole_number(1, 4096, besides={-1: "all cores", 0: "likewise"})

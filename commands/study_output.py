@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from commands.study_progress import StudyProgress
+from experiments.child_processes import NO_LIMITS
 from experiments.execution import RunFailure, available_cores, execute
 from experiments.planned_runs import PlannedRun
 from experiments.repair import move_damaged_aside
+from experiments.replaced_runs import move_replaced_aside
+from experiments.run_limits import RunLimits
 from experiments.study_results import LeftOut, StudyResults, read_results
 from experiments.study_spec import StudySpec
 from pipeline.signs_of_life import Activity, doing
@@ -31,6 +34,7 @@ def run_study(
     *,
     n_workers: int = 0,
     with_page: bool = True,
+    limits: RunLimits = NO_LIMITS,
 ) -> int:
     """Do a study as planned, print the judgement, and write tables, figures and page.
 
@@ -42,15 +46,19 @@ def run_study(
         command: the command that asked for it.
         n_workers: runs at once; 0 for as many as there are cores.
         with_page: draw the figures and write the page, beside the tables.
+        limits: what each run may take.
 
     Returns:
-        The exit code: 1 where a run failed or is damaged, else 0.
+        The exit code: 0 if all runs are there and sound, else 1.
     """
-    failures = _do_missing(console, planned, root, command, n_workers or available_cores())
+    _make_way(console, planned, root)
+    n_workers = n_workers or available_cores()
+    failures = _do_missing(console, planned, root, command, n_workers, limits)
     with doing(console, "reading the results") as activity:
         results = read_results(study, planned, root, activity.at)
     if len(results.summary):
         _judge(console, results, command, with_page=with_page)
+        _print_mixed_versions(console, results)
     for failure in failures:
         console.print(
             f"failed: {failure.planned.agent} on {failure.planned.environment}, "
@@ -60,7 +68,25 @@ def run_study(
             soft_wrap=True,
         )
     _print_left_out(console, results.left_out)
-    return 1 if failures or results.left_out else 0
+    n_missing = len(planned) - len(results.finished)
+    if n_missing > len(failures) + len(results.left_out):
+        _say(console, f"{n_missing} of {len(planned)} runs are missing; the same command goes on")
+    return 1 if n_missing else 0
+
+
+def _make_way(console: Console, planned: Sequence[PlannedRun], root: Path) -> None:
+    moved, place = move_replaced_aside(planned, root)
+    if place is not None:
+        runs = "1 run that is" if len(moved) == 1 else f"{len(moved)} runs that are"
+        _say(console, f"{runs} done again: what was there is in {place} now")
+
+
+def _print_mixed_versions(console: Console, results: StudyResults) -> None:
+    from experiments.run_versions import mixed_versions
+
+    note = mixed_versions(run.run.read_info() for run in results.finished)
+    if note:
+        _say(console, note)
 
 
 def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) -> None:
@@ -91,7 +117,12 @@ def _say(console: Console, line: str) -> None:
 
 
 def _do_missing(
-    console: Console, planned: Sequence[PlannedRun], root: Path, command: str, n_workers: int
+    console: Console,
+    planned: Sequence[PlannedRun],
+    root: Path,
+    command: str,
+    n_workers: int,
+    limits: RunLimits,
 ) -> list[RunFailure]:
     missing = [run for run in planned if run.is_to_do]
     done = [run for run in planned if run.is_finished]
@@ -103,7 +134,7 @@ def _do_missing(
     with StudyProgress(console, planned, done) as progress:
         for run in done:
             progress.note_refusal(run)
-        return execute(missing, root, command, n_workers, progress.note)
+        return execute(missing, root, command, n_workers, progress.note, limits)
 
 
 def _judge(console: Console, results: StudyResults, command: str, *, with_page: bool) -> None:

@@ -10,19 +10,23 @@ anew, and imports for some seconds.
 from __future__ import annotations
 
 import contextlib
+import logging
 import multiprocessing
 import os
 import signal
 import sys
 import threading
-import traceback
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
+
+from experiments.awaited_child import RAISED, RETURNED, awaited, kill
+from experiments.run_limits import RunLimits
+from experiments.task_in_child import LEFT_TO_SUPERVISOR, answer_from_child
+from pipeline.stopping import current
 
 PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
 
@@ -34,6 +38,10 @@ START_METHOD = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
 WARM_UPS = "YARDSTICK_WARM_UPS"
 OUR_OWN = "yardstick"
 
+SECONDS_TO_START = 0.3  # that a server takes to fork, once it has imported
+NO_LIMITS = RunLimits()
+
+_log = logging.getLogger(__name__)
 _context: Any = multiprocessing.get_context(START_METHOD)
 _children: set[BaseProcess] = set()
 _lock = threading.Lock()
@@ -41,7 +49,7 @@ _stopping = threading.Event()
 
 
 class TaskFailedError(Exception):
-    """The function raised an exception, or its process died each time.
+    """The function raised an exception, or exceeded a limit.
 
     Attributes:
         details: the traceback, or what is known.
@@ -50,6 +58,10 @@ class TaskFailedError(Exception):
     def __init__(self, message: str, details: str) -> None:
         super().__init__(message)
         self.details = details
+
+
+class TaskDiedError(TaskFailedError):
+    """The process of the function died each time."""
 
 
 class StoppedError(Exception):
@@ -61,6 +73,7 @@ def supervise(
     *args: Any,
     clean_up: Callable[[], object],
     tries: int = 2,
+    limits: RunLimits = NO_LIMITS,
 ) -> Any:
     """Call ``function`` in a child process; again if the process dies without an answer.
 
@@ -69,37 +82,40 @@ def supervise(
         args: what to call it with.
         clean_up: called here after each try, and in the child if this process dies before it.
         tries: how often to begin.
+        limits: what each try may take.
 
     Returns:
         What the function returns.
 
     Raises:
-        TaskFailedError: if it raised an exception, which is not tried again, or died each time.
+        TaskFailedError: if it raised an exception or exceeded a limit, which is not tried again.
+        TaskDiedError: if its process died each time.
         StoppedError: if `stop_all` ended it.
     """
     task = bytes(ForkingPickler.dumps((function, args, clean_up)))
     for _ in range(tries):
-        receiver, sender = _context.Pipe(duplex=False)
-        child = _context.Process(target=_answer_from_child, args=(sender, task), daemon=True)
-        with _started(child):
-            sender.close()
-            try:
-                kind, answer = receiver.recv()
-            except EOFError:
-                kind, answer = "died", None
-            finally:
-                receiver.close()
-            child.join()
-            clean_up()
+        kind, answer = _attempt(task, limits)
+        clean_up()
         if _stopping.is_set():
             raise StoppedError
-        if kind == "returned":
+        if kind == RETURNED:
             return answer
-        if kind == "raised":
+        if kind == RAISED:
             raise TaskFailedError(*answer)
-    code = child.exitcode or 0
-    how = signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    raise TaskFailedError(f"its process died {tries} times ({how})", f"{how}, {tries} times")
+    how, last_words = answer
+    details = f"{last_words}{how}, {tries} times\n"
+    raise TaskDiedError(f"its process died {tries} times ({how})", details)
+
+
+def _attempt(task: bytes, limits: RunLimits) -> tuple[str, Any]:
+    """What became of one child, see `awaited`."""
+    receiver, sender = _context.Pipe(duplex=False)
+    last_words, writer = _context.Pipe(duplex=False)
+    child = _context.Process(target=answer_from_child, args=(sender, writer, task), daemon=True)
+    with receiver, last_words, _started(child):
+        sender.close()
+        writer.close()
+        return awaited(child, receiver, last_words, limits)
 
 
 @contextlib.contextmanager
@@ -107,13 +123,28 @@ def _started(child: BaseProcess) -> Iterator[None]:
     with _lock:
         if _stopping.is_set():
             raise StoppedError
-        child.start()
+        _start(child)
         _children.add(child)
     try:
         yield
     finally:
         with _lock:
             _children.discard(child)
+
+
+def _start(child: BaseProcess) -> None:
+    """Start a child; from a new server, where somebody has killed the one there was."""
+    if _context.get_start_method() != "forkserver":
+        child.start()
+        return
+    for _ in range(3):
+        _ensure_fork_server()
+        with contextlib.suppress(EOFError, OSError):
+            child.start()
+            return
+        if _stopping.is_set():
+            raise StoppedError
+    child.start()
 
 
 @contextlib.contextmanager
@@ -129,10 +160,11 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
     try:
         yield executor
     except BaseException:
-        stop_all()
+        with current().held():  # a second Ctrl-C finds it as short as it can be
+            stop_all()
+            executor.shutdown(cancel_futures=True)
         raise
-    finally:
-        executor.shutdown(cancel_futures=True)
+    executor.shutdown(cancel_futures=True)
 
 
 def start_server(warm_ups: str = "[]") -> None:
@@ -154,50 +186,52 @@ def start_server(warm_ups: str = "[]") -> None:
 
 
 def _start_fork_server(warm_ups: str) -> None:
-    """Start the process that children are forked from, which ignores Ctrl-C while it imports."""
+    """Start the process that children are forked from."""
+    os.environ[WARM_UPS] = warm_ups
+    _context.set_forkserver_preload(PRELOADED)
+    _ensure_fork_server()
+
+
+def _ensure_fork_server() -> None:
+    """Start it where it is not there; signals to all processes at once leave it as it is."""
     if sys.platform != "win32":
         from multiprocessing import forkserver, resource_tracker
 
-        os.environ[WARM_UPS] = warm_ups
-        _context.set_forkserver_preload(PRELOADED)
         # It lets SIGINT through again after its own start, so that has to come first.
         resource_tracker.ensure_running()
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_SUPERVISOR)
         try:
+            pid = _server_pid()
             forkserver.ensure_running()
+            if pid is not None and _server_pid() != pid:
+                _log.warning("the process that runs are forked from was killed; it is started anew")
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
+def _server_pid() -> int | None:
+    """The process that children are forked from, where there is one."""
+    server = getattr(sys.modules.get("multiprocessing.forkserver"), "_forkserver", None)
+    pid = getattr(server, "_forkserver_pid", None)
+    return pid if isinstance(pid, int) else None
+
+
 def stop_all() -> None:
     """End all children, and let none be started any more."""
-    with _lock:
-        _stopping.set()
-        for child in _children:
-            child.kill()
-
-
-def _answer_from_child(sender: Connection, task: bytes) -> None:
-    # Ctrl-C reaches the whole group of processes; the supervisor decides what it means. Only then
-    # is the task unpacked: in a process that begins anew, its imports take seconds.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _stopping.set()
+    if not _lock.acquire(timeout=SECONDS_TO_START):
+        end_server()  # one is being started, by a server that is still importing
+        _lock.acquire()
     try:
-        function, args, clean_up = ForkingPickler.loads(task)
-        threading.Thread(target=_end_with_parent, args=(clean_up,), daemon=True).start()
-        answer = ("returned", function(*args))
-    except Exception as error:  # noqa: BLE001  # whatever it is, the supervisor is told
-        message = " ".join(str(error).split()) or type(error).__name__
-        answer = ("raised", (message, traceback.format_exc()))
-    with contextlib.suppress(BrokenPipeError):
-        sender.send(answer)
-    sender.close()
+        for child in _children:
+            kill(child)
+    finally:
+        _lock.release()
 
 
-def _end_with_parent(clean_up: Callable[[], object]) -> None:
-    """Leave nothing behind when the supervisor is gone."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    wait([parent.sentinel])
-    with contextlib.suppress(OSError):
-        clean_up()
-    os._exit(1)
+def end_server() -> None:
+    """End the process that children are forked from, whatever it is at."""
+    pid = _server_pid()
+    if sys.platform != "win32" and pid is not None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)

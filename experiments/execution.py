@@ -9,15 +9,18 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from experiments.child_processes import StoppedError, TaskFailedError, local_executor, supervise
-from experiments.planned_runs import PlannedRun
-from experiments.run_in_child import (
-    do_run,
-    draft_path,
-    make_folder,
-    remove_dead_drafts,
-    remove_draft,
+from experiments.child_processes import (
+    NO_LIMITS,
+    StoppedError,
+    TaskDiedError,
+    TaskFailedError,
+    local_executor,
+    supervise,
 )
+from experiments.drafts import leave_drafts, make_folder, remove_dead_drafts, run_name
+from experiments.planned_runs import PlannedRun
+from experiments.run_in_child import do_planned_run
+from experiments.run_limits import RunLimits
 from experiments.study_spec import file_name
 from pipeline.files import write_text
 
@@ -51,7 +54,12 @@ def available_cores() -> int:
 
 
 def execute(
-    runs: Sequence[PlannedRun], root: Path, command: str, n_workers: int, listener: Listener
+    runs: Sequence[PlannedRun],
+    root: Path,
+    command: str,
+    n_workers: int,
+    listener: Listener,
+    limits: RunLimits = NO_LIMITS,
 ) -> list[RunFailure]:
     """Do the runs, each in a process of its own.
 
@@ -61,23 +69,31 @@ def execute(
         command: the command that asked for it, noted in every run folder.
         n_workers: how many at once.
         listener: called for every run that has ended, with how it failed if it did.
+        limits: what each may take.
 
     Returns:
         Those that failed.
     """
-    remove_dead_drafts(root)
+    remove_dead_drafts(root, {run_name(run) for run in runs})
     if not runs:
         return []
     with local_executor(min(n_workers, len(runs))) as executor:
-        return execute_on(executor, runs, root, command, listener)
+        failures = execute_on(executor, runs, root, command, listener, limits)
+    remove_dead_drafts(root, {run_name(failure.planned) for failure in failures})
+    return failures
 
 
 def execute_on(
-    executor: Executor, runs: Sequence[PlannedRun], root: Path, command: str, listener: Listener
+    executor: Executor,
+    runs: Sequence[PlannedRun],
+    root: Path,
+    command: str,
+    listener: Listener,
+    limits: RunLimits = NO_LIMITS,
 ) -> list[RunFailure]:
     """As `execute`, wherever the workers of ``executor`` are, if they share the folder."""
     failures = []
-    futures = {executor.submit(_supervised_run, run, root, command): run for run in runs}
+    futures = {executor.submit(_supervised_run, run, root, command, limits): run for run in runs}
     for future in as_completed(futures):
         failure = future.result()
         listener(futures[future], failure)
@@ -86,14 +102,18 @@ def execute_on(
     return failures
 
 
-def _supervised_run(planned: PlannedRun, root: Path, command: str) -> RunFailure | None:
-    log = failure_log(root, planned)
-    draft = draft_path(root, planned)
+def _supervised_run(
+    planned: PlannedRun, root: Path, command: str, limits: RunLimits
+) -> RunFailure | None:
+    log, name = failure_log(root, planned), run_name(planned)
+    clean_up = partial(leave_drafts, root, name)
     try:
-        supervise(do_run, planned, draft, command, clean_up=partial(remove_draft, draft))
+        supervise(do_planned_run, planned, root, command, clean_up=clean_up, limits=limits)
     except StoppedError:
         return None
     except TaskFailedError as error:
+        if not isinstance(error, TaskDiedError):
+            leave_drafts(root, name, with_states=True)  # the next try begins anew
         make_folder(log.parent)
         write_text(log, error.details)
         return RunFailure(planned, str(error), log)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 
 from experiments.child_processes import OUR_OWN, WARM_UPS
+from experiments.task_in_child import leave_signals_to_supervisor
 from experiments.warm_ups import take_steps, train_aside
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -20,6 +21,7 @@ def _warm_up() -> None:
     take_steps(os.environ.pop(WARM_UPS, "[]"))
 
 
+leave_signals_to_supervisor()
 if os.environ.get("PYTHONSAFEPATH") == OUR_OWN:
     del os.environ["PYTHONSAFEPATH"]  # what a run starts is to find its modules as usual
 _warm_up()

@@ -63,12 +63,39 @@ class PlannedRun:
             return False
         if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
             return False
-        spec = info.get("spec")
-        recorded = completed(spec if isinstance(spec, dict) else {})
-        wanted = self.spec.save_every_n_episodes
+        recorded, wanted = _recorded(info), self.spec.save_every_n_episodes
         return _identity(recorded) == _identity(self.spec.as_data()) and (
             wanted < 1 or self.is_batch or recorded["save_every_n_episodes"] == wanted
         )
+
+    def is_of(self, run: Run) -> bool:
+        """Whether what a folder was begun with is this very run."""
+        try:
+            recorded = _recorded(run.read_info())
+        except DamagedFileError:
+            return False
+        return _identity(recorded) == _identity(self.spec.as_data())
+
+    @property
+    def differences(self) -> dict[str, tuple[Any, Any]]:
+        """By name, the settings of a finished run in this folder beside those that are asked for.
+
+        Empty where they are the same: then a run is done again because it lacks something, such as
+        checkpoints, or in a batch the seeds that are new.
+        """
+        try:
+            info = self.run.read_info()
+        except DamagedFileError:
+            return {}
+        if info.get("state") != FINISHED:
+            return {}
+        there = _by_name(_identity(_recorded(info)))
+        now = _by_name(_identity(self.spec.as_data()))
+        return {
+            name: (there.get(name), now.get(name))
+            for name in {**there, **now}
+            if there.get(name) != now.get(name)
+        }
 
     @property
     def is_to_do(self) -> bool:
@@ -99,3 +126,15 @@ class PlannedRun:
 def _identity(spec: Mapping[str, Any]) -> Any:
     kept = {key: value for key, value in spec.items() if key not in _MAY_DIFFER}
     return json.loads(json.dumps(kept))
+
+
+def _recorded(info: Mapping[str, Any]) -> dict[str, Any]:
+    spec = info.get("spec")
+    return completed(spec if isinstance(spec, dict) else {})
+
+
+def _by_name(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as they are called, hyperparameters among them."""
+    settings = dict(identity)
+    hyperparams = settings.pop("hyperparams", None)
+    return {**settings, **(hyperparams if isinstance(hyperparams, dict) else {})}

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 from agents import ALGORITHMS
+from experiments import run_limits
 from experiments.study_spec import (
     AgentSpec,
     EnvironmentSpec,
@@ -45,7 +46,12 @@ _STUDY_VALUES: dict[str, Any] = {
     "threshold": float,
     "episodes_table": int,
 }
-_STUDY_KEYS = (*_STUDY_VALUES, "agents", "environments", "settings", "sweep", "quick")
+# Limits of each run, written as on the command line.
+_LIMITS: dict[str, Callable[[str], float]] = {
+    "run_timeout": run_limits.seconds,
+    "run_memory": run_limits.memory,
+}
+_STUDY_KEYS = (*_STUDY_VALUES, *_LIMITS, "agents", "environments", "settings", "sweep", "quick")
 _AGENT_KEYS = ("algo", "tuned", "conf_file", "summary", "sweep")
 _QUICK_VALUES: dict[str, Any] = {"seeds": int, "budget": float}
 _NOT_NEGATIVE = ("margin", "episodes_table")
@@ -137,6 +143,7 @@ def read_study(path: Path) -> StudySpec:
     data = document.mapping(data)
     document.check_names(data, _STUDY_KEYS)
     values = {"title": path.stem, **document.values(data, _STUDY_VALUES)}
+    values |= _run_limits(document, data)
     document.check_budget(data)
     shared = document.mapping(data.get("settings"), "settings")
     document.check_budget(shared, "settings")
@@ -153,6 +160,17 @@ def read_study(path: Path) -> StudySpec:
         source=path,
         **values,
     )
+
+
+def _run_limits(document: _Document, data: Mapping[str, Any]) -> dict[str, float]:
+    limits = {}
+    for key, read in _LIMITS.items():
+        if data.get(key) is not None:
+            try:
+                limits[key] = read(str(data[key]))
+            except ValueError as error:
+                raise UserError(f"{document.at(key)}: {key} {error}") from error
+    return limits
 
 
 def _entries(

@@ -133,6 +133,8 @@ class StudySpec:
         user_modules: the same, as another process can import them.
         tensorboard: whether each run writes a TensorBoard log.
         render_every: episodes between two that are filmed; 0 for no films.
+        run_timeout: seconds that each run may take; None for no limit.
+        run_memory: bytes of memory that each run may take; None for no limit.
         source: the file that it was read from, or None.
     """
 
@@ -154,6 +156,8 @@ class StudySpec:
     user_modules: tuple[UserModule, ...] = ()
     tensorboard: bool = False
     render_every: int = 0
+    run_timeout: float | None = None
+    run_memory: int | None = None
     source: Path | None = None
 
     def quickened(self) -> StudySpec:

@@ -96,7 +96,8 @@ def type_in_own_folder(own_folder, monkeypatch, capsys):
 @pytest.fixture(scope="session")
 def do_study():
     """Does the runs of a study that are missing, in this process, and reads its results."""
-    from experiments.run_in_child import do_run, draft_path
+    from experiments.drafts import draft_path
+    from experiments.run_in_child import do_run
     from experiments.study_plan import plan
     from experiments.study_results import read_results
 
@@ -114,8 +115,9 @@ def do_study():
 def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
     from experiments.analysis import analyse
+    from experiments.drafts import draft_path
     from experiments.execution import failure_log
-    from experiments.run_in_child import do_run, draft_path
+    from experiments.run_in_child import do_run
     from experiments.study_plan import plan
     from experiments.study_results import read_results
     from pipeline.files import write_text

@@ -8,6 +8,7 @@ from typing import Any
 
 from experiments.execution import failure_log
 from experiments.planned_runs import PlannedRun
+from experiments.run_versions import mixed_versions
 from experiments.study_results import StudyResults
 from report.page.markup import setting
 from report.page.sections import Report, Section
@@ -60,6 +61,7 @@ def section(report: Report) -> Section | None:
             for e in report.analysis.environments
         ],
         "versions": _versions(info for _, info in done),
+        "mixed": mixed_versions(info for _, info in done),
         "missing": _missing_runs(results, missing),
     }
     return Section("settings", "Settings", context, by_environment=True)

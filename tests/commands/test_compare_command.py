@@ -77,7 +77,30 @@ class Slow(Walk):
             time.sleep(0.05)
 
 
-for kind in (Fragile, Killed, Slow):
+class Leaves(Walk):
+    """Ends the program, or so it thinks, in the training with seed 0 or 1."""
+
+    def act(self):
+        if self.seed < 2 and self.steps == 30:
+            raise (SystemExit, KeyboardInterrupt)[self.seed]("bye")
+
+
+class Refuses(Walk):
+    """Ends the program as soon as it is made."""
+
+    def __init__(self):
+        raise SystemExit(0)
+
+
+class Late(Walk):
+    """Goes no further in the training with seed 1."""
+
+    def act(self):
+        while self.seed == 1 and self.steps == 30:
+            time.sleep(0.05)
+
+
+for kind in (Fragile, Killed, Slow, Leaves, Refuses, Late):
     gym.register(f"{kind.__name__}-v0", entry_point=kind, max_episode_steps=20)
 '''
 
@@ -165,10 +188,26 @@ def test_what_is_there_is_not_run_again(type_command, folder):
     assert first.items() <= extended.items()
     assert sorted(rows(study)["seed"]) == [0, 0, 1, 1, 2, 2]
 
-    code, out, _ = type_command(*PAIR, "--seeds", 3, "-params", "gamma:0.9")
-    assert (code, "6 runs, 0 of them there already" in out) == (0, True)
-    assert set(records(study)) == set(extended)
-    assert not set(records(study).values()) & set(extended.values())
+
+def test_finished_runs_of_other_settings_are_replaced_only_when_asked(type_command, folder):
+    study = folder / "studies" / "FrozenLake-v1_qlearning-sarsa"
+    assert type_command(*PAIR, "--seeds", 2)[0] == 0
+    first = records(study)
+    other = [*PAIR, "--seeds", 2, "-params", "gamma:0.9"]
+    code, out, err = type_command(*other)
+    assert (code, out.count("\n"), err.count("\n")) == (2, 1, 1)
+    assert "4 finished runs have other settings (gamma: 0.995 there, 0.9 now)" in err
+    assert "--name NAME" in err
+    assert records(study) == first
+
+    code, out, _ = type_command(*other, "--replace")
+    assert (code, "4 runs, 0 of them there already" in out) == (0, True)
+    assert set(records(study)) == set(first)
+    assert not set(records(study).values()) & set(first.values())
+    place = study / "replaced" / "1"
+    assert f"4 runs that are done again: what was there is in {place.relative_to(folder)}" in out
+    place.rename(place.parent / "runs")
+    assert records(place.parent) == first
 
 
 def test_the_same_seed_gives_the_same_run_as_train_py(type_command, folder, monkeypatch):
@@ -277,7 +316,11 @@ def test_a_killed_driver_leaves_no_orphans_and_no_drafts(folder):
     process.kill()
     process.communicate()
     wait_for(lambda: not any(map(is_alive, started)))
-    wait_for(lambda: not study.exists())
+    # Of the driver itself its lock is left, which nobody heeds.
+    wait_for(lambda: [path.name for path in study.iterdir()] == [".lock"])
+    (folder / "mark").touch()
+    assert finish(*SLOW)[0] == 0
+    assert sorted(path.name for path in study.iterdir()) == ["curves.csv.gz", "runs", "summary.csv"]
 
 
 def test_ctrl_c_ends_with_130_and_goes_on_afterwards(folder):
@@ -295,6 +338,81 @@ def test_ctrl_c_ends_with_130_and_goes_on_afterwards(folder):
     code, out, _ = finish(*SLOW)
     assert (code, "2 runs, 0 of them there already" in out) == (0, True)
     assert len(records(study)) == 2
+
+
+@pytest.mark.parametrize(("number", "to_all"), [(signal.SIGTERM, True), (signal.SIGHUP, False)])
+def test_other_signals_do_what_ctrl_c_does(folder, number, to_all):
+    """A cluster sends SIGTERM, a terminal that is closed SIGHUP; some to every process."""
+    process, study = begin_slowly(folder)
+    started = session_of(process.pid)
+    (os.killpg if to_all else os.kill)(process.pid, number)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 128 + number
+    assert err == f"compare.py: ended by {number.name}\n"
+    assert "0 of 2 runs" in out
+    assert "the same command goes on" in out
+    wait_for(lambda: not any(map(is_alive, started)))
+    assert not study.exists()
+
+
+def test_a_second_driver_says_who_is_at_work_and_touches_nothing(folder):
+    process, study = begin_slowly(folder)
+    before = [*sorted(study.iterdir()), *sorted(study.glob(".drafts/*"))]
+    code, _, err = finish(*SLOW, "-params", "gamma:0.5", "--replace", "--repair")
+    assert (code, err.count("\n")) == (2, 1)
+    assert f"process {process.pid} on " in err
+    assert [*sorted(study.iterdir()), *sorted(study.glob(".drafts/*"))] == before
+    (folder / "mark").touch()
+    process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert len(records(study)) == 2
+
+
+def test_what_a_dead_driver_began_is_gone_on_with(folder):
+    """Until a run can go on from its state, what is taken over is begun anew; nothing is left."""
+    process, study = begin_slowly(folder)
+    drafts = list(study.glob(".drafts/*"))
+    for draft in drafts:
+        (draft / "state").mkdir()
+        (draft / "state" / "newest").touch()
+    process.kill()
+    process.communicate()
+    wait_for(lambda: not session_of(process.pid) or not any(map(is_alive, session_of(process.pid))))
+    assert sorted(study.glob(".drafts/*")) == sorted(drafts)
+    (folder / "mark").touch()
+    assert finish(*SLOW)[0] == 0
+    assert sorted(path.name for path in study.iterdir()) == ["curves.csv.gz", "runs", "summary.csv"]
+
+
+def test_an_environment_ends_its_run_and_nothing_else(folder):
+    words = ["--env", "Leaves-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+    code, out, err = finish(*words, "--seeds", 3, "-n", 300, "--no-report", "-f", "studies")
+    assert (code, err) == (1, "")
+    assert "seed 0: SystemExit: bye" in out
+    assert "seed 1: KeyboardInterrupt" in out
+    study = folder / "studies" / "Leaves-v0_qlearning"
+    assert sorted(rows(study)["seed"]) == [2]
+    assert not (study / ".drafts").exists()
+
+
+def test_an_environment_cannot_end_the_command_as_if_all_were_done(type_command, folder):
+    words = ["--env", "Refuses-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+    code, _, err = type_command(*words, "-n", 300, "-f", "studies")
+    assert (code, err.count("\n")) == (2, 1)
+    assert "a module or environment asked the program to exit: 0" in err
+
+
+def test_a_run_that_hangs_is_ended_and_says_where_it_was(folder):
+    (folder / "late.yml").write_text(
+        "agents: [qlearning]\nenvironments: [Late-v0]\nn_timesteps: 300\nseeds: 2\n"
+        "run_timeout: 4s\n"
+    )
+    words = ["late.yml", "--gym-packages", "fragile_walks", "--no-report", "-f", "studies"]
+    code, out, err = finish(*words)
+    assert (code, err) == (1, "")
+    assert "seed 1: took longer than --run-timeout allows, 4 s" in out
+    log = folder / "studies" / "late" / "failures" / "qlearning@Late-v0_2.txt"
+    assert "in act\n" in log.read_text()
 
 
 def test_ctrl_c_while_the_libraries_load(folder):

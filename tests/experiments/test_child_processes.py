@@ -9,17 +9,21 @@ import sys
 import threading
 import time
 from functools import partial
+from pathlib import Path
 
 import pytest
 
 from experiments import child_processes
 from experiments.child_processes import (
     StoppedError,
+    TaskDiedError,
     TaskFailedError,
+    end_server,
     local_executor,
     stop_all,
     supervise,
 )
+from experiments.run_limits import RunLimits
 
 # What the children are to do; they import it by its name.
 CHORES = """
@@ -48,9 +52,30 @@ def wait(folder):
     time.sleep(600)
 
 def interrupt_itself():
-    os.kill(os.getpid(), signal.SIGINT)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        os.kill(os.getpid(), number)
     time.sleep(0.05)
     return "still here"
+
+def say_why_it_ends(kind, *words):
+    raise {"exit": SystemExit, "interrupt": KeyboardInterrupt}[kind](*words)
+
+def crash():
+    import ctypes
+    ctypes.string_at(0)
+
+def hold_on():
+    time.sleep(600)
+
+def grow():
+    kept = bytearray(b"x") * 800_000_000
+    time.sleep(600)
+
+def write_and_wait(folder, text):
+    (Path(folder) / f"waiting_{os.getpid()}").touch()
+    while not (Path(folder) / "go").exists():
+        time.sleep(0.01)
+    return text
 
 def threads():
     return os.environ["OMP_NUM_THREADS"]
@@ -171,6 +196,98 @@ def test_nothing_is_started_after_the_end(chores):
         stop_all()
         future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)
         assert isinstance(future.exception(), StoppedError)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("exit", "bye"), "SystemExit: bye"),
+        (("exit", 0), "SystemExit: 0"),
+        (("exit",), "SystemExit"),
+        (("interrupt",), "KeyboardInterrupt"),
+        (("interrupt", "from\n inside"), "KeyboardInterrupt: from inside"),
+    ],
+)
+def test_what_ends_a_program_is_a_failure_like_others(chores, arguments, words):
+    with pytest.raises(TaskFailedError) as error:
+        supervise(chores.say_why_it_ends, *arguments, clean_up=nothing)
+    assert str(error.value) == words
+    assert "in say_why_it_ends" in error.value.details
+
+
+def test_a_crash_leaves_its_traceback(chores):
+    with pytest.raises(TaskDiedError, match=r"SIGSEGV") as error:
+        supervise(chores.crash, clean_up=nothing, tries=1)
+    assert "Fatal Python error: Segmentation fault" in error.value.details
+    assert "in crash\n" in error.value.details
+    assert "Extension modules" not in error.value.details
+
+
+@pytest.mark.parametrize(
+    ("chore", "limits", "reason"),
+    [
+        ("hold_on", RunLimits(seconds=0.5), "took longer than --run-timeout allows, 0.5 s"),
+        ("grow", RunLimits(memory=700_000_000), "--run-memory allows 700 MB"),
+    ],
+)
+def test_what_exceeds_a_limit_is_ended_where_it_is(chores, tmp_path, chore, limits, reason, method):
+    if method == "spawn" and chore == "hold_on":
+        limits, reason = RunLimits(seconds=5), "--run-timeout allows, 5 s"
+    clean_up = partial(chores.clean_up, str(tmp_path))
+    with pytest.raises(TaskFailedError) as error:
+        supervise(getattr(chores, chore), clean_up=clean_up, limits=limits)
+    assert reason in str(error.value)
+    assert f"in {chore}\n" in error.value.details
+    assert error.value.details.endswith(f"{error.value}\n")
+    assert not isinstance(error.value, TaskDiedError)
+    assert (tmp_path / "cleaned").read_text() == "."
+
+
+def test_within_its_limits_a_task_is_left_alone(chores):
+    limits = RunLimits(seconds=300, memory=10**12)
+    assert supervise(chores.add, 1, 1, clean_up=nothing, limits=limits)[0] == 2
+
+
+def test_when_the_server_is_killed_all_go_on(chores, tmp_path, method, caplog):
+    if method == "spawn":
+        return
+    with local_executor(2) as executor:
+        first = executor.submit(
+            supervise, chores.write_and_wait, str(tmp_path), "first", clean_up=nothing
+        )
+        wait_for(lambda: list(tmp_path.glob("waiting_*")))
+        server = child_processes._server_pid()
+        end_server()
+        wait_for(lambda: not is_alive(server) or is_zombie(server))
+        assert executor.submit(supervise, chores.add, 1, 1, clean_up=nothing).result()[0] == 2
+        (tmp_path / "go").touch()
+        assert first.result() == "first"
+    assert caplog.messages == [
+        "the process that runs are forked from was killed; it is started anew"
+    ]
+
+
+def is_zombie(pid):
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+def test_a_stop_does_not_wait_for_a_server_that_imports(chores, tmp_path, method, monkeypatch):
+    """Where it is still at that, no child can be started, and the one who waits is let go."""
+    if method == "spawn":
+        return
+    end_server()
+    with local_executor(1) as executor:
+        os.kill(child_processes._server_pid(), signal.SIGSTOP)
+        future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)
+        wait_for(child_processes._lock.locked)
+        began = time.monotonic()
+        stop_all()
+        assert isinstance(future.exception(), StoppedError)
+        assert time.monotonic() - began < 2
+
+
+def test_programs_that_a_task_starts_can_be_ended_as_usual(chores):
+    assert supervise(subprocess.getoutput, "kill $$; echo still here", clean_up=nothing) == ""
 
 
 def test_ctrl_c_does_not_reach_the_children(chores, tmp_path):

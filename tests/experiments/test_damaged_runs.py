@@ -14,9 +14,10 @@ from rich.console import Console
 import compare
 from commands.study_output import repair, run_study
 from experiments.bandit_batches import STATISTICS_FILE
+from experiments.drafts import draft_path
 from experiments.repair import move_damaged_aside
 from experiments.run_figures import read_value_maps
-from experiments.run_in_child import do_run, draft_path
+from experiments.run_in_child import do_run
 from experiments.study_plan import plan
 from experiments.study_results import read_results, read_run
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec

@@ -2,34 +2,54 @@
 
 import os
 import platform
-import runpy
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
-from experiments import run_in_child
-from experiments.run_in_child import (
+from experiments import drafts, run_in_child
+from experiments.drafts import (
     claim_draft,
-    do_run,
     draft_path,
+    leave_drafts,
     make_folder,
     remove_dead_drafts,
     remove_draft,
+    take_over,
 )
+from experiments.run_in_child import do_run
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline import liveness
 
 HERE = platform.node()
+RUN = "qlearning@lake_1"
 
 
-def draft_of(root, pid, machine=HERE):
-    """A draft as a process of that number has left it on that machine."""
-    draft = root / ".drafts" / f"{pid}@{machine}@qlearning@lake_1"
+def draft_of(root, process, machine=HERE, state=False, run=RUN):
+    """A draft as a process has left it on that machine: what it is called, or its number."""
+    owner = process if isinstance(process, str) else owner_of(process)
+    draft = root / ".drafts" / f"{owner}@{machine}@{run}"
     (draft / "inner").mkdir(parents=True)
     (draft / "inner" / "0.monitor.csv").write_text("half a li")
+    if state:
+        (draft / "state").mkdir()
+        (draft / "state" / "newest").write_text("far")
     return draft
+
+
+def owner_of(pid):
+    """How drafts name a process of this machine that is there, or was."""
+    mark = liveness.mark()
+    stat = Path(f"/proc/{pid}/stat")
+    began = stat.read_text().rpartition(")")[2].split()[19] if stat.exists() else 1
+    return f"{pid}-{began}-{drafts._place(mark)}"
+
+
+def let_pass(draft, seconds):
+    then = draft.stat().st_mtime - seconds
+    os.utime(draft, (then, then))
 
 
 @pytest.fixture
@@ -62,71 +82,95 @@ def test_what_a_live_process_writes_stays(tmp_path, live_pid):
     assert [(draft / "inner" / "0.monitor.csv").is_file() for draft in drafts] == [True, True]
 
 
-def test_of_another_machine_nothing_is_known(tmp_path, dead_pid):
-    draft = draft_of(tmp_path, dead_pid, machine=f"{HERE}2")
+@pytest.mark.parametrize("owner", ["1-1-00000000", "nobody"])
+def test_elsewhere_a_process_counts_as_gone_once_it_is_silent(tmp_path, owner):
+    """On another machine, or before the last boot."""
+    draft = draft_of(tmp_path, owner, machine="elsewhere")
     remove_dead_drafts(tmp_path)
     assert draft.is_dir()
+    let_pass(draft, 44)
+    remove_dead_drafts(tmp_path)
+    assert draft.is_dir()
+    let_pass(draft, 46)
+    remove_dead_drafts(tmp_path)
+    assert not tmp_path.exists()
+
+
+def test_a_number_that_is_used_again_is_another_process(tmp_path, live_pid):
+    owner = owner_of(live_pid).split("-")
+    draft = draft_of(tmp_path, f"{owner[0]}-1-{owner[2]}")
+    remove_dead_drafts(tmp_path)
+    assert not draft.exists()
 
 
 def test_each_draft_is_judged_by_itself(tmp_path, dead_pid, live_pid):
     dead, alive = draft_of(tmp_path, dead_pid), draft_of(tmp_path, live_pid)
-    elsewhere = draft_of(tmp_path, dead_pid, machine="elsewhere")
-    nobodys = draft_of(tmp_path, "nobody")
+    elsewhere = draft_of(tmp_path, "1-1-00000000", machine="elsewhere")
     remove_dead_drafts(tmp_path)
-    assert [path.exists() for path in (dead, alive, elsewhere, nobodys)] == [0, 1, 1, 0]
+    assert [path.exists() for path in (dead, alive, elsewhere)] == [0, 1, 1]
     assert sorted((tmp_path / ".drafts").iterdir()) == sorted([alive, elsewhere])
 
 
-def test_a_process_of_another_user_is_alive(tmp_path, dead_pid, monkeypatch):
-    def refuse(pid, signal):
-        assert (pid, signal) == (dead_pid, 0)
-        raise PermissionError
-
-    monkeypatch.setattr(os, "kill", refuse)
-    draft = draft_of(tmp_path, dead_pid)
-    remove_dead_drafts(tmp_path)
+def test_a_state_is_kept_for_a_run_that_is_still_to_do(tmp_path, dead_pid):
+    draft = draft_of(tmp_path, dead_pid, state=True)
+    remove_dead_drafts(tmp_path, {RUN})
+    leave_drafts(tmp_path, RUN)
     assert draft.is_dir()
+    remove_dead_drafts(tmp_path, {"qlearning@lake_2"})
+    assert not tmp_path.exists()
 
 
-class _Windows:
-    """What Windows says of three processes: one at work, one that has ended, another user's."""
-
-    SYNCHRONIZE, WAIT_OBJECT_0, WAIT_TIMEOUT = 0x100000, 0, 0x102
-
-    def __init__(self):
-        self.n_open = 0
-
-    def OpenProcess(self, access, inherit, pid):  # noqa: N802  # that is what it is called
-        assert (access, inherit) == (self.SYNCHRONIZE, False)
-        if pid == 3:
-            raise PermissionError
-        if pid > 3:
-            raise OSError(22, "the parameter is incorrect")
-        self.n_open += 1
-        return pid
-
-    def WaitForSingleObject(self, handle, milliseconds):  # noqa: N802
-        assert milliseconds == 0
-        return {1: self.WAIT_TIMEOUT, 2: self.WAIT_OBJECT_0}[handle]
-
-    def CloseHandle(self, handle):  # noqa: N802
-        self.n_open -= 1
+def test_a_run_that_is_over_leaves_no_state(tmp_path, dead_pid, live_pid):
+    draft_of(tmp_path, dead_pid, state=True)
+    others = draft_of(tmp_path, live_pid, state=True)
+    another = draft_of(tmp_path, dead_pid, state=True, run="qlearning@lake_2")
+    leave_drafts(tmp_path, RUN, with_states=True)
+    assert sorted((tmp_path / ".drafts").iterdir()) == sorted([others, another])
 
 
-def test_on_windows_nothing_is_sent_to_the_process(tmp_path, monkeypatch):
-    windows = _Windows()
-    monkeypatch.setitem(sys.modules, "_winapi", windows)
-    monkeypatch.setattr(sys, "platform", "win32")
-    monkeypatch.delattr(os, "kill")
-    drafts = [draft_of(tmp_path, pid) for pid in (1, 2, 3, 4)]
-    runpy.run_path(run_in_child.__file__)["remove_dead_drafts"](tmp_path)
-    assert [draft.exists() for draft in drafts] == [True, False, True, False]
-    assert windows.n_open == 0
+def test_what_this_process_has_left_without_a_state_is_removed(tmp_path):
+    draft = draft_of(tmp_path, os.getpid())
+    leave_drafts(tmp_path, "another run")
+    assert draft.is_dir()
+    leave_drafts(tmp_path, RUN)
+    assert not draft.exists()
+
+
+def test_the_next_process_takes_over_what_a_dead_one_has_left(tmp_path, dead_pid, live_pid):
+    own = tmp_path / ".drafts" / f"{owner_of(os.getpid())}@{HERE}@{RUN}"
+    assert not take_over(own)
+    draft_of(tmp_path, dead_pid, run="qlearning@lake_2", state=True)
+    draft_of(tmp_path, live_pid, state=True)
+    draft_of(tmp_path, f"{dead_pid}-2-{drafts._place(liveness.mark())}")  # without a state
+    assert not take_over(own)
+    assert not own.exists()
+    left = draft_of(tmp_path, dead_pid, state=True)
+    assert take_over(own)
+    assert not left.exists()
+    assert (own / "state" / "newest").read_text() == "far"
+
+
+def test_a_link_is_taken_over_by_nobody(tmp_path, dead_pid):
+    outside = draft_of(tmp_path / "outside", dead_pid, state=True)
+    link = tmp_path / ".drafts" / outside.name
+    link.parent.mkdir()
+    link.symlink_to(outside)
+    assert not take_over(link.with_name(f"{owner_of(os.getpid())}@{HERE}@{RUN}"))
+
+
+def test_another_process_was_faster(tmp_path, dead_pid, monkeypatch):
+    draft = draft_of(tmp_path, dead_pid, state=True)
+
+    def gone(path, target):
+        raise FileNotFoundError(path)
+
+    monkeypatch.setattr(Path, "replace", gone)
+    assert not take_over(draft.with_name(f"{owner_of(os.getpid())}@{HERE}@{RUN}"))
 
 
 def test_a_draft_that_cannot_be_renamed_is_removed_all_the_same(tmp_path, monkeypatch):
     """Windows renames no folder of which somebody has a file open."""
-    draft = draft_of(tmp_path, 1)
+    draft = draft_of(tmp_path, "1")
 
     def refuse(path, target):
         raise PermissionError(13, "is being used by another process", str(path))
@@ -143,7 +187,7 @@ def test_where_there_are_no_drafts_nothing_happens(tmp_path):
 
 
 def test_removing_a_draft_leaves_the_others_and_the_study(tmp_path):
-    first, second = draft_of(tmp_path, 1), draft_of(tmp_path, 2)
+    first, second = draft_of(tmp_path, "1"), draft_of(tmp_path, "2")
     (tmp_path / "study.yml").touch()
     remove_draft(first)
     assert sorted(tmp_path.rglob("*@*")) == [second]
@@ -158,7 +202,7 @@ def test_a_draft_says_whose_it_is(tmp_path):
     paths = [draft_path(tmp_path, run) for run in plan(study, tmp_path)]
     assert {path.parent for path in paths} == {tmp_path / ".drafts"}
     assert [path.name for path in paths] == [
-        f"{os.getpid()}@{HERE}@mine@dry_lake_{number}" for number in (1, 2)
+        f"{owner_of(os.getpid())}@{HERE}@mine@dry_lake_{number}" for number in (1, 2)
     ]
 
 

@@ -8,8 +8,10 @@ import pytest
 import yaml
 
 from experiments.child_processes import StoppedError, TaskFailedError
+from experiments.drafts import draft_path
 from experiments.execution import available_cores, execute, execute_on, failure_log
-from experiments.run_in_child import do_run, draft_path
+from experiments.run_in_child import do_planned_run, do_run
+from experiments.run_limits import RunLimits
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 
@@ -84,8 +86,10 @@ def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
     log.parent.mkdir()
     log.write_text("of an earlier try")
 
-    def supervise(work, run, draft, command, *, clean_up):
-        assert (work, draft, command) == (do_run, draft_path(tmp_path, run), "c")
+    limits = RunLimits(seconds=9)
+
+    def supervise(work, run, root, command, *, clean_up, limits):
+        assert (work, root, command, limits) == (do_planned_run, tmp_path, "c", RunLimits(9))
         if run is bad:
             raise TaskFailedError("thin ice", "Traceback: thin ice\n")
         if run is stopped:
@@ -94,7 +98,12 @@ def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr("experiments.execution.supervise", supervise)
     told = {}
     failures = execute_on(
-        InPlace(), runs, tmp_path, "c", lambda run, failure: told.setdefault(run.seed, failure)
+        InPlace(),
+        runs,
+        tmp_path,
+        "c",
+        lambda run, failure: told.setdefault(run.seed, failure),
+        limits,
     )
     (failure,) = failures
     assert (failure.planned, failure.reason) == (bad, "thin ice")

@@ -346,3 +346,27 @@ def test_an_agent_has_a_file_of_settings_beside_the_study(read, tmp_path):
         {"n_timesteps": 9},
         {"n_timesteps": 7, "gamma": 0.5, "learning_rate": 0.25},
     ]
+
+
+@pytest.mark.parametrize(
+    ("line", "seconds", "memory"),
+    [
+        ("run_timeout: 10m", 600, None),
+        ("run_timeout: 90", 90, None),
+        ("run_memory: 1.5GB", None, 1_500_000_000),
+        ("run_memory: 2000000000", None, 2_000_000_000),
+    ],
+)
+def test_limits_of_runs(tmp_path, line, seconds, memory):
+    path = tmp_path / "s.yml"
+    path.write_text(f"{line}\nagents: [qlearning]\nenvironments: [FrozenLake-v1]\n")
+    study = read_study(path)
+    assert (study.run_timeout, study.run_memory) == (seconds, memory)
+
+
+@pytest.mark.parametrize("line", ["run_timeout: -1", "run_timeout: [1]", "run_memory: 4"])
+def test_limits_that_are_none(tmp_path, line):
+    path = tmp_path / "s.yml"
+    path.write_text(f"{line}\nagents: [qlearning]\nenvironments: [FrozenLake-v1]\n")
+    with pytest.raises(UserError, match=r"s\.yml:1: run_\w+ must be a (time|size)"):
+        read_study(path)

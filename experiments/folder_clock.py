@@ -1,0 +1,65 @@
+"""Signs of life, by the clock of their folder: all machines that share it agree on that one."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+from pathlib import Path
+
+SECONDS_BETWEEN_SIGNS = 5.0
+
+# What is written beside its place for an instant, here and by `pipeline.files.replacing`.
+_FOR_AN_INSTANT = re.compile(r"\..*[0-9a-f]{16}(\.dead)?\.tmp")
+_SECONDS_OF_AN_INSTANT = 5.0
+
+
+def give_sign(path: Path) -> None:
+    """Show that the owner of a file or folder is alive."""
+    os.utime(path)  # without a time, so that a network folder takes that of its server
+
+
+def seconds_silent(path: Path) -> float:
+    """How long ago `give_sign` was last called for a path, or it was written to.
+
+    Raises:
+        OSError: if there is no such path, or its folder cannot be written to.
+    """
+    return _now_in(path.parent) - last_sign(path)
+
+
+def last_sign(path: Path) -> float:
+    """When that was, by the folder's clock.
+
+    Raises:
+        OSError: if there is no such path.
+    """
+    if path.is_dir():
+        return path.stat().st_mtime
+    # Network folders remember for a while what a file was, but not beyond its being opened.
+    with path.open("rb") as file:
+        return os.fstat(file.fileno()).st_mtime
+
+
+def _now_in(folder: Path) -> float:
+    probe = folder / f".{secrets.token_hex(8)}.tmp"
+    try:
+        probe.touch()
+        return probe.stat().st_mtime
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink()
+
+
+def remove_remains(root: Path) -> None:
+    """Remove what processes that were killed have left half written, in a folder or one below."""
+    for path in [*root.glob(".*.tmp"), *root.glob("*/.*.tmp")]:
+        with contextlib.suppress(OSError):
+            if _FOR_AN_INSTANT.fullmatch(path.name) and (
+                seconds_silent(path) > _SECONDS_OF_AN_INSTANT
+            ):
+                if path.is_dir():
+                    path.rmdir()
+                else:
+                    path.unlink()

@@ -1,0 +1,67 @@
+"""A run of a study in its draft: from the beginning, or from where another process left it."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments.bandit_batches import do_batch
+from experiments.drafts import claim_draft, holds_state
+from experiments.planned_runs import PlannedRun
+from pipeline.errors import UserError
+from pipeline.resuming.state_keeping import StateKeeping
+from pipeline.resuming.unfinished_runs import go_on
+from pipeline.run_folder import FINISHED, Run
+from pipeline.training import train
+
+
+class NotFinishedError(Exception):
+    """A training came back before its end, though nobody had stopped it."""
+
+
+def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
+    """Do a run in its draft, to its end.
+
+    Args:
+        planned: the run.
+        draft: its folder. It is there where another process has left it: the run goes on from its
+            state if that is whole and of these very settings, and else begins anew.
+        command: the command that asked for the study.
+
+    Raises:
+        NotFinishedError: if something in the run ended the training, as Ctrl-C would.
+    """
+    run = Run(draft, planned.run.env_name)
+    keeping = _to_go_on_with(planned, run)
+    if not keeping.goes_on:
+        _begin_anew(planned, run)
+    if planned.is_batch:
+        do_batch(planned.spec, planned.n_runs, run, command)
+        return
+    args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
+    outcome = train(planned.spec, Console(quiet=True), args, command, run, keeping)
+    if outcome.state != FINISHED:
+        raise NotFinishedError(f"KeyboardInterrupt in the run after {outcome.n_steps:,} steps")
+
+
+def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:
+    """The state that another process has left, where there is one."""
+    if planned.is_batch or not holds_state(run.path) or not planned.is_of(run):
+        return StateKeeping()
+    try:
+        return go_on(run, StateKeeping(), _say_to_nobody)
+    except UserError:  # it is damaged, or another user's
+        return StateKeeping()
+
+
+def _begin_anew(planned: PlannedRun, run: Run) -> None:
+    claim_draft(run.path)
+    run.params_path.mkdir()
+    if planned.spec.tensorboard_log is not None:
+        shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)  # of an earlier try
+
+
+def _say_to_nobody(line: str) -> None:
+    """The report on a run is its folder."""

@@ -1,0 +1,178 @@
+"""One driver at a time on a study: a file that says who is at work, and is not held by the dead.
+
+The file appears in one step, as a link to one that is written already; that works on network
+folders too. Its owner gives signs of life. On the machine where it was made the process itself is
+looked for; elsewhere an owner counts as gone once it has been silent for a minute.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import os
+import secrets
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from experiments.folder_clock import (
+    SECONDS_BETWEEN_SIGNS,
+    give_sign,
+    last_sign,
+    remove_remains,
+    seconds_silent,
+)
+from pipeline import liveness
+from pipeline.errors import UserError, visible
+from pipeline.signs_of_life import Heartbeat
+
+NAME = ".lock"
+SECONDS_OF_SILENCE = 60.0
+_SECONDS_BETWEEN_LOOKS = 0.2
+_LARGEST = 10_000  # bytes
+
+
+class StudyInUseError(UserError):
+    """Another driver is at work on the study."""
+
+
+@contextmanager
+def study_lock(
+    root: Path, on_loss: Callable[[], object], say: Callable[[str], object]
+) -> Iterator[None]:
+    """Be the only driver of a study inside the ``with`` statement.
+
+    Args:
+        root: the study's folder; it is made, and removed again if nothing else came into it.
+        on_loss: called in another thread if another driver has taken this one for dead.
+        say: told in a line why it takes long, where it does.
+
+    Raises:
+        StudyInUseError: if another driver is at work, saying who.
+    """
+    made = _make_folders(root)
+    path, token = root / NAME, secrets.token_hex(16)
+    try:
+        _take(path, token, say)
+        remove_remains(root)
+        heart = Heartbeat(lambda: _beat(path, token, on_loss), SECONDS_BETWEEN_SIGNS)
+        heart.start()
+        try:
+            yield
+        finally:
+            heart.stop()
+            remove_remains(root)
+            if _read(path).get("token") == token:
+                path.unlink(missing_ok=True)
+    finally:
+        for folder in made:
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+
+def _make_folders(root: Path) -> list[Path]:
+    """Make the folder; those that were not there, innermost first."""
+    missing = [folder for folder in (root, *root.parents) if not folder.exists()]
+    root.mkdir(parents=True, exist_ok=True)
+    return missing
+
+
+def _take(path: Path, token: str, say: Callable[[str], object]) -> None:
+    mark = {**liveness.mark(), "token": token, "since": time.strftime("%Y-%m-%d %H:%M:%S")}
+    while not _appears(path, json.dumps(mark)):
+        owner = _read(path)
+        if _is_at_work(path, owner, say):
+            raise StudyInUseError(_words(path.parent, owner))
+        _remove_dead(path, owner)
+
+
+def _appears(path: Path, content: str) -> bool:
+    """Let the lock appear, whole; whether it was not there."""
+    draft = path.with_name(f"{NAME}.{secrets.token_hex(8)}.tmp")
+    try:
+        draft.write_text(content, encoding="utf-8")
+        os.link(draft, path)
+    except FileExistsError:
+        return False
+    except OSError:  # a file system without links: the lock is empty for an instant
+        try:
+            with path.open("x", encoding="utf-8") as file:
+                file.write(content)
+        except FileExistsError:
+            return False
+        except OSError:  # the disk is full
+            path.unlink(missing_ok=True)
+            raise
+    finally:
+        draft.unlink(missing_ok=True)
+    return True
+
+
+def _read(path: Path) -> dict[str, Any]:
+    """What a lock says; nothing where it is gone, or says nothing."""
+    with contextlib.suppress(OSError, ValueError, RecursionError):
+        with path.open("rb") as file:
+            owner = json.loads(file.read(_LARGEST))
+        return owner if isinstance(owner, dict) else {}
+    return {}
+
+
+def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object]) -> bool:
+    """Whether the owner of a lock is there; one that is elsewhere is waited for, until it shows."""
+    is_alive = liveness.is_alive(owner)
+    if is_alive is not None:
+        return is_alive
+    has_said = False
+    try:
+        first = last_sign(path)
+        while (silent := seconds_silent(path)) <= SECONDS_OF_SILENCE:
+            if last_sign(path) != first:
+                return True
+            if not has_said and silent > 2 * SECONDS_BETWEEN_SIGNS:
+                say(f"waiting for a sign of life: {_words(path.parent, owner)}")
+                has_said = True
+            time.sleep(_SECONDS_BETWEEN_LOOKS)
+    except FileNotFoundError:
+        pass  # it has just ended
+    return False
+
+
+def _remove_dead(path: Path, owner: dict[str, Any]) -> None:
+    """Remove the lock of an owner that is gone, and no other that came meanwhile.
+
+    Of several drivers, one alone can give it the name that only this lock can get.
+    """
+    digest = hashlib.sha256(repr(owner.get("token")).encode()).hexdigest()[:32]
+    grave = path.with_name(f"{NAME}.{digest}.dead.tmp")
+    try:
+        grave.mkdir()
+    except FileExistsError:
+        # Another driver is at it, or was killed while it was.
+        with contextlib.suppress(OSError):
+            if seconds_silent(grave) > SECONDS_BETWEEN_SIGNS:
+                grave.rmdir()
+        time.sleep(_SECONDS_BETWEEN_LOOKS)
+        return
+    try:
+        if _read(path).get("token") == owner.get("token"):
+            path.unlink(missing_ok=True)
+    finally:
+        with contextlib.suppress(OSError):
+            grave.rmdir()
+
+
+def _beat(path: Path, token: str, on_loss: Callable[[], object]) -> None:
+    owner = _read(path)
+    if owner.get("token") == token:
+        with contextlib.suppress(OSError):
+            give_sign(path)
+    elif owner or not path.exists():  # and not merely out of reach
+        on_loss()
+
+
+def _words(root: Path, owner: dict[str, Any]) -> str:
+    who = f"process {owner.get('pid', '?')} on {owner.get('host', '?')}"
+    return visible(f"{root}: {who} is at work on this study since {owner.get('since', '?')}")

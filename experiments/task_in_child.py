@@ -1,0 +1,81 @@
+"""What a child process of `child_processes` does: a task, and the answer to its supervisor."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from multiprocessing.connection import Connection, wait
+from multiprocessing.reduction import ForkingPickler
+from types import FrameType
+from typing import Any
+
+# What reaches a whole group of processes at once; the supervisor decides what it means.
+LEFT_TO_SUPERVISOR = tuple(
+    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
+)
+
+
+def answer_from_child(sender: Connection, last_words: Connection, task: bytes) -> None:
+    """Do the task and send what came of it.
+
+    Args:
+        sender: takes ``("returned", value)`` or ``("raised", (message, traceback))``.
+        last_words: takes the traceback where the process crashes, or is about to be ended.
+        task: function, arguments, and what to call if the supervisor dies first, pickled.
+    """
+    leave_signals_to_supervisor()
+    _say_last_words(last_words)
+    # Only now is the task unpacked: in a process that begins anew, its imports take seconds.
+    try:
+        function, args, clean_up = ForkingPickler.loads(task)
+        threading.Thread(target=_end_with_parent, args=(clean_up,), daemon=True).start()
+        answer: tuple[str, Any] = ("returned", function(*args))
+    except BaseException as error:  # noqa: BLE001  # whatever it is, the supervisor is told
+        answer = ("raised", (_words(error), traceback.format_exc()))
+    with contextlib.suppress(BrokenPipeError):
+        sender.send(answer)
+    sender.close()
+
+
+def leave_signals_to_supervisor() -> None:
+    """Do nothing when such a signal comes; programs that this process starts get it as usual."""
+    for number in LEFT_TO_SUPERVISOR:
+        signal.signal(number, _do_nothing)  # and not SIG_IGN, which they would inherit
+    if sys.platform != "win32":
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, LEFT_TO_SUPERVISOR)
+
+
+def _do_nothing(number: int, frame: FrameType | None) -> None:
+    """Handle a signal."""
+
+
+def _words(error: BaseException) -> str:
+    """The message in one line; with the kind of what ends a program, where no mistake is meant."""
+    kind, message = type(error).__name__, " ".join(str(error).split())
+    if isinstance(error, Exception):
+        return message or kind
+    return f"{kind}: {message}" if message else kind
+
+
+def _say_last_words(last_words: Connection) -> None:
+    """Let a crash leave its traceback; and SIGUSR1, which the supervisor sends to learn it."""
+    if sys.platform != "win32":  # there a pipe has no number that a crash could write to
+        faulthandler.enable(last_words.fileno())
+        faulthandler.register(signal.SIGUSR1, last_words.fileno())
+
+
+def _end_with_parent(clean_up: Callable[[], object]) -> None:
+    """Leave nothing behind when the supervisor is gone."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    wait([parent.sentinel])
+    with contextlib.suppress(OSError):
+        clean_up()
+    os._exit(1)
