@@ -60,6 +60,9 @@ def run_study(
             soft_wrap=True,
         )
     _print_left_out(console, results.left_out)
+    if results.n_unchecked:
+        runs = "1 run" if results.n_unchecked == 1 else f"{results.n_unchecked} runs"
+        _say(console, f"{runs} of an earlier version recorded no digests: damage may go unseen")
     return 1 if failures or results.left_out else 0
 
 

@@ -36,9 +36,14 @@ from pipeline.evaluation.sampled import evaluate, evaluation_seed, takes_batches
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
-from pipeline.models.continuation import continuing, load_to_continue, statistics_to_continue
+from pipeline.models.continuation import (
+    continuing,
+    load_to_continue,
+    model_to_continue,
+    statistics_to_continue,
+)
 from pipeline.models.model_loading import agent_class
-from pipeline.models.model_zips import telling_masks
+from pipeline.models.model_zips import ModelFile, telling_masks
 from pipeline.models.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
@@ -111,8 +116,9 @@ def set_up(
     spec: TrainSpec, run: Run, kwargs: dict[str, Any], console: Console, undo: ExitStack
 ) -> Training:
     """Make all parts of the training, and add to ``undo`` how to remove them again."""
-    spec, env = _training_env(spec, run, undo)
-    model = _make_model(spec, env, kwargs)
+    trained = model_to_continue(spec)
+    spec, env = _training_env(spec, trained, run, undo)
+    model = _make_model(spec, trained, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
     n_eval_envs = min(spec.n_eval_envs, spec.eval_episodes) if takes_batches(model) else 1
@@ -150,10 +156,12 @@ def _exact_evaluator(
     return None if reason else exact
 
 
-def _training_env(spec: TrainSpec, run: Run, undo: ExitStack) -> tuple[TrainSpec, VecEnv]:
+def _training_env(
+    spec: TrainSpec, trained: ModelFile | None, run: Run, undo: ExitStack
+) -> tuple[TrainSpec, VecEnv]:
     """What the agent is trained on; and the spec, which follows one that goes on."""
-    if spec.trained_agent is not None:
-        spec = telling_masks(spec, spec.trained_agent)
+    if trained is not None:
+        spec = telling_masks(spec, trained)
     statistics = statistics_to_continue(spec)
     if statistics is not None:
         spec = continuing(spec, statistics)
@@ -231,7 +239,9 @@ def _has_moving_schedule(model: BaseAlgorithm) -> bool:
     return any(callable(s) and s(1.0) != s(0.0) for s in schedules)
 
 
-def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlgorithm:
+def _make_model(
+    spec: TrainSpec, trained: ModelFile | None, env: VecEnv, kwargs: dict[str, Any]
+) -> BaseAlgorithm:
     folder = spec.tensorboard_log
     common: dict[str, Any] = {
         "seed": spec.seed,
@@ -239,9 +249,9 @@ def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlg
         "tensorboard_log": None if folder is None else str(folder / environment_name(spec.env_id)),
         **action_noise(spec.hyperparams, env.action_space),
     }
-    if spec.trained_agent is None:
+    if trained is None:
         return _new_model(agent_class(spec.algo), env, spec.device, common, kwargs)
-    return load_to_continue(spec, spec.trained_agent, env, **common, **kwargs)
+    return load_to_continue(spec, trained, env, **common, **kwargs)
 
 
 def _new_model(

@@ -13,7 +13,16 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.file_digests import FIELD, RECORD, RecordedFiles, digests_of, read_record, sealed
+from pipeline.file_digests import (
+    FIELD,
+    RECORD,
+    VERSION,
+    VERSION_FIELD,
+    RecordedFiles,
+    digests_of,
+    read_record,
+    sealed,
+)
 from pipeline.files import portable_name, write_json
 
 RUNNING = "running"
@@ -197,7 +206,7 @@ class Run:
 
     def end(self, **fields: Any) -> None:
         """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
-        self.update_info(**fields, **{FIELD: digests_of(self.path)})
+        self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
 
     @property
     def files(self) -> RecordedFiles:

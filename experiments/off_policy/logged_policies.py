@@ -19,8 +19,8 @@ from pipeline.agent_checks import check_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import policy_matrix, why_not_exact
 from pipeline.models.model_loading import load_model
-from pipeline.models.model_zips import check_model_file, hand_written_algorithm, run_of
-from pipeline.models.recorded_runs import check_digest
+from pipeline.models.model_zips import hand_written_algorithm, read_model
+from pipeline.models.recorded_runs import run_of
 from pipeline.module_records import check_recorded
 from pipeline.user_modules import UserModule
 
@@ -103,13 +103,12 @@ def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
         UserError: if there is no agent, or none that sees a context as the log has it.
     """
     zip_path = _final_model(path) if path.is_dir() else path
-    check_model_file(zip_path)
     run = run_of(zip_path)
+    model = read_model(zip_path, run)
     spec = {} if run is None else run.recorded_spec()
     if run is not None:
         check_recorded(spec, run.path)
-        check_digest(run, zip_path)
-    algo = hand_written_algorithm(zip_path) or spec.get("algo")
+    algo = hand_written_algorithm(model) or spec.get("algo")
     if algo is None:
         raise UserError(f"{path} lies in no run folder: what agent it holds is not known")
     settings = spec.get("hyperparams") or {}
@@ -117,7 +116,7 @@ def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
     if changed is not None:
         raise UserError(f"{path} was trained with {changed}: it observes more than a log holds")
     check_algorithm(algo)
-    agent = load_model(algo, zip_path, modules=modules, device="cpu")
+    agent = load_model(algo, model, modules=modules, device="cpu")
     if not isinstance(agent.action_space, spaces.Discrete):
         raise UserError(f"{path} chooses no arms: its actions are {agent.action_space}")
     log = (settings.get("env_kwargs") or {}).get("log")

@@ -20,7 +20,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing, write_json
 from pipeline.filming import film_episode, write_film
-from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_choice import model_of_run
 from pipeline.models.model_loading import load_model
 from pipeline.playing import playing_env
 from report.page.markup import data_uri
@@ -121,10 +121,10 @@ def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     spec = planned.spec
     th.set_num_threads(spec.num_threads)
-    planned.run.files.check(planned.run.model_path)
-    env = playing_env(ChosenModel(planned.run.model_path, spec, planned.run), "rgb_array")
+    chosen = model_of_run(planned.run.model_path, spec, planned.run)
+    env = playing_env(chosen, "rgb_array")
     try:
-        model = load_model(spec.algo, planned.run.model_path, env, spec.user_modules)
+        model = load_model(spec.algo, chosen.file, env, spec.user_modules)
         env.seed(evaluation_seed(planned.seed, 3))
         frames, ended = film_episode(model, env, MAX_STEPS, deterministic=True)
     finally:

@@ -75,6 +75,20 @@ def test_a_changed_record_is_refused(run, old, new):
         run.read_info()
 
 
+@pytest.mark.parametrize("field", ["files", "record_version"])
+def test_a_record_that_lost_its_digests_is_no_record_of_an_earlier_version(run, field):
+    """One letter of a name is enough to lose them."""
+    text = run.info_path.read_text()
+    run.info_path.write_text(text.replace(f'"{field}"', f'"{field[:-1]}?"'))
+    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: it "):
+        run.read_info()
+    record = json.loads(text)
+    del record[field]
+    run.info_path.write_text(json.dumps(record))
+    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: it "):
+        run.read_info()
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner),
