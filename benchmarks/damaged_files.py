@@ -3,13 +3,13 @@
     python benchmarks/damaged_files.py                   # a tenth of the flips, a minute
     python benchmarks/damaged_files.py --flips 300       # all: some minutes
 
-Every file of a tabular run, a run of PPO, and of runs on bandits is damaged in turn: cut off at each
-per cent of its length, with a bit turned over, and, where it is a zip, with a bit of a member turned
-over and the checksum mended. Then the run is read as `compare.py` and `enjoy.py` do, its agents
-loaded. Counted are four ends: refused in one line; the figures that were there before; taken for
-another run, which only one that recorded no digests can be; and all else, of which there must be
-none. The same again for runs that recorded no digests, as those of earlier versions, and for their
-zips lying alone: there a wrong figure can pass, and is counted as such.
+Every file of a tabular run, a run of PPO, and of runs on bandits is damaged in turn: cut off at
+each per cent of its length, with a bit turned over, and, where it is a zip, with a bit of a member
+turned over and the checksum mended. Then the run is read as `compare.py` and `enjoy.py` do, its
+agents loaded. Counted are four ends: refused in one line; the figures that were there before; taken
+for another run, which only one that recorded no digests can be; and all else, of which there must
+be none. The same again for runs that recorded no digests, as those of earlier versions, and for
+their zips lying alone: there a wrong figure can pass, and is counted as such.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ RUNS = (
         EnvironmentSpec("pole", "CartPole-v1", STEPS),
     ),
     (AgentSpec("ucb", "ucb"), EnvironmentSpec("arms", "BernoulliBandit-v0", STEPS)),
+    # More steps than an episode has are no batch: the run leaves an agent.
+    (AgentSpec("ucb", "ucb"), EnvironmentSpec("long", "BernoulliBandit-v0", {"n_timesteps": 1100})),
     (
         AgentSpec("ppo", "ppo", {**SMALL_NETWORK, "policy": "MlpPolicy"}, tuned=False),
         EnvironmentSpec("arms", "BernoulliBandit-v0", STEPS),

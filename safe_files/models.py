@@ -25,6 +25,7 @@ from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import Source, content_of
 from safe_files.sizes import check_sizes
 from safe_files.tensors import check_values, first_line, load_tensors
+from safe_files.weights import check_fit, check_variable
 
 # What is trained and part of no network: the entropy coefficient of SAC and its kin.
 VARIABLES = frozenset({"log_ent_coef", "ent_coef_tensor"})
@@ -104,11 +105,13 @@ def load_model(
     check_sizes({**settings.plain, **objects, **replaced}, tensors)
     checked = _zipped({**members, SETTINGS: _data(settings, objects)})
     try:
-        return algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+        model = algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+        check_fit(model, tensors)
     except ValueError:
         raise  # it does not fit the environment
     except Exception as error:  # settings and weights that do not go together can fail anywhere
         raise UnsafeFileError(f"holds no such model: {first_line(error)}") from error
+    return model
 
 
 def read_settings(members: Mapping[str, bytes], algorithm: type[BaseAlgorithm]) -> Settings:
@@ -189,6 +192,8 @@ def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
         strange = sorted(map(str, set(variables or ()) - known))
         if strange:
             raise UnsafeFileError(f"sets {shown(strange[0])}, which is no variable of a model")
+        for key in VARIABLES & set(variables or ()):
+            check_variable(f"{name}: {key}", variables[key])
 
 
 def _data(settings: Settings, objects: Mapping[str, Any]) -> bytes:
