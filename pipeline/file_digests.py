@@ -92,7 +92,8 @@ class RecordedFiles:
 
     def _recorded(self, path: Path) -> str | None:
         """The digest of a file; None where the run recorded none, or the file is not its own."""
-        place = path.resolve()
+        # Not where a link leads that somebody put in the file's place.
+        place = path.parent.resolve() / path.name
         folder = self.folder.resolve()
         if self.digests is None or not place.is_relative_to(folder):
             return None

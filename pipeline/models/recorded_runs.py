@@ -13,6 +13,7 @@ these files is run, and no module is imported because they ask for it.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -51,11 +52,12 @@ def run_of(path: Path) -> Run | None:
     Raises:
         UserError: if the folder's ``run.json`` is damaged.
     """
-    folder = path.resolve().parent
-    try:
-        env_name = read_record(folder / RECORD).get("env_name")
-    except (FileNotFoundError, NotADirectoryError):
+    # A link to a zip may lie in the run, or lead there.
+    folders = (path.parent.resolve(), path.resolve().parent)
+    folder = next((one for one in folders if os.path.lexists(one / RECORD)), None)
+    if folder is None:
         return None
+    env_name = read_record(folder / RECORD).get("env_name")
     if not isinstance(env_name, str):
         return None
     if env_name != environment_name(env_name):

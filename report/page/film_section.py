@@ -26,11 +26,13 @@ from pipeline.playing import playing_env
 from report.page.markup import data_uri
 from report.page.sections import Report, Section
 from report.wording import number
+from safe_files.regular_files import read_file
 
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
 COLOURS = 128
 MAX_SIDE = 320  # pixels of a picture's longer side
 MAX_BYTES = 300_000  # of a film
+MAX_FIGURE = 1e300  # in the caption
 ALL_BYTES = 6_000_000  # of the films of a page, a third more as text
 
 
@@ -98,7 +100,7 @@ def film_of(planned: PlannedRun) -> Path | None:
         cannot be drawn.
     """
     path = planned.path / "episode.gif"
-    if not path.with_suffix(".json").exists():
+    if not _is_kept(path):
         try:
             frames, episode = _play(planned)
         except (UserError, *MISTAKES):
@@ -111,6 +113,22 @@ def film_of(planned: PlannedRun) -> Path | None:
             draft.write_bytes(film)
         write_json(path.with_suffix(".json"), {**episode, "frames": kept})
     return path
+
+
+def _is_kept(path: Path) -> bool:
+    """Whether a film and how it went lie there, as this module leaves them."""
+    try:
+        episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
+        # Films are no part of the run, so that it has no digest of them.
+        with Image.open(io.BytesIO(read_file(path, 2 * MAX_BYTES)), formats=["GIF"]) as picture:
+            is_small = max(picture.size) <= MAX_SIDE
+            picture.load()
+        numbers = [episode["frames"], episode["return"] or 0.0, episode["steps"] or 0]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError, SyntaxError):
+        return False
+    return is_small and all(
+        isinstance(one, int | float) and abs(one) < MAX_FIGURE for one in numbers
+    )
 
 
 def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:

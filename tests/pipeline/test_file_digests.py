@@ -184,5 +184,15 @@ def test_a_path_through_a_link_is_the_same_file(run, tmp_path_factory):
         Run(link, "Lake-v1").files.check(run.path / "0.monitor.csv")
 
 
+def test_a_link_in_the_place_of_a_file_is_no_way_round_its_digest(run, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere") / "0.monitor.csv"
+    elsewhere.write_bytes(b"another's")
+    (run.path / "0.monitor.csv").unlink()
+    (run.path / "0.monitor.csv").symlink_to(elsewhere)
+    for read in (run.files.read, run.files.check):
+        with pytest.raises(DamagedFileError, match="is not as the run left it"):
+            read(run.path / "0.monitor.csv")
+
+
 def test_digests_of_an_empty_folder(tmp_path):
     assert digests_of(tmp_path) == {}
