@@ -14,6 +14,7 @@ import io
 import json
 import os
 import pickle
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -26,26 +27,29 @@ from typing import Any
 
 import torch as th
 from rich.console import Console
-from rich.table import Table
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 
 ROOT = Path(__file__).resolve().parent.parent
-ENV = "CartPole-v1"
+REFUSED = 2
 ENJOY = ("enjoy.py", "model.zip", "--algo", "sac", "--env", "Pendulum-v1", "--render", "none")
 PLAY = (*ENJOY, "-n", "5")
 GO_ON = ("train.py", "--algo", "sac", "--env", "Pendulum-v1", "-n", "5", "-i", "model.zip")
 TRAIN = ("train.py", "--algo", "qlearning", "--env", "Warehouse-v0", "-n", "50", "-params")
 JUDGE = ("compare.py", "--logged", "log.csv", "--policy", "ucb.zip")
 STUDY = ("compare.py", "study.yml", "--no-report", "-j", "1")
-LOG = "arm,reward,propensity\n" + "0,1,0.5\n1,0,0.5\n" * 50
+LOG = "arm,reward,propensity\n" + "0,1,0.4\n1,0,0.3\n2,1,0.3\n" * 50
 GOOD_STUDY = """\
 title: T
 agents: {a: {algo: qlearning}}
 environments: {e: {id: Warehouse-v0}}
 n_timesteps: 50
 """
+
+
+# What is done where the files are good, for commands whose flags are what is wrong.
+WHOLE = {"train.py": (*TRAIN, "gamma:0.9")}
 
 
 class Attack:
@@ -111,6 +115,7 @@ def start_up(words: tuple[str, ...], folder: Path) -> tuple[float, float]:
 
 def make_good(folder: Path) -> None:
     """The good files that the commands are given."""
+    folder.mkdir()
     settings: dict[str, Any] = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 4}
     sac: Any = load_algorithm("sac")
     sac("MlpPolicy", "Pendulum-v1", device="cpu", **settings).learn(6).save(folder / "model.zip")
@@ -239,29 +244,26 @@ def digits(folder: Path) -> None:
 
 def main() -> int:
     """Measure and print; the exit code is 1 where something was not refused in one line."""
-    table = Table("case", "seconds", "above", "MB", "above", "refused")
-    known: dict[str, tuple[float, float]] = {}
-    is_right = True
-    for case in cases():
-        with tempfile.TemporaryDirectory() as name:
-            folder = Path(name)
-            make_good(folder)
-            if case.words[0] + case.words[2] not in known:
-                good = (*TRAIN, "gamma:0.9") if case.words[: len(TRAIN)] == TRAIN else case.words
-                known[case.words[0] + case.words[2]] = start_up(good, folder)
-            seconds, megabytes = known[case.words[0] + case.words[2]]
+    console, known, is_right = Console(width=120), {}, True
+    with tempfile.TemporaryDirectory() as root:
+        make_good(good := Path(root) / "good")
+        for case in cases():
+            folder = Path(root) / "case"
+            shutil.copytree(good, folder)
+            kind = (case.words[0], case.words[-1] if case.words[0] == "compare.py" else "")
+            if kind not in known:
+                known[kind] = start_up(WHOLE.get(case.words[0], case.words), folder)
             case.spoil(folder)
             taken, used, code, errors = measured(command(case.words), folder)
-        is_refused = code == 2 and errors.count("\n") == 1
-        is_right &= is_refused
-        figures = (
-            f"{taken:.1f}",
-            f"{taken - seconds:+.1f}",
-            f"{used:.0f}",
-            f"{used - megabytes:+.0f}",
-        )
-        table.add_row(case.name, *figures, "yes" if is_refused else errors[-300:] or f"code {code}")
-    Console(width=120).print(table)
+            shutil.rmtree(folder)
+            is_refused = code == REFUSED and errors.count("\n") == 1
+            is_right &= is_refused
+            seconds, megabytes = known[kind]
+            console.print(
+                f"{case.name:24} {taken:5.1f} s ({taken - seconds:+5.1f})  {used:4.0f} MB "
+                f"({used - megabytes:+5.0f})  {'' if is_refused else errors[-300:] or code}",
+                markup=False,
+            )
     return 0 if is_right else 1
 
 

@@ -186,13 +186,13 @@ def _objects(
 def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
     """The library sets each of these by the way to it: let there be no other than it writes."""
     for name in ("pytorch_variables.pth", "tensors.pth"):
-        variables = tensors.get(name)
-        if not (variables is None or isinstance(variables, dict)):
+        variables = tensors.get(name, {})
+        if not isinstance(variables, dict):
             raise UnsafeFileError(f"holds {name} that is not as the library writes it")
-        strange = sorted(map(str, set(variables or ()) - known))
+        strange = sorted(map(str, set(variables) - known))
         if strange:
             raise UnsafeFileError(f"sets {shown(strange[0])}, which is no variable of a model")
-        for key in VARIABLES & set(variables or ()):
+        for key in VARIABLES & set(variables):
             check_variable(f"{name}: {key}", variables[key])
 
 

@@ -46,7 +46,7 @@ def check_fit(model: BaseAlgorithm, tensors: Mapping[str, Any]) -> None:
         UnsafeFileError: if one is of another kind or shape; it names the tensor.
     """
     for name in model._get_torch_save_params()[0]:
-        part, found = recursive_getattr(model, name), tensors.get(f"{name}.pth")
+        part, found = recursive_getattr(model, name), tensors.get(f"{name}.pth", {})
         if isinstance(part, nn.Module):
             for key, like in part.state_dict().items():
                 _check_alike(f"{name}.pth: {key}", found[key], like)

@@ -202,7 +202,8 @@ def _as_floats(texts: Iterable[str]) -> Floats:
 
 
 def _is_arm(values: Floats) -> Bools:
-    return (values >= 0) & (values < MAX_ARMS) & (values == np.floor(values))
+    is_arm: Bools = (values >= 0) & (values < MAX_ARMS) & (values == np.floor(values))
+    return is_arm
 
 
 def _is_propensity(values: Floats) -> Bools:
