@@ -2,7 +2,7 @@
 
     python benchmarks/refusals.py
 
-Start-up is what the same command imports when its file is good, in a process that does nothing
+Start-up is what the same command imports when its files are good, in a process that does nothing
 else: nobody waits less who uses the command. A refusal should come within a second and 200 MB of
 that, and comes long before where the file is looked at before the libraries are imported.
 """
@@ -18,7 +18,6 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -48,8 +47,22 @@ n_timesteps: 50
 """
 
 
-# What is done where the files are good, for commands whose flags are what is wrong.
-WHOLE = {"train.py": (*TRAIN, "gamma:0.9")}
+# The module behind which a command's libraries are.
+_LIBRARIES = {
+    "enjoy.py": "commands.playing_output",
+    "train.py": "pipeline.training",
+    "compare.py": "experiments.off_policy.logged_policies",
+}
+
+# A small process in between: one that is forked counts the memory of the one that forks it.
+_WATCH = """
+import json, os, subprocess, sys, time
+started = time.perf_counter()
+process = subprocess.Popen([sys.executable, *sys.argv[1:]], stdout=subprocess.DEVNULL)
+_, status, usage = os.wait4(process.pid, 0)
+taken = time.perf_counter() - started
+print(json.dumps([taken, usage.ru_maxrss, os.waitstatus_to_exitcode(status)]))
+"""
 
 
 class Attack:
@@ -70,20 +83,16 @@ class Case:
 
 def measured(words: tuple[str, ...], folder: Path) -> tuple[float, float, int, str]:
     """Seconds, megabytes, exit code and errors of a process."""
-    started = time.perf_counter()
-    with (folder / "errors").open("w+b") as errors:
-        process = subprocess.Popen(
-            [sys.executable, *words],
-            cwd=folder,
-            env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
-            stdout=subprocess.DEVNULL,
-            stderr=errors,
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-        taken = time.perf_counter() - started
-        errors.seek(0)
-        code = process.returncode = os.waitstatus_to_exitcode(status)
-        return taken, usage.ru_maxrss / 1024, code, errors.read().decode()
+    done = subprocess.run(
+        [sys.executable, "-c", _WATCH, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    taken, kilobytes, code = json.loads(done.stdout.splitlines()[-1])
+    return taken, kilobytes / 1024, code, done.stderr
 
 
 def command(words: tuple[str, ...]) -> tuple[str, ...]:
@@ -91,25 +100,9 @@ def command(words: tuple[str, ...]) -> tuple[str, ...]:
     return (str(ROOT / words[0]), *words[1:])
 
 
-def start_up(words: tuple[str, ...], folder: Path) -> tuple[float, float]:
-    """Seconds and megabytes of importing all that a command imports where its files are good."""
-    listing = folder / "modules.json"
-    script = (
-        "import atexit, json, pathlib, runpy, sys\n"
-        f"save = lambda: pathlib.Path({str(listing)!r}).write_text(json.dumps(list(sys.modules)))\n"
-        "atexit.register(save)\n"
-        f"sys.argv = {list(command(words))!r}\n"
-        "runpy.run_path(sys.argv[0], run_name='__main__')\n"
-    )
-    done = measured(("-c", script), folder)
-    assert done[2] == 0, done[3]
-    imports = (
-        "import importlib, json, pathlib, warnings\nwarnings.simplefilter('ignore')\n"
-        f"for name in json.loads(pathlib.Path({str(listing)!r}).read_text()):\n"
-        "    try: importlib.import_module(name)\n"
-        "    except Exception: pass\n"
-    )
-    seconds, megabytes, _, _ = measured(("-c", imports), folder)
+def start_up(program: str, folder: Path) -> tuple[float, float]:
+    """Seconds and megabytes of importing what a command imports where its files are good."""
+    seconds, megabytes, _, _ = measured(("-c", f"import {_LIBRARIES[program]}"), folder)
     return seconds, megabytes
 
 
@@ -244,21 +237,22 @@ def digits(folder: Path) -> None:
 
 def main() -> int:
     """Measure and print; the exit code is 1 where something was not refused in one line."""
-    console, known, is_right = Console(width=120), {}, True
+    console, is_right = Console(width=120), True
+    known: dict[str, tuple[float, float]] = {}
     with tempfile.TemporaryDirectory() as root:
         make_good(good := Path(root) / "good")
         for case in cases():
             folder = Path(root) / "case"
             shutil.copytree(good, folder)
-            kind = (case.words[0], case.words[-1] if case.words[0] == "compare.py" else "")
-            if kind not in known:
-                known[kind] = start_up(WHOLE.get(case.words[0], case.words), folder)
+            program = case.words[0]
+            if program not in known:
+                known[program] = start_up(program, folder)
             case.spoil(folder)
             taken, used, code, errors = measured(command(case.words), folder)
             shutil.rmtree(folder)
             is_refused = code == REFUSED and errors.count("\n") == 1
             is_right &= is_refused
-            seconds, megabytes = known[kind]
+            seconds, megabytes = known[program]
             console.print(
                 f"{case.name:24} {taken:5.1f} s ({taken - seconds:+5.1f})  {used:4.0f} MB "
                 f"({used - megabytes:+5.0f})  {'' if is_refused else errors[-300:] or code}",
