@@ -290,6 +290,20 @@ def test_tensors_that_were_deflated_are_refused(genuine, tmp_path):
         load_model(PPO, path)
 
 
+def test_a_zip_that_unpacks_out_of_proportion_is_refused(genuine, tmp_path):
+    path = write(tmp_path / "model.zip", genuine)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("tensors.pth", bytes(80 << 20))
+    assert path.stat().st_size < 1 << 20
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnsafeFileError, match="out of proportion"):
+            load_model(PPO, path)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize("member", ["extra.py", "../escaped.pth", "/etc/passwd", "predict.pth"])
 def test_members_that_no_model_has_are_refused(genuine, tmp_path, member):
     path = write(tmp_path / "model.zip", {**genuine, member: b""})
