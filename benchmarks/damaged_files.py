@@ -3,13 +3,13 @@
     python benchmarks/damaged_files.py                   # a tenth of the flips, a minute
     python benchmarks/damaged_files.py --flips 300       # all: some minutes
 
-Every file of a tabular run, a run of PPO, and two runs on a bandit is damaged in turn: cut off at
+Every file of a tabular run, a run of PPO, and of runs on bandits is damaged in turn: cut off at
 each per cent of its length, with a bit turned over, and, where it is a zip, with a bit of a member
-turned over and the checksum mended. Then the run is read as `compare.py` and `enjoy.py` do. Counted
-are four ends: refused in one line; the figures that were there before; taken for another run, which
-only one that recorded no digests can be; and all else, of which there must be none. The same again
-for runs that recorded no digests, as those of earlier versions: there a wrong figure can pass,
-and is counted as such.
+turned over and the checksum mended. Then the run is read as `compare.py` and `enjoy.py` do, its
+agents loaded. Counted are four ends: refused in one line; the figures that were there before; taken
+for another run, which only one that recorded no digests can be; and all else, of which there must
+be none. The same again for runs that recorded no digests, as those of earlier versions, and for
+their zips lying alone: there a wrong figure can pass, and is counted as such.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from experiments.drafts import draft_path
 from experiments.planned_runs import PlannedRun
@@ -37,7 +38,9 @@ from experiments.study_results import read_run
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.models.continuation import agent_to_continue
-from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.models.model_choice import ChosenModel, ModelRequest, choose_model
+from pipeline.models.model_loading import load_model
+from safe_files.tensors import tensors_in
 
 REFUSED, RIGHT, WRONG, ANOTHER, BROKEN = "refused", "right", "wrong", "another run", "broken"
 UNNAMED = "refused, and the file not named"
@@ -50,6 +53,8 @@ RUNS = (
         EnvironmentSpec("pole", "CartPole-v1", STEPS),
     ),
     (AgentSpec("ucb", "ucb"), EnvironmentSpec("arms", "BernoulliBandit-v0", STEPS)),
+    # More steps than an episode has are no batch: the run leaves an agent.
+    (AgentSpec("ucb", "ucb"), EnvironmentSpec("long", "BernoulliBandit-v0", {"n_timesteps": 1100})),
     (
         AgentSpec("ppo", "ppo", {**SMALL_NETWORK, "policy": "MlpPolicy"}, tuned=False),
         EnvironmentSpec("arms", "BernoulliBandit-v0", STEPS),
@@ -73,7 +78,7 @@ def forget_digests(planned: PlannedRun) -> None:
     """Make the run one of an earlier version."""
     path = planned.run.info_path
     info = json.loads(path.read_text(encoding="utf-8"))
-    del info["files"]
+    del info["files"], info["record_version"]
     path.write_text(json.dumps(info, indent=2), encoding="utf-8")
 
 
@@ -91,7 +96,7 @@ def as_played(study: StudySpec, planned: PlannedRun) -> str | None:
     if planned.is_batch:
         return ""  # it leaves no agent
     request = ModelRequest(path=planned.path, log_folder=planned.path.parents[1])
-    return repr((choose_model(request), agent_to_continue(planned.path)))
+    return _described(choose_model(request)) + str(agent_to_continue(planned.path))
 
 
 def as_played_at_its_best(study: StudySpec, planned: PlannedRun) -> str | None:
@@ -99,7 +104,36 @@ def as_played_at_its_best(study: StudySpec, planned: PlannedRun) -> str | None:
     if planned.is_batch:
         return ""
     request = ModelRequest(path=planned.path, log_folder=planned.path.parents[1], which="best")
-    return repr(choose_model(request))
+    return _described(choose_model(request))
+
+
+def _described(chosen: ChosenModel) -> str:
+    model = load_model(chosen.spec.algo, chosen.file, device="cpu")
+    statistics = None if chosen.statistics is None else vars(chosen.statistics)
+    parts = {name: getattr(part, "__dict__", part) for name, part in (statistics or {}).items()}
+    return repr((chosen.path, chosen.spec, chosen.run, parts)) + _agent(model)
+
+
+def _agent(model: BaseAlgorithm) -> str:
+    """The numbers in an agent."""
+    plain = {name: value for name, value in vars(model).items() if isinstance(value, int | float)}
+    weights = [tensor.tolist() for _, tensor in tensors_in(model.get_parameters())]
+    return repr((sorted(plain.items()), weights))
+
+
+def as_zips_alone(study: StudySpec, planned: PlannedRun) -> str | None:
+    """The agents in the zips, as if these lay somewhere by themselves."""
+    with tempfile.TemporaryDirectory() as folder:
+        found = ""
+        for path in sorted(planned.path.glob("*.zip")):
+            alone = Path(folder) / path.name
+            alone.write_bytes(path.read_bytes())
+            try:
+                found += _agent(load_model(planned.spec.algo, alone, device="cpu"))
+            except UserError as error:
+                # Named is the copy; the reader of the outcome looks for the run.
+                raise UserError(str(error).replace(folder, str(planned.path))) from error
+        return found
 
 
 def outcome(
@@ -163,24 +197,34 @@ def campaign(
         stride: take every so many-th of the damages alone.
 
     Returns:
-        Counts by reader ("compared", "played", "best") and file.
+        Counts by reader ("compared", "played", "best", and of a run without digests "alone") and
+        file.
     """
     readers = {"compared": as_compared, "played": as_played, "best": as_played_at_its_best}
+    if planned.run.files.digests is None:
+        readers["alone"] = as_zips_alone
     expected = {name: read(study, planned) for name, read in readers.items()}
     rng = np.random.default_rng(seed)
     counts: dict[tuple[str, str], Counter[str]] = {}
     for path in sorted(path for path in planned.path.rglob("*") if path.is_file()):
         whole = path.read_bytes()
         name = path.relative_to(planned.path).as_posix()
-        counts |= {(reader, name): Counter[str]() for reader in readers}
+        readers_of = {
+            reader: read for reader, read in readers.items() if reader != "alone" or _is_zip(path)
+        }
+        counts |= {(reader, name): Counter[str]() for reader in readers_of}
         for place, content in enumerate(damaged(whole, flips, rng)):
             if place % stride:
                 continue
             path.write_bytes(content)
-            for reader, read in readers.items():
+            for reader, read in readers_of.items():
                 counts[reader, name][outcome(read, study, planned, expected[reader])] += 1
         path.write_bytes(whole)
     return counts
+
+
+def _is_zip(path: Path) -> bool:
+    return path.suffix == ".zip"
 
 
 def _print(console: Console, title: str, counts: Any) -> Counter[str]:

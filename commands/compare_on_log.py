@@ -31,7 +31,7 @@ def compare_on_log(args: argparse.Namespace) -> int:
     n = len(args.policy)
     about = f"{n} {'policy' if n == 1 else 'policies'} on {args.logged}"
     console.print(about, markup=False, soft_wrap=True)
-    with doing(console, "loading the libraries") as activity:
+    with doing(console, "reading the log") as activity:
         compared = _compare(args, modules, activity)
     from report.off_policy_table import print_comparison
 
@@ -42,15 +42,18 @@ def compare_on_log(args: argparse.Namespace) -> int:
 def _compare(
     args: argparse.Namespace, modules: Sequence[UserModule], activity: Activity
 ) -> Comparison:
-    from experiments.off_policy.logged_policies import compare_policies, read_logged, read_policy
+    from experiments.off_policy.policy_files import find_policy, read_logged
 
-    activity.now("reading the log")
     data = read_logged(args.logged)
-    activity.now("loading the policies")
-    policies = [read_policy(Path(path), modules) for path in args.policy]
-    names = [policy.name for policy in policies]
+    found = [find_policy(Path(path)) for path in args.policy]
+    names = [policy.name for policy in found]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise UserError(f"--policy names {twice} twice")
+    activity.now("loading the libraries")
+    from experiments.off_policy.logged_policies import compare_policies, load_policy
+
+    activity.now("loading the policies")
+    policies = [load_policy(policy, modules) for policy in found]
     activity.now("judging the policies")
     return compare_policies(data, policies)

@@ -156,7 +156,7 @@ def _play() -> int:
         from commands.playing_output import PlayingRequest, play
         from pipeline.models.model_choice import with_statistics
 
-        chosen = with_statistics(found, wanted)
+        chosen = with_statistics(found, wanted.statistics)
     if film is not None or args.reward_log:
         go_on_unread()
     n_steps = args.n_timesteps if args.n_timesteps >= 0 else None

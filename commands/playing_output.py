@@ -119,7 +119,7 @@ def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None
         env = playing_env(chosen, request.mode, request.n_envs, request.monitor_folder)
         if request.norm_reward:
             env = with_normalised_rewards(env)
-        model = load_to_play(spec.algo, chosen.path, env, spec.device, spec.user_modules)
+        model = load_to_play(spec.algo, chosen.file, env, spec.device, spec.user_modules)
         env.seed(spec.seed)
     show = _Show(Activity(console, "playing"), request.mode, FrameTaker(env))
     # Pictures of letters show by themselves that something goes on.

@@ -68,6 +68,9 @@ def run_study(
             soft_wrap=True,
         )
     _print_left_out(console, results.left_out)
+    if results.n_unchecked:
+        runs = "1 run" if results.n_unchecked == 1 else f"{results.n_unchecked} runs"
+        _say(console, f"{runs} of an earlier version recorded no digests: damage may go unseen")
     n_missing = len(planned) - len(results.finished)
     if n_missing > len(failures) + len(results.left_out):
         _say(console, f"{n_missing} of {len(planned)} runs are missing; the same command goes on")

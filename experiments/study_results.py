@@ -68,6 +68,7 @@ class StudyResults:
         planned: all runs of the study, also those that failed.
         pulls: on bandits, figures by pull, by labels of agent and environment.
         left_out: the runs that are damaged.
+        n_unchecked: how many runs recorded no digests, so that damage in them may go unseen.
     """
 
     study: StudySpec
@@ -77,6 +78,7 @@ class StudyResults:
     planned: tuple[PlannedRun, ...]
     pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
     left_out: tuple[LeftOut, ...] = ()
+    n_unchecked: int = 0
 
     @property
     def finished(self) -> list[PlannedRun]:
@@ -159,6 +161,7 @@ def read_results(
         tuple(planned),
         read_pulls(done),
         tuple(left_out),
+        sum(run.n_runs for run in done if run.run.files.digests is None),
     )
 
 

@@ -2,7 +2,8 @@
 
 The entry of ``run.json`` itself is the digest of all else in it, as JSON without spaces and with
 sorted keys. A file that is not listed is the user's own, and nothing is said of it. Runs of earlier
-versions have no such field: their files are taken as they are.
+versions have no such field: their files are taken as they are. What tells them from a run that has
+lost it is ``record_version``, which is written with it: either without the other is damage.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from safe_files.regular_files import opened, read_file
 RECORD = "run.json"
 FIELD = "files"
 STATE_FOLDER = "state"  # of what a run goes on from, which is no part of what it leaves
+VERSION_FIELD = "record_version"
+VERSION = 2  # of records with digests; those before had no such field
 LARGEST_RECORD = 64 << 20  # bytes
 LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
 _PIECE = 1 << 20  # bytes
@@ -66,13 +69,13 @@ class RecordedFiles:
         names = (name for name in self.digests if "/" not in name and fnmatchcase(name, pattern))
         return [self.folder / name for name in sorted(names)]
 
-    def read(self, path: Path) -> bytes:
-        """All of a file, which is as the run left it.
+    def read(self, path: Path, limit: int = LARGEST_READ) -> bytes:
+        """All of a file of no more than ``limit`` bytes, which is as the run left it.
 
         Raises:
             DamagedFileError: if it is not, or cannot be read.
         """
-        content = _reading(read_file, path, LARGEST_READ)
+        content = _reading(read_file, path, limit)
         recorded = self._recorded(path)
         if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
             raise DamagedFileError(path, "is not as the run left it")
@@ -90,7 +93,8 @@ class RecordedFiles:
 
     def _recorded(self, path: Path) -> str | None:
         """The digest of a file; None where the run recorded none, or the file is not its own."""
-        place = path.resolve()
+        # Not where a link leads that somebody put in the file's place.
+        place = path.parent.resolve() / path.name
         folder = self.folder.resolve()
         if self.digests is None or not place.is_relative_to(folder):
             return None
@@ -138,6 +142,8 @@ def read_record(path: Path) -> dict[str, Any]:
         raise DamagedFileError(path, "is damaged: it must map names to values")
     if _is_too_deep(record):
         raise DamagedFileError(path, "is damaged: it is nested too deeply")
+    if VERSION_FIELD in record and FIELD not in record:
+        raise DamagedFileError(path, "is damaged: it has lost the digests of the run's files")
     if FIELD in record and not _is_whole(record):
         raise DamagedFileError(path, "is damaged: it is not as the run left it")
     return record

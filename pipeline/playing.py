@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
 from pipeline.models.model_choice import ChosenModel
-from pipeline.models.normalization import normalising, read_statistics, take_over
+from pipeline.models.normalization import take_over
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -51,15 +51,14 @@ def playing_env(
     extra = {} if mode is None else {"render_mode": mode}
     # A VecEnv resets a finished environment at once: frames are kept before that happens.
     wrap_innermost = keep_frames if mode in KEPT_MODES else None
-    statistics = None if chosen.statistics is None else read_statistics(chosen.statistics)
-    spec = chosen.spec if statistics is None else normalising(chosen.spec, statistics.settings)
+    spec = chosen.spec
     env: VecEnv = make_evaluation_env(
         spec, n_envs, wrap_innermost=wrap_innermost, monitor_folder=monitor_folder, **extra
     )
     if mode is not None and mode not in env.get_attr("metadata")[0].get("render_modes", []):
         raise UserError(f"{spec.env_id} cannot be rendered as {mode}")
-    if statistics is not None:
-        take_over(env, statistics)
+    if chosen.statistics is not None:
+        take_over(env, chosen.statistics)
     return env
 
 

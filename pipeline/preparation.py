@@ -31,9 +31,14 @@ from pipeline.evaluation.exact import (
 from pipeline.evaluation.sampled import takes_batches
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
-from pipeline.models.continuation import continuing, load_to_continue, statistics_to_continue
+from pipeline.models.continuation import (
+    continuing,
+    load_to_continue,
+    model_to_continue,
+    statistics_to_continue,
+)
 from pipeline.models.model_loading import agent_class
-from pipeline.models.model_zips import telling_masks
+from pipeline.models.model_zips import ModelFile, telling_masks
 from pipeline.models.normalization import take_over
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
@@ -123,8 +128,9 @@ def set_up(
 ) -> Training:
     """Make all parts of the training, and add to ``undo`` how to remove them again."""
     undo.callback(end_workers_after_stop)
-    spec, env = _training_env(spec, run, undo, appends=keeping.state is not None)
-    model = _make_model(spec, env, kwargs)
+    trained = model_to_continue(spec)
+    spec, env = _training_env(spec, trained, run, undo, appends=keeping.state is not None)
+    model = _make_model(spec, trained, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
     elif keeping.state is not None:
@@ -174,14 +180,14 @@ def _exact_evaluator(
 
 
 def _training_env(
-    spec: TrainSpec, run: Run, undo: ExitStack, appends: bool
+    spec: TrainSpec, trained: ModelFile | None, run: Run, undo: ExitStack, appends: bool
 ) -> tuple[TrainSpec, VecEnv]:
     """What the agent is trained on; and the spec, which follows one that goes on.
 
     With ``appends``, Monitor goes on in the files that are there.
     """
-    if spec.trained_agent is not None:
-        spec = telling_masks(spec, spec.trained_agent)
+    if trained is not None:
+        spec = telling_masks(spec, trained)
     statistics = statistics_to_continue(spec)
     if statistics is not None:
         spec = continuing(spec, statistics)
@@ -204,7 +210,9 @@ def is_unread(spec: TrainSpec) -> bool:
     return spec.tensorboard_log is None and spec.verbose < 2
 
 
-def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlgorithm:
+def _make_model(
+    spec: TrainSpec, trained: ModelFile | None, env: VecEnv, kwargs: dict[str, Any]
+) -> BaseAlgorithm:
     folder = spec.tensorboard_log
     common: dict[str, Any] = {
         "seed": spec.seed,
@@ -212,9 +220,9 @@ def _make_model(spec: TrainSpec, env: VecEnv, kwargs: dict[str, Any]) -> BaseAlg
         "tensorboard_log": None if folder is None else str(folder / environment_name(spec.env_id)),
         **action_noise(spec.hyperparams, env.action_space),
     }
-    if spec.trained_agent is None:
+    if trained is None:
         return _new_model(agent_class(spec.algo), env, spec.device, common, kwargs)
-    return load_to_continue(spec, spec.trained_agent, env, **common, **kwargs)
+    return load_to_continue(spec, trained, env, **common, **kwargs)
 
 
 def _new_model(

@@ -19,6 +19,8 @@ from pipeline.file_digests import (
     FIELD,
     RECORD,
     STATE_FOLDER,
+    VERSION,
+    VERSION_FIELD,
     RecordedFiles,
     digests_of,
     read_record,
@@ -46,6 +48,7 @@ OUTCOME = (
     "regret",
     "pulls",
     FIELD,
+    VERSION_FIELD,
 )
 # The field of ``run.json`` that says, while a run is running, which process is at work on it.
 PROCESS = "process"
@@ -253,7 +256,7 @@ class Run:
         """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
         for draft in drafts_in(self.path):  # of a file that was not to be finished any more
             draft.unlink(missing_ok=True)
-        self.update_info(**fields, **{FIELD: digests_of(self.path)})
+        self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
 
     @property
     def files(self) -> RecordedFiles:

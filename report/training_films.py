@@ -15,7 +15,7 @@ from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing
 from pipeline.filming import film_episode, write_film
-from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_choice import ChosenModel, model_of_run
 from pipeline.models.model_loading import load_model
 from pipeline.playing import playing_env
 from pipeline.signs_of_life import Tell, tell_nobody
@@ -50,8 +50,7 @@ def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     for checkpoint, episode in _checkpoints(planned):
         path = folder / f"{name}_{episode}.gif"
         if not (path.exists() and path.stat().st_mtime >= checkpoint.stat().st_mtime):
-            planned.run.files.check(checkpoint)
-            chosen = ChosenModel(checkpoint, planned.spec, planned.run)
+            chosen = model_of_run(checkpoint, planned.spec, planned.run)
             frames = episode_in_training(chosen, evaluation_seed(planned.seed, 4), MAX_STEPS)
             folder.mkdir(exist_ok=True)
             with replacing(path) as draft:
@@ -89,7 +88,7 @@ def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[
     th.set_num_threads(chosen.spec.num_threads)
     env = playing_env(chosen, "rgb_array")
     try:
-        model = load_model(chosen.spec.algo, chosen.path, env, chosen.spec.user_modules)
+        model = load_model(chosen.spec.algo, chosen.file, env, chosen.spec.user_modules)
         model.set_random_seed(seed)
         frames, _ = film_episode(model, env, max_steps, deterministic=False)
     finally:

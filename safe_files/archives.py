@@ -10,6 +10,11 @@ from collections.abc import Mapping
 from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_MEMBERS, MAX_TENSOR_RECORDS
 from safe_files.refusals import UnsafeFileError, shown
 
+# The library stores members as they are. Whoever packs a zip anew may deflate them, and weights
+# become a little smaller; what becomes much smaller is a bomb, unless it is small.
+FREELY_UNPACKED = 64 << 20
+MOST_TIMES = 20
+
 # What the library raises at zips that are damaged, encrypted, or of a kind that it does not know.
 _DAMAGE = (
     zipfile.BadZipFile,
@@ -42,6 +47,11 @@ def read_members(content: bytes, expected: frozenset[str] | None = None) -> Mapp
             if len(names) != len(set(names)) or len(names) > MAX_MEMBERS:
                 raise UnsafeFileError("holds a member twice")
             _check_sizes(infos)
+            unpacked = sum(info.file_size for info in infos)
+            if unpacked > max(FREELY_UNPACKED, MOST_TIMES * len(content)):
+                raise UnsafeFileError(
+                    f"unpacks to {unpacked:,} bytes, out of proportion to its {len(content):,}"
+                )
             # A member that unpacks to more than it says fails its own check.
             return {name: archive.read(name) for name in names}
     except UnsafeFileError:

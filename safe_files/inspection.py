@@ -11,7 +11,8 @@ from safe_files.admission import read_pickle
 from safe_files.archives import read_members
 from safe_files.library_classes import all_policy_classes
 from safe_files.limits import MAX_ARCHIVE_BYTES
-from safe_files.models import MEMBERS, NOT_READ, SERIALIZED, TENSORS, decoded, parse_settings
+from safe_files.model_members import MEMBERS, TENSORS, parse_settings
+from safe_files.models import NOT_READ, SERIALIZED, decoded
 from safe_files.pickle_trees import Grouped, Made, Mapped, Name, read_tree
 from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown

@@ -10,7 +10,6 @@ import json
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeVar
 
 import torch as th
@@ -19,29 +18,17 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from safe_files.admission import read_pickle
 from safe_files.archives import read_members
 from safe_files.library_classes import policy_classes
-from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
+from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.model_members import MEMBERS, SETTINGS, TENSORS, parse_settings
 from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown
-from safe_files.regular_files import read_file
+from safe_files.regular_files import Source, content_of
 from safe_files.sizes import check_sizes
 from safe_files.tensors import check_values, first_line, load_tensors
+from safe_files.weights import check_fit, check_variable
 
-SETTINGS = "data"
-TENSORS = frozenset(
-    f"{name}.pth"
-    for name in (
-        "policy",
-        "policy.optimizer",
-        "actor.optimizer",
-        "critic.optimizer",
-        "ent_coef_optimizer",
-        "pytorch_variables",
-        "tensors",
-    )
-)
 # What is trained and part of no network: the entropy coefficient of SAC and its kin.
 VARIABLES = frozenset({"log_ent_coef", "ent_coef_tensor"})
-MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
 
 # What the reader's own side decides.
 NOT_READ = frozenset(
@@ -76,7 +63,7 @@ class Settings:
 
 def load_model(
     algorithm: type[Algorithm],
-    path: Path | str,
+    path: Source,
     env: Any = None,
     *,
     device: th.device | str = "auto",
@@ -90,7 +77,7 @@ def load_model(
     Args:
         algorithm: the class of the model, of Stable-Baselines3 or sb3-contrib, or one of your own
             that is made and saved as theirs are.
-        path: the zip.
+        path: the zip, or a stream of its bytes.
         env: the environment to go on with, or None.
         device: where the tensors go.
         classes: classes of your own that the file may name, by their full names.
@@ -105,7 +92,7 @@ def load_model(
         ValueError: if the model does not fit ``env``, as the library says it.
     """
     files, variables = _tensors_of(algorithm)
-    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS | files)
+    members = read_members(content_of(path, MAX_ARCHIVE_BYTES), MEMBERS | files)
     settings = read_settings(members, algorithm)
     known = {**policy_classes(algorithm), **(classes or {})}
     given = {name: value for name, value in (custom_objects or {}).items() if name in settings}
@@ -118,11 +105,13 @@ def load_model(
     check_sizes({**settings.plain, **objects, **replaced}, tensors)
     checked = _zipped({**members, SETTINGS: _data(settings, objects)})
     try:
-        return algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+        model = algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+        check_fit(model, tensors)
     except ValueError:
         raise  # it does not fit the environment
     except Exception as error:  # settings and weights that do not go together can fail anywhere
         raise UnsafeFileError(f"holds no such model: {first_line(error)}") from error
+    return model
 
 
 def read_settings(members: Mapping[str, bytes], algorithm: type[BaseAlgorithm]) -> Settings:
@@ -164,31 +153,6 @@ def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozens
     return TENSORS | files, VARIABLES | variables
 
 
-def parse_settings(members: Mapping[str, bytes]) -> dict[str, Any]:
-    """The settings of a model as JSON.
-
-    Raises:
-        UnsafeFileError: if there are none, or they are no JSON, or too large.
-    """
-    if SETTINGS not in members:
-        raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
-    if len(members[SETTINGS]) > MAX_SETTINGS_BYTES:
-        raise UnsafeFileError(f"has more than {MAX_SETTINGS_BYTES:,} bytes of settings")
-    try:
-        data = json.loads(members[SETTINGS], parse_int=_integer)
-    except (ValueError, RecursionError) as error:
-        raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
-    if not isinstance(data, dict):
-        raise UnsafeFileError("has settings that do not map names to values")
-    return data
-
-
-def _integer(digits: str) -> int:
-    if len(digits) > MAX_INTEGER_BITS:
-        raise UnsafeFileError("holds an absurdly large number")
-    return int(digits)
-
-
 def decoded(key: str, text: Any) -> bytes:
     """The pickle that stands in JSON as base64.
 
@@ -222,12 +186,14 @@ def _objects(
 def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
     """The library sets each of these by the way to it: let there be no other than it writes."""
     for name in ("pytorch_variables.pth", "tensors.pth"):
-        variables = tensors.get(name)
-        if not (variables is None or isinstance(variables, dict)):
+        variables = tensors.get(name, {})
+        if not isinstance(variables, dict):
             raise UnsafeFileError(f"holds {name} that is not as the library writes it")
-        strange = sorted(map(str, set(variables or ()) - known))
+        strange = sorted(map(str, set(variables) - known))
         if strange:
             raise UnsafeFileError(f"sets {shown(strange[0])}, which is no variable of a model")
+        for key in VARIABLES & set(variables):
+            check_variable(f"{name}: {key}", variables[key])
 
 
 def _data(settings: Settings, objects: Mapping[str, Any]) -> bytes:

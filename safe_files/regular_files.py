@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import stat
 from collections.abc import Iterator
@@ -10,6 +11,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from safe_files.refusals import UnsafeFileError
+
+# What is read: a path, or a stream of bytes that were read already.
+Source = Path | str | io.BufferedIOBase
 
 
 @contextmanager
@@ -38,6 +42,21 @@ def read_file(path: Path, limit: int) -> bytes:
     with opened(path, limit) as file:
         # It may grow meanwhile: what is read is no more than was there.
         return file.read(os.fstat(file.fileno()).st_size)
+
+
+def content_of(source: Source, limit: int) -> bytes:
+    """All of a regular file, or of a stream.
+
+    Raises:
+        UnsafeFileError: if it is larger than ``limit``, or the file is no regular one.
+        OSError: if it cannot be read.
+    """
+    if not isinstance(source, io.BufferedIOBase):
+        return read_file(Path(source), limit)
+    content = source.read(limit + 1)
+    if len(content) > limit:
+        raise UnsafeFileError(f"is larger than {limit:,} bytes")
+    return content
 
 
 def _check(status: os.stat_result, path: Path, limit: int) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from safe_files.limits import MAX_BUFFER_BYTES, MAX_ROWS
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, fields, wrong
 from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.regular_files import Source, content_of
 
 _CLASSES = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
 _ARGUMENTS = ("buffer_size", "n_envs", "optimize_memory_usage", "handle_timeout_termination")
@@ -41,7 +40,7 @@ class _Stored:
 
 def load_replay_buffer(
     model: OffPolicyAlgorithm,
-    path: Path | str,
+    path: Source,
     truncate_last_traj: bool = True,
     *,
     classes: Iterable[type[ReplayBuffer]] = (),
@@ -50,7 +49,7 @@ def load_replay_buffer(
 
     Args:
         model: the agent to give the buffer to.
-        path: the file.
+        path: the file, or a stream of its bytes.
         truncate_last_traj: with `HerReplayBuffer`, end the episode under way in the buffer.
         classes: of your own, made with the arguments of `ReplayBuffer`, that the file may hold.
 
@@ -60,7 +59,7 @@ def load_replay_buffer(
     """
     known: tuple[type[ReplayBuffer], ...] = (*_CLASSES, *classes)
     makers = {full_name(cls): partial(_stored, cls) for cls in known}
-    found = read_pickle(read_file(Path(path), MAX_BUFFER_BYTES), makers=makers)
+    found = read_pickle(content_of(path, MAX_BUFFER_BYTES), makers=makers)
     if not isinstance(found, _Stored):
         raise UnsafeFileError("holds no replay buffer")
     for name in ("observation_space", "action_space"):

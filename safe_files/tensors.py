@@ -60,4 +60,6 @@ def tensors_in(content: Any, path: str = "") -> Iterator[tuple[str, th.Tensor]]:
 def first_line(error: BaseException) -> str:
     """The message of a foreign exception, or its kind where it has none."""
     lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    # PyTorch says below a heading which tensor it is.
+    n_lines = 2 if lines and lines[0].endswith(":") else 1
+    return " ".join(line.strip() for line in lines[:n_lines]) or type(error).__name__

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -16,7 +15,7 @@ from safe_files.limits import MAX_STATISTICS_BYTES
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, chosen_fields, wrong
 from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.regular_files import Source, content_of
 
 _CLASS = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
 _FLAGS = ("training", "norm_obs", "norm_reward")
@@ -42,18 +41,18 @@ class Normalization:
     ret_rms: RunningMeanStd
 
 
-def load_vec_normalize(path: Path | str, venv: VecEnv) -> VecNormalize:
+def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
     """As `VecNormalize.load`, without running anything that the file names.
 
     Args:
-        path: the file.
+        path: the file, or a stream of its bytes.
         venv: the environments to normalise.
 
     Raises:
         UnsafeFileError: if the file is no such statistics, or they do not fit the environments.
         OSError: if it cannot be read.
     """
-    found = read_normalization(read_file(Path(path), MAX_STATISTICS_BYTES))
+    found = read_normalization(content_of(path, MAX_STATISTICS_BYTES))
     _check_fit(found, venv.observation_space)
     normalized = VecNormalize(venv, **found.settings)
     if found.obs_rms is not None:

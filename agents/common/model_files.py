@@ -19,9 +19,10 @@ from stable_baselines3.common.utils import check_for_correct_spaces
 from agents.common.serialization import UnknownTypeError, decode, encode
 from safe_files.archives import read_members
 from safe_files.limits import MAX_ARCHIVE_BYTES
-from safe_files.models import MEMBERS, hides, parse_settings
+from safe_files.model_members import MEMBERS, parse_settings
+from safe_files.models import hides
 from safe_files.refusals import UnsafeFileError, shown
-from safe_files.regular_files import read_file
+from safe_files.regular_files import content_of
 from safe_files.tensors import check_values, load_tensors
 
 FORMAT_VERSION = 1
@@ -137,22 +138,25 @@ class JsonAlgorithm(BaseAlgorithm):
         known = replaced or {}
         raw = parse_settings(members)
         if raw.pop("algorithm", None) != cls.__name__:
-            raise ValueError(f"{path} does not hold a {cls.__name__} agent")
+            raise ValueError(f"{_named(path)} does not hold a {cls.__name__} agent")
         if raw.pop("format", None) != FORMAT_VERSION:
-            raise ValueError(f"{path} is written in another version of the file format")
+            raise ValueError(f"{_named(path)} is written in another version of the file format")
         return {
             name: known[name] if name in known else decode(value) for name, value in raw.items()
         }
 
 
+def _named(path: str | pathlib.Path | io.BufferedIOBase) -> str:
+    return "it" if isinstance(path, io.BufferedIOBase) else str(path)
+
+
 def _content(path: str | pathlib.Path | io.BufferedIOBase) -> bytes:
     """All of a file, read once; ``.zip`` is appended where there is none of that name."""
-    if isinstance(path, io.BufferedIOBase):
-        return path.read()
-    path = pathlib.Path(path)
-    if not path.exists():
-        path = path.with_name(f"{path.name}.zip")
-    return read_file(path, MAX_ARCHIVE_BYTES)
+    if not isinstance(path, io.BufferedIOBase):
+        path = pathlib.Path(path)
+        if not path.exists():
+            path = path.with_name(f"{path.name}.zip")
+    return content_of(path, MAX_ARCHIVE_BYTES)
 
 
 def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:

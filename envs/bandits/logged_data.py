@@ -7,11 +7,7 @@ what probability the arm was chosen, ``propensity``. Every other column is part 
 from __future__ import annotations
 
 import csv
-import math
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from io import TextIOWrapper
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +16,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.bandits.bandit import MAX_ARMS
-from mdp.array_types import Bools, Floats, Ints
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import opened
-
-ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
-
-MAX_BYTES = 1 << 30
-# An arm's linear model of the context takes its square in numbers.
-MAX_COLUMNS = 1000
-# Squares of numbers beyond these no longer are numbers, nor are the weights of rarer pulls.
-MAX_NUMBER, MIN_PROPENSITY = 1e15, 1e-9
-NUMBER = "a finite number of no more than 1e15"
+from envs.bandits.log_columns import ARM, PROPENSITY, REWARD, read_columns, some
+from mdp.array_types import Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +104,7 @@ class LoggedData:
         """The contexts in words."""
         if not self.context_names:
             return "no context"
-        names = ", ".join(self.context_names)
+        names = some(self.context_names)
         if self.categories is None:
             return f"the context {names}"
         return f"the context {names} with {len(self.categories)} values of text"
@@ -136,31 +121,19 @@ def read_log(path: str | Path) -> LoggedData:
             too long, an arm is not a whole number from 0, a number not finite or beyond 1e15, or a
             propensity not from 1e-9 to 1. The message names file and line.
     """
-    table = _Table.read(Path(path))
-    names = tuple(name for name in table.columns if name not in {ARM, REWARD, PROPENSITY})
-    text = len(names) == 1 and bool(np.isnan(_as_floats(table.columns[names[0]])).all())
-    categories = tuple(sorted(set(table.columns[names[0]]))) if text else None
-    contexts = np.empty((len(table.lines), len(names)))
-    if categories is not None:
-        place = {value: i for i, value in enumerate(categories)}
-        contexts[:, 0] = [place[value] for value in table.columns[names[0]]]
-    else:
-        for i, name in enumerate(names):
-            contexts[:, i] = table.numbers(name, f"{NUMBER}: text can only be all of the context")
-    whole = f"a whole number from 0 to {MAX_ARMS - 1}"
-    arms = table.numbers(ARM, whole, lambda v: (v >= 0) & (v < MAX_ARMS) & (v == np.floor(v)))
-    propensities = None
-    if PROPENSITY in table.columns:
-        above = f"a probability from {MIN_PROPENSITY} to 1"
-        propensities = table.numbers(PROPENSITY, above, lambda v: (v >= MIN_PROPENSITY) & (v <= 1))
+    columns, words = read_columns(Path(path))
+    names = tuple(name for name in columns if name not in {ARM, REWARD, PROPENSITY})
+    contexts = np.empty((len(columns[ARM]), len(names)))
+    for i, name in enumerate(names):
+        contexts[:, i] = columns[name] if words is None else words.places()
     return LoggedData(
         source=str(path),
         context_names=names,
         contexts=contexts,
-        arms=arms.astype(np.int64),
-        rewards=table.numbers(REWARD, NUMBER),
-        propensities=propensities,
-        categories=categories,
+        arms=columns[ARM].astype(np.int64),
+        rewards=columns[REWARD],
+        propensities=columns.get(PROPENSITY),
+        categories=None if words is None else words.sorted,
     )
 
 
@@ -194,76 +167,3 @@ def log_uniformly(env: gym.Env[Any, Any], n: int, seed: int, path: str | Path) -
             writer.writerow([*shown, arm, reward, 1 / n_arms])
             if terminated or truncated:
                 context, _ = env.reset()
-
-
-@dataclass(frozen=True, eq=False)
-class _Table:
-    """The cells of a CSV file by column, and the line of the file that each row stands on."""
-
-    path: Path
-    lines: list[int]
-    columns: dict[str, tuple[str, ...]]
-
-    @classmethod
-    def read(cls, path: Path) -> _Table:
-        """Split a file into cells, and check that it has the columns it must have."""
-        try:
-            with opened(path, MAX_BYTES) as binary:
-                file = TextIOWrapper(binary, encoding="utf-8-sig", newline="")
-                reader = csv.reader(file, strict=True)
-                numbered = ((reader.line_num, row) for row in reader if row)
-                return cls._of_rows(path, numbered)
-        except (OSError, UnicodeDecodeError, csv.Error, UnsafeFileError) as error:
-            reason = error.strerror if isinstance(error, OSError) else error
-            raise ValueError(f"cannot read {path}: {reason}") from error
-
-    @classmethod
-    def _of_rows(cls, path: Path, numbered: Iterator[tuple[int, list[str]]]) -> _Table:
-        """The table of a header and the rows below it, each with its line."""
-        header = [name.strip() for _, row in islice(numbered, 1) for name in row]
-        _check_header(header, path)
-        lines: list[int] = []
-        columns: list[list[str]] = [[] for _ in header]
-        for line, row in numbered:
-            if len(row) != len(header):
-                raise ValueError(f"{path}, line {line} has {len(row)} values, not {len(header)}")
-            lines.append(line)
-            for column, cell in zip(columns, row, strict=True):
-                column.append(cell.strip())
-        if not lines:
-            raise ValueError(f"{path} holds no pulls: a header and a row for each are needed")
-        return cls(path, lines, dict(zip(header, map(tuple, columns), strict=True)))
-
-    def numbers(
-        self, name: str, wanted: str, valid: Callable[[Floats], Bools] = np.isfinite
-    ) -> Floats:
-        """A column as numbers, all of them of a size to reckon with and valid."""
-        values = _as_floats(self.columns[name])
-        wrong = np.flatnonzero(~((np.abs(values) <= MAX_NUMBER) & valid(values)))
-        if len(wrong):
-            line, value = self.lines[wrong[0]], self.columns[name][wrong[0]]
-            raise ValueError(f"{self.path}, line {line}: {name} is {value!r}, it must be {wanted}")
-        return values
-
-
-def _check_header(header: list[str], path: Path) -> None:
-    if len(header) > MAX_COLUMNS:
-        raise ValueError(f"{path} has {len(header):,} columns, more than {MAX_COLUMNS:,}")
-    for name in (ARM, REWARD) if header else ():
-        if name not in header:
-            raise ValueError(f"{path} has no column {name!r}, only {', '.join(header)}")
-    twice = next((name for name in header if header.count(name) > 1), None)
-    if twice is not None:
-        raise ValueError(f"{path} has two columns {twice!r}")
-
-
-def _as_floats(texts: Iterable[str]) -> Floats:
-    """Each text as a number, NaN where it is none."""
-
-    def number(text: str) -> float:
-        try:
-            return float(text)
-        except ValueError:
-            return math.nan
-
-    return np.fromiter(map(number, texts), np.float64)

@@ -11,21 +11,15 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from envs.bandits import LoggedData, read_log
+from envs.bandits import LoggedData
 from experiments.off_policy.estimators import PolicyTerms, check_rewards, evaluate_policy
+from experiments.off_policy.policy_files import PolicyFile, find_policy, read_logged
 from experiments.off_policy.reward_models import CrossFit, cross_fit
 from mdp.array_types import Floats
-from pipeline.agent_checks import check_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import policy_matrix, why_not_exact
 from pipeline.models.model_loading import load_model
-from pipeline.models.model_zips import check_model_file, hand_written_algorithm, run_of
-from pipeline.models.recorded_runs import check_digest
-from pipeline.module_records import check_recorded
 from pipeline.user_modules import UserModule
-
-# What changes an agent's observations, so that they are no longer the log's contexts.
-_OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")
 
 
 @dataclass(frozen=True)
@@ -73,64 +67,25 @@ class Comparison:
     notes: tuple[str, ...]
 
 
-def read_logged(path: str | Path) -> LoggedData:
-    """A log whose propensities are known.
-
-    Raises:
-        UserError: if it cannot be read or lacks them.
-    """
-    try:
-        data = read_log(path)
-    except ValueError as error:
-        raise UserError(one_line(error)) from error
-    if data.propensities is None:
-        raise UserError(
-            f"{path} has no column 'propensity': off-policy evaluation needs the probability with "
-            "which each arm was chosen, 1 divided by the number of arms where all were equally "
-            "likely"
-        )
-    return data
-
-
 def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
-    """Load an agent from its run folder or its zip.
+    """Load an agent from its run folder or its zip: `find_policy`, then `load_policy`."""
+    return load_policy(find_policy(path), modules)
+
+
+def load_policy(found: PolicyFile, modules: Iterable[UserModule] = ()) -> LoggedPolicy:
+    """Load an agent.
 
     Args:
-        path: either.
+        found: its file.
         modules: those that the user typed, which the agent may need.
 
     Raises:
-        UserError: if there is no agent, or none that sees a context as the log has it.
+        UserError: if it cannot be loaded, or is none that sees a context as the log has it.
     """
-    zip_path = _final_model(path) if path.is_dir() else path
-    check_model_file(zip_path)
-    run = run_of(zip_path)
-    spec = {} if run is None else run.recorded_spec()
-    if run is not None:
-        check_recorded(spec, run.path)
-        check_digest(run, zip_path)
-    algo = hand_written_algorithm(zip_path) or spec.get("algo")
-    if algo is None:
-        raise UserError(f"{path} lies in no run folder: what agent it holds is not known")
-    settings = spec.get("hyperparams") or {}
-    changed = next((key for key in _OBSERVATION_SETTINGS if settings.get(key)), None)
-    if changed is not None:
-        raise UserError(f"{path} was trained with {changed}: it observes more than a log holds")
-    check_algorithm(algo)
-    agent = load_model(algo, zip_path, modules=modules, device="cpu")
+    agent = load_model(found.algo, found.model, modules=modules, device="cpu")
     if not isinstance(agent.action_space, spaces.Discrete):
-        raise UserError(f"{path} chooses no arms: its actions are {agent.action_space}")
-    log = (settings.get("env_kwargs") or {}).get("log")
-    return LoggedPolicy(str(path), agent, None if log is None else Path(log))
-
-
-def _final_model(folder: Path) -> Path:
-    run = run_of(folder / "any.zip")
-    if run is None:
-        raise UserError(f"{folder} is no run folder: it holds no whole run.json")
-    if not run.model_path.exists():
-        raise UserError(f"{folder} holds no {run.model_path.name}: its training may not have ended")
-    return run.model_path
+        raise UserError(f"{found.name} chooses no arms: its actions are {agent.action_space}")
+    return LoggedPolicy(found.name, agent, found.log)
 
 
 def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comparison:

@@ -24,9 +24,14 @@ from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.models.companions import statistics_of
 from pipeline.models.model_finding import Which, model_at, model_of
-from pipeline.models.model_zips import hand_written_algorithm, telling_masks
-from pipeline.models.normalization import normalising, read_statistics
-from pipeline.models.recorded_runs import RecordedRun, check_digest, recorded_run, run_around
+from pipeline.models.model_zips import (
+    ModelFile,
+    hand_written_algorithm,
+    read_model,
+    telling_masks,
+)
+from pipeline.models.normalization import Statistics, normalising, read_statistics
+from pipeline.models.recorded_runs import RecordedRun, recorded_run, run_around
 from pipeline.module_records import check_recorded
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
@@ -70,31 +75,29 @@ class ModelRequest:
 
 @dataclass(frozen=True)
 class ChosenModel:
-    """A model file and the run that it comes from.
+    """A model and the run that it comes from; its files have been read, and are not read again.
 
     Attributes:
-        path: the zip.
+        file: the zip.
         spec: how its environments are made.
         run: the run folder, or None for a zip that lies elsewhere.
-        named_statistics: a file of VecNormalize's statistics to use, or None for those that lie
-            with the model.
+        statistics: VecNormalize's statistics that it is played with, or None.
     """
 
-    path: Path
+    file: ModelFile
     spec: TrainSpec
     run: Run | None
-    named_statistics: Path | None = None
+    statistics: Statistics | None = None
 
     @property
-    def statistics(self) -> Path | None:
-        """The file of VecNormalize's statistics that it is played with, or None."""
-        params_path = None if self.run is None else self.run.params_path
-        return self.named_statistics or statistics_of(self.path, params_path)
+    def path(self) -> Path:
+        """Where the zip lay."""
+        return self.file.path
 
 
 def choose_model(request: ModelRequest) -> ChosenModel:
     """The model that is asked for, ready to be played: `find_model`, then `with_statistics`."""
-    return with_statistics(find_model(request), request)
+    return with_statistics(find_model(request), request.statistics)
 
 
 def find_model(request: ModelRequest) -> ChosenModel:
@@ -109,15 +112,23 @@ def find_model(request: ModelRequest) -> ChosenModel:
         chosen = _newest(request)
     else:
         chosen = _model_at(model_at(request.path, request.which), request)
-    check_digest(chosen.run, chosen.path)
-    return replace(chosen, spec=telling_masks(chosen.spec, chosen.path))
+    return replace(chosen, spec=telling_masks(chosen.spec, chosen.file))
+
+
+def model_of_run(path: Path, spec: TrainSpec, run: Run) -> ChosenModel:
+    """A model of a run whose spec is known, ready to be played.
+
+    Raises:
+        UserError: if it, or what goes with it, is not as the run left it.
+    """
+    return with_statistics(ChosenModel(read_model(path, run), spec, run))
 
 
 def _newest(request: ModelRequest) -> ChosenModel:
     algo, env_id = request.algo or "ppo", request.env_id or "CartPole-v1"
     run = _find_run(algo, env_id, request)
-    path = model_of(run, request.which)
-    return ChosenModel(path, _spec(algo, env_id, recorded_run(run), request), run)
+    file = read_model(model_of(run, request.which), run)
+    return ChosenModel(file, _spec(algo, env_id, recorded_run(run), request), run)
 
 
 def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
@@ -144,9 +155,10 @@ def _check_modules(run: Run | None) -> None:
 
 def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
     run = run_around(path)
+    file = read_model(path, run)
     _check_modules(run)
     recorded = recorded_run(run)
-    hand_written = hand_written_algorithm(path)
+    hand_written = hand_written_algorithm(file)
     algo = request.algo or hand_written or recorded.algo
     env_id = request.env_id or recorded.env_id
     if algo is None or env_id is None:
@@ -154,7 +166,7 @@ def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
         raise UserError(f"{path} lies in no run folder: say what it is with {missing}")
     check_algorithm(algo)
     check_env_id(env_id)
-    return ChosenModel(path, _spec(algo, env_id, recorded, request), run)
+    return ChosenModel(file, _spec(algo, env_id, recorded, request), run)
 
 
 def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) -> TrainSpec:
@@ -186,13 +198,21 @@ def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
     return {key: value for key, value in entry.items() if key != "normalize"}
 
 
-def with_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
+def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenModel:
     """The model with the statistics that it is played with, which are there and may be read.
+
+    Args:
+        chosen: the model.
+        named: a file of them, instead of those that lie with the model.
 
     Raises:
         UserError: if they are not.
     """
-    path, normalize = request.statistics or chosen.statistics, chosen.spec.hyperparams.normalize
+    params_path = None if chosen.run is None else chosen.run.params_path
+    path, normalize = (
+        named or statistics_of(chosen.path, params_path),
+        chosen.spec.hyperparams.normalize,
+    )
     if path is None:
         if normalize is not None and normalize.get("norm_obs", True):
             raise UserError(
@@ -200,6 +220,6 @@ def with_statistics(chosen: ChosenModel, request: ModelRequest) -> ChosenModel:
                 "are not there: name their file with --vec-normalize"
             )
         return chosen
-    check_digest(chosen.run, path)
-    spec = normalising(chosen.spec, read_statistics(path).settings)
-    return ChosenModel(chosen.path, spec, chosen.run, path)
+    statistics = read_statistics(path, chosen.run)
+    spec = normalising(chosen.spec, statistics.settings)
+    return replace(chosen, spec=spec, statistics=statistics)

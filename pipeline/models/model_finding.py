@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import UserError
-from pipeline.models.model_zips import check_model_file
 from pipeline.models.recorded_runs import run_in
 from pipeline.run_folder import INTERRUPTED, Run
 
@@ -36,7 +35,8 @@ def model_at(path: Path, which: Which = "final") -> Path:
             "--load-last-checkpoint"
         )
     path = with_suffix if with_suffix.is_file() else path
-    check_model_file(path)
+    if not path.exists():
+        raise UserError(f"no such model file: {path}")
     return path
 
 
@@ -55,7 +55,6 @@ def model_of(run: Run, which: Which = "final") -> Path:
         if isinstance(which, int) and known:
             reason = f"there are checkpoints after {known} steps"
         raise UserError(f"{run.path} holds no {path.name}: {reason}")
-    check_model_file(path)
     return path
 
 

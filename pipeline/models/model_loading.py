@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import warnings
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -11,11 +12,14 @@ from agents import load_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.models.admitted_classes import own_classes, own_makers
 from pipeline.models.model_zips import (
+    ModelFile,
     _is_hand_written,
-    check_model_file,
+    read_model,
     saved_observation,
     shown_space,
 )
+from pipeline.models.recorded_runs import read_recorded
+from pipeline.run_folder import Run
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.user_modules import UserModule
 
@@ -41,7 +45,7 @@ def agent_class(algo: str) -> type[BaseAlgorithm]:
 
 def load_model(
     algo: str,
-    path: Path,
+    model: ModelFile | Path,
     env: VecEnv | None = None,
     modules: Iterable[UserModule] = (),
     **kwargs: Any,
@@ -50,7 +54,7 @@ def load_model(
 
     Args:
         algo: name of the agent.
-        path: the zip.
+        model: the zip, or where it lies.
         env: environment to go on with, or None.
         modules: those that the user typed: the zip may name classes of theirs.
         kwargs: attributes to change.
@@ -58,40 +62,45 @@ def load_model(
     Raises:
         UserError: if the file is not a zip of such an agent, or does not fit ``env``.
     """
-    check_model_file(path)
+    file = _read(model)
     algorithm = agent_class(algo)
     try:
         with warnings.catch_warnings():
             # Said of the buffer that the library itself chose when the agent was made.
             warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
-            model = _loaded(algorithm, path, env, modules, kwargs)
-        model.__class__ = algorithm
-        return model
+            agent = _loaded(algorithm, file, env, modules, kwargs)
+        agent.__class__ = algorithm
+        return agent
     except UserError:
         raise
     except Exception as error:  # a file of another agent can fail anywhere in the library
         raise UserError(
-            f"{path} cannot be loaded as a {algo} agent: {one_line(error)}"
+            f"{file.path} cannot be loaded as a {algo} agent: {one_line(error)}"
             f"{_way_out(algorithm, error)}"
         ) from error
 
 
 def _loaded(
     algorithm: type[BaseAlgorithm],
-    path: Path,
+    file: ModelFile,
     env: VecEnv | None,
     modules: Iterable[UserModule],
     kwargs: Mapping[str, Any],
 ) -> BaseAlgorithm:
     """An agent by its class's own `load`, where it has one, or else read as data."""
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from agents.common.model_files import JsonAlgorithm
     from safe_files import load_model
 
-    if _has_own_load(algorithm):
-        # Of ours, which reads JSON and tensors, or code of the user's.
-        return algorithm.load(path, env=env, **kwargs)
+    if _is_load_of(JsonAlgorithm, algorithm):
+        return algorithm.load(file.stream(), env=env, **kwargs)
+    if not _is_load_of(BaseAlgorithm, algorithm):
+        # Code of the user's, which may do with paths alone.
+        return algorithm.load(file.path, env=env, **kwargs)
     return load_model(
         _loadable(algorithm),
-        path,
+        file.stream(),
         env,
         classes=own_classes(algorithm, modules),
         makers=own_makers(),
@@ -99,10 +108,13 @@ def _loaded(
     )
 
 
-def _has_own_load(algorithm: type[BaseAlgorithm]) -> bool:
-    from stable_baselines3.common.base_class import BaseAlgorithm
+def _read(model: ModelFile | Path) -> ModelFile:
+    return model if isinstance(model, ModelFile) else read_model(model)
 
-    return getattr(algorithm.load, "__func__", None) is not vars(BaseAlgorithm)["load"].__func__
+
+def _is_load_of(owner: type, algorithm: type[BaseAlgorithm]) -> bool:
+    """Whether the class loads as ``owner`` does."""
+    return getattr(algorithm.load, "__func__", None) is vars(owner)["load"].__func__
 
 
 def _way_out(algorithm: type[BaseAlgorithm], error: Exception) -> str:
@@ -135,7 +147,7 @@ def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
 
 def load_to_play(
     algo: str,
-    path: Path,
+    model: ModelFile | Path,
     env: VecEnv,
     device: str = "auto",
     modules: Iterable[UserModule] = (),
@@ -148,18 +160,18 @@ def load_to_play(
     Raises:
         UserError: as `load_model`; and if the agent was trained on observations of another shape.
     """
-    check_model_file(path)
+    file = _read(model)
     if _is_hand_written(algo):
-        return load_model(algo, path, env, device=device)
+        return load_model(algo, file, env, device=device)
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.utils import ConstantSchedule
 
-    saved, given = saved_observation(path), shown_space(vars(env.observation_space))
+    saved, given = saved_observation(file), shown_space(vars(env.observation_space))
     if saved != given and saved is not None:
         raise UserError(
-            f"{path} was trained on observations of {saved}, and the environment as it is made "
-            f"here gives {given}: args.yml and config.yml beside the zip would say how it was made "
-            "there, or --env-kwargs"
+            f"{file.path} was trained on observations of {saved}, and the environment as it is "
+            f"made here gives {given}: args.yml and config.yml beside the zip would say how it was "
+            "made there, or --env-kwargs"
         )
     unused = ConstantSchedule(0.0)
     replaced: dict[str, Any] = {
@@ -171,25 +183,33 @@ def load_to_play(
         replaced["observation_space"] = env.observation_space
     small = {"buffer_size": 1, "optimize_memory_usage": False}
     extra = small if issubclass(agent_class(algo), OffPolicyAlgorithm) else {}
-    return load_model(algo, path, env, modules, device=device, custom_objects=replaced, **extra)
+    return load_model(algo, file, env, modules, device=device, custom_objects=replaced, **extra)
 
 
-def load_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
+def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None) -> None:
     """Give an agent the replay buffer in a file, where it is of a kind that has one.
 
+    Args:
+        model: the agent.
+        path: the file.
+        run: the run that it is of, whose record says what it was, or None.
+
     Raises:
-        UserError: if it cannot be read, or was filled by other environments than the agent's.
+        UserError: if it cannot be read, is not as the run left it, or was filled by other
+            environments than the agent's.
     """
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     from agents.dqn import MaskedReplayBuffer
     from safe_files import load_replay_buffer as load_safely
+    from safe_files.limits import MAX_BUFFER_BYTES
 
     if not isinstance(model, OffPolicyAlgorithm):
         return
     wanted: Any = model.replay_buffer
     try:
-        load_safely(model, path, classes={MaskedReplayBuffer, type(wanted)})
+        content = io.BytesIO(read_recorded(run, path, MAX_BUFFER_BYTES))
+        load_safely(model, content, classes={MaskedReplayBuffer, type(wanted)})
     except (OSError, ValueError, AssertionError) as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
     buffer: Any = model.replay_buffer

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError, one_line
+from pipeline.models.recorded_runs import read_recorded
+from pipeline.run_folder import Run
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
@@ -44,18 +46,21 @@ class Statistics:
     returns: RunningMeanStd
 
 
-def read_statistics(path: Path) -> Statistics:
+def read_statistics(path: Path, run: Run | None = None) -> Statistics:
     """Read what VecNormalize saved, as data: nothing in the file is run.
 
+    Args:
+        path: the file.
+        run: the run that it is of, whose record says what it was, or None.
+
     Raises:
-        UserError: if the file is no such thing.
+        UserError: if the file is no such thing, or not as the run left it.
     """
     from safe_files.limits import MAX_STATISTICS_BYTES
-    from safe_files.regular_files import read_file
     from safe_files.vec_normalize import read_normalization
 
     try:
-        saved = read_normalization(read_file(path, MAX_STATISTICS_BYTES))
+        saved = read_normalization(read_recorded(run, path, MAX_STATISTICS_BYTES))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
     settings = {key: saved.settings[key] for key in _SETTINGS if saved.settings[key] is not None}

@@ -13,15 +13,16 @@ these files is run, and no module is imported because they ask for it.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError
-from pipeline.models.model_zips import run_of
-from pipeline.run_folder import Run
+from pipeline.file_digests import RECORD, DamagedFileError, read_record
+from pipeline.run_folder import Run, environment_name
 from pipeline.settings.strict_yaml import read_saved_settings
+from safe_files.regular_files import read_file
 
 _SETTINGS_FILES = ("args.yml", "config.yml")
 
@@ -43,6 +44,26 @@ class RecordedRun:
     hyperparams: dict[str, Any] | None = None
     gym_packages: tuple[str, ...] = ()
     is_own: bool = False
+
+
+def run_of(path: Path) -> Run | None:
+    """The run folder that a model file lies in, or None if it lies elsewhere.
+
+    Raises:
+        UserError: if the folder's ``run.json`` is damaged.
+    """
+    # A link to a zip may lie in the run, or lead there.
+    folders = (path.parent.resolve(), path.resolve().parent)
+    folder = next((one for one in folders if os.path.lexists(one / RECORD)), None)
+    if folder is None:
+        return None
+    env_name = read_record(folder / RECORD).get("env_name")
+    if not isinstance(env_name, str):
+        return None
+    if env_name != environment_name(env_name):
+        # Names of files are made of it.
+        raise UserError(f"{folder / RECORD} is damaged: env_name is {env_name!r}")
+    return Run(folder, env_name)
 
 
 def run_around(model: Path) -> Run | None:
@@ -114,7 +135,32 @@ def check_digest(run: Run | None, path: Path) -> None:
     try:
         run.files.check(path)
     except DamagedFileError as error:
-        raise UserError(f"{error}: train again, or name another copy of it") from error
+        raise _with_way_out(error) from error
+
+
+def read_recorded(run: Run | None, path: Path, limit: int) -> bytes:
+    """All of a file; where a run recorded what it was, it is as the run left it.
+
+    Args:
+        run: the run that the file belongs to, or None.
+        path: the file.
+        limit: the most bytes that it may have.
+
+    Raises:
+        UserError: if it is not so.
+        UnsafeFileError: if a file of no run is no regular file, or too large.
+        OSError: if such a file cannot be read.
+    """
+    if run is None:
+        return read_file(path, limit)
+    try:
+        return run.files.read(path, limit)
+    except DamagedFileError as error:
+        raise _with_way_out(error) from error
+
+
+def _with_way_out(error: DamagedFileError) -> UserError:
+    return UserError(f"{error}: train again, or name another copy of it")
 
 
 def _read(path: Path) -> dict[str, Any]:

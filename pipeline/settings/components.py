@@ -202,5 +202,13 @@ def _components(
             is_variable = parameter.kind in {parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD}
             if parameter.default is parameter.empty and name not in kwargs and not is_variable:
                 raise UserError(f"{place}: argument {name!r} is missing")
+            if kwargs.get(name) is not None and _is_function(parameter.annotation):
+                raise UserError(f"{place}: {name} is a function, which settings cannot hold")
         components.append(_Component(cls, build_value(kwargs, extra_packages, place), place))
     return tuple(components)
+
+
+def _is_function(annotation: object) -> bool:
+    """Whether an argument takes functions alone, as its type says."""
+    kind = str(annotation).partition("[")[0]
+    return "Callable" in kind and "|" not in kind

@@ -20,17 +20,19 @@ from pipeline.errors import UserError
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing, write_json
 from pipeline.filming import film_episode, write_film
-from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_choice import model_of_run
 from pipeline.models.model_loading import load_model
 from pipeline.playing import playing_env
 from report.page.markup import data_uri
 from report.page.sections import Report, Section
 from report.wording import number
+from safe_files.regular_files import read_file
 
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
 COLOURS = 128
 MAX_SIDE = 320  # pixels of a picture's longer side
 MAX_BYTES = 300_000  # of a film
+MAX_FIGURE = 1e300  # in the caption
 ALL_BYTES = 6_000_000  # of the films of a page, a third more as text
 
 
@@ -98,7 +100,7 @@ def film_of(planned: PlannedRun) -> Path | None:
         cannot be drawn.
     """
     path = planned.path / "episode.gif"
-    if not path.with_suffix(".json").exists():
+    if not _is_kept(path):
         try:
             frames, episode = _play(planned)
         except (UserError, *MISTAKES):
@@ -113,6 +115,22 @@ def film_of(planned: PlannedRun) -> Path | None:
     return path
 
 
+def _is_kept(path: Path) -> bool:
+    """Whether a film and how it went lie there, as this module leaves them."""
+    try:
+        episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
+        # Films are no part of the run, so that it has no digest of them.
+        with Image.open(io.BytesIO(read_file(path, 2 * MAX_BYTES)), formats=["GIF"]) as picture:
+            is_small = max(picture.size) <= MAX_SIDE
+            picture.load()
+        numbers = [episode["frames"], episode["return"] or 0.0, episode["steps"] or 0]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError, SyntaxError):
+        return False
+    return is_small and all(
+        isinstance(one, int | float) and abs(one) < MAX_FIGURE for one in numbers
+    )
+
+
 def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     """The frames of an episode, and how it went."""
     import torch as th
@@ -121,10 +139,10 @@ def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     spec = planned.spec
     th.set_num_threads(spec.num_threads)
-    planned.run.files.check(planned.run.model_path)
-    env = playing_env(ChosenModel(planned.run.model_path, spec, planned.run), "rgb_array")
+    chosen = model_of_run(planned.run.model_path, spec, planned.run)
+    env = playing_env(chosen, "rgb_array")
     try:
-        model = load_model(spec.algo, planned.run.model_path, env, spec.user_modules)
+        model = load_model(spec.algo, chosen.file, env, spec.user_modules)
         env.seed(evaluation_seed(planned.seed, 3))
         frames, ended = film_episode(model, env, MAX_STEPS, deterministic=True)
     finally:

@@ -18,7 +18,7 @@ import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
 from envs.bandits import log_uniformly
 from pipeline.errors import UserError
-from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_choice import model_of_run
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -124,9 +124,8 @@ def test_a_film_is_made_of_a_copied_study(evil_zip, mark):
     raw = {"n_timesteps": 8}
     spec = TrainSpec("ppo", "CartPole-v1", split(raw), raw, 0)
     shutil.copy(evil_zip, evil_zip.with_name("CartPole-v1.zip"))
-    chosen = ChosenModel(
-        evil_zip.with_name("CartPole-v1.zip"), spec, Run(evil_zip.parent, "CartPole-v1")
-    )
+    run = Run(evil_zip.parent, "CartPole-v1")
+    chosen = model_of_run(run.model_path, spec, run)
     with pytest.raises(UserError) as refused:
         episode_in_training(chosen, 0, 5)
     assert not mark.exists()

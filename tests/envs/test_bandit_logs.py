@@ -417,3 +417,41 @@ def test_replay_without_a_log_is_refused() -> None:
 def test_data_made_by_hand_needs_no_file() -> None:
     data = LoggedData("made", (), np.empty((2, 0)), np.array([0, 3]), np.zeros(2), None)
     assert (data.n_arms, data.observation_space) == (4, spaces.Discrete(1))
+
+
+@pytest.mark.parametrize(
+    "row", ["1," * 2**20, "1" * 2**21, '"\n",' * 2**19], ids=["cells", "a cell", "lines"]
+)
+@pytest.mark.parametrize("header", ["", "arm,reward\n"])
+def test_a_row_without_end_is_refused_before_it_is_read(tmp_path, header, row):
+    path = tmp_path / "log.csv"
+    path.write_text(header + row)
+    with pytest.raises(ValueError, match=r"more than 1,048,576 characters|field larger") as refused:
+        read_log(path)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_log_is_read_in_pieces_without_a_seam(tmp_path, monkeypatch):
+    lines = [f"{word},{i % 3},{i},0.5" for i, word in enumerate("zabzcabca")]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["word,arm,reward,propensity", *lines]))
+    whole = read_log(path)
+    monkeypatch.setattr("envs.bandits.log_columns.ROWS_AT_ONCE", 2)
+    pieces = read_log(path)
+    assert pieces.categories == whole.categories == ("a", "b", "c", "z")
+    assert (
+        pieces.contexts[:, 0].tolist()
+        == whole.contexts[:, 0].tolist()
+        == [3, 0, 1, 3, 2, 0, 1, 2, 0]
+    )
+    assert pieces.rewards.tolist() == list(range(9))
+
+
+@pytest.mark.parametrize("first", ["1", "a"])
+def test_text_and_numbers_in_different_pieces_do_not_mix(tmp_path, monkeypatch, first):
+    monkeypatch.setattr("envs.bandits.log_columns.ROWS_AT_ONCE", 2)
+    path = tmp_path / "log.csv"
+    cells = [first, first, "a" if first == "1" else "1", "1"]
+    path.write_text("word,arm,reward\n" + "".join(f"{cell},0,1\n" for cell in cells))
+    with pytest.raises(ValueError, match="text can only be all of the context"):
+        read_log(path)

@@ -149,6 +149,7 @@ def test_what_wraps_can_be_pickled() -> None:
             "unknown argument 'max_steps': did you mean 'max_episode_steps'?",
         ),
         ({TIME_LIMIT: {"env": 5}}, "unknown argument 'env'"),
+        ({"gymnasium.wrappers.TransformReward": {"func": "print"}}, "func is a function, which"),
         ({TIME_LIMIT: {"max_episode_steps": "few"}}, "must be a whole number, not 'few'"),
         ({TIME_LIMIT: [5]}, "must be the dotted name of a class, or that name with its arguments"),
         (5, "must be the dotted name of a class"),

@@ -75,6 +75,20 @@ def test_a_changed_record_is_refused(run, old, new):
         run.read_info()
 
 
+@pytest.mark.parametrize("field", ["files", "record_version"])
+def test_a_record_that_lost_its_digests_is_no_record_of_an_earlier_version(run, field):
+    """One letter of a name is enough to lose them."""
+    text = run.info_path.read_text()
+    run.info_path.write_text(text.replace(f'"{field}"', f'"{field[:-1]}?"'))
+    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: it "):
+        run.read_info()
+    record = json.loads(text)
+    del record[field]
+    run.info_path.write_text(json.dumps(record))
+    with pytest.raises(DamagedFileError, match=r"run\.json is damaged: it "):
+        run.read_info()
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=4),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=4), inner),
@@ -168,6 +182,16 @@ def test_a_path_through_a_link_is_the_same_file(run, tmp_path_factory):
     (run.path / "0.monitor.csv").write_bytes(b"changed")
     with pytest.raises(DamagedFileError):
         Run(link, "Lake-v1").files.check(run.path / "0.monitor.csv")
+
+
+def test_a_link_in_the_place_of_a_file_is_no_way_round_its_digest(run, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("elsewhere") / "0.monitor.csv"
+    elsewhere.write_bytes(b"another's")
+    (run.path / "0.monitor.csv").unlink()
+    (run.path / "0.monitor.csv").symlink_to(elsewhere)
+    for read in (run.files.read, run.files.check):
+        with pytest.raises(DamagedFileError, match="is not as the run left it"):
+            read(run.path / "0.monitor.csv")
 
 
 def test_digests_of_an_empty_folder(tmp_path):

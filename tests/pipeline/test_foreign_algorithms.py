@@ -20,7 +20,7 @@ from pipeline import training
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
 from pipeline.models.model_loading import load_model
-from pipeline.models.model_zips import _JSON_FAMILIES, hand_written_algorithm
+from pipeline.models.model_zips import _JSON_FAMILIES, hand_written_algorithm, read_model
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy, needs_policy
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.settings.hyperparams import split
@@ -272,4 +272,4 @@ def test_a_zip_says_what_it_is_where_it_holds_json(says, algo, tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("data", json.dumps({"algorithm": says}))
         archive.writestr("policy.pth", b"")
-    assert hand_written_algorithm(path) == algo
+    assert hand_written_algorithm(read_model(path)) == algo

@@ -22,7 +22,7 @@ from pipeline.evaluation.exact import exact_evaluator
 from pipeline.models.model_choice import ModelRequest, choose_model
 from pipeline.models.model_loading import load_to_play
 from pipeline.models.normalization import with_normalised_rewards
-from pipeline.models.recorded_runs import recorded_run, run_around
+from pipeline.models.recorded_runs import recorded_run, run_around, run_of
 from pipeline.playing import play_episodes, playing_env
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparam_entries import NoEntryError
@@ -370,3 +370,18 @@ def test_where_a_folder_says_nothing_the_default_entry_counts(zoo, tmp_path, mon
 
     monkeypatch.setattr("pipeline.models.model_choice.read_hyperparams", no_entry)
     assert choose_model(request).spec.hyperparams.frame_stack is None
+
+
+@pytest.mark.parametrize("name", ["../elsewhere", "/etc", "..", ""])
+def test_a_record_cannot_lead_out_of_its_folder(tmp_path, name):
+    (tmp_path / "run.json").write_text(json.dumps({"env_name": name}))
+    with pytest.raises(UserError, match=r"run\.json is damaged: env_name is "):
+        run_of(tmp_path / "any.zip")
+
+
+def test_a_damaged_record_is_not_taken_for_none(tmp_path):
+    """The zip beside it would be played as if nobody had said what it was."""
+    assert run_of(tmp_path / "any.zip") is None
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(UserError, match=r"run\.json is damaged"):
+        run_of(tmp_path / "any.zip")

@@ -109,9 +109,9 @@ def cut_off(spec, monkeypatch, every=None):
     return training.run
 
 
-def gone_on(run, interval=SaveInterval(is_off=True), modules=()):
-    spec = replace(recorded_training(run, modules), verbose=0, pictures=False)
-    keeping = go_on(run, StateKeeping(interval), pytest.fail)
+def gone_on(run):
+    spec = replace(recorded_training(run, ()), verbose=0, pictures=False)
+    keeping = go_on(run, StateKeeping(SaveInterval(is_off=True)), pytest.fail)
     assert keeping.state is not None
     return carry_out(training_of(spec, keeping, run))
 

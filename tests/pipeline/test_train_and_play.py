@@ -13,7 +13,8 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
-from pipeline.models.model_choice import ChosenModel
+from pipeline.models.model_choice import ChosenModel, with_statistics
+from pipeline.models.model_zips import ModelFile
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -83,7 +84,8 @@ def test_a_bar_lets_go_of_the_terminal_whatever_happens(tmp_path, monkeypatch, e
 
 
 def chosen_of(spec, statistics=None):
-    return ChosenModel(Path("no.zip"), spec, None, statistics)
+    chosen = ChosenModel(ModelFile(Path("no.zip"), b"", {}), spec, None)
+    return chosen if statistics is None else with_statistics(chosen, statistics)
 
 
 def saved_statistics(spec, path):

@@ -240,6 +240,25 @@ def test_a_film_is_small_and_made_once(report_study):
         assert picture.n_frames > 1
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("episode.json", "{}"),
+        ("episode.json", "["),
+        ("episode.json", '{"frames": "x", "steps": 1, "return": 1.0}'),
+        ("episode.json", '{"frames": 3, "steps": 1, "return": 1e999}'),
+        ("episode.gif", "GIF89a"),
+        ("episode.gif", "no picture"),
+    ],
+)
+def test_a_film_that_is_none_is_made_anew(report_study, name, content):
+    run = report_study.planned[0]
+    before = film_of(run).read_bytes()
+    (run.path / name).write_text(content)
+    assert film_of(run).read_bytes() == before
+    assert json.loads((run.path / "episode.json").read_text())["frames"] > 1
+
+
 # --- nothing gets in, nothing gets out -----------------------------------------------------------
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.utils import ConstantSchedule
 
 from safe_files import UnsafeFileError, load_model
@@ -199,6 +199,80 @@ def test_weights_that_are_not_finite_are_refused(genuine, tmp_path):
         load_model(PPO, path)
 
 
+def changed_tensor(content, change):
+    """The file of tensors after `change` had its way with what it holds."""
+    held = th.load(io.BytesIO(content), weights_only=True)
+    change(held)
+    return tensors(held)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """The members of the zip of a SAC agent, whose optimizers have seen something."""
+    path = tmp_path_factory.mktemp("trained") / "model.zip"
+    settings = {"policy_kwargs": {"net_arch": [4]}, "learning_starts": 4, "batch_size": 4}
+    SAC("MlpPolicy", "Pendulum-v1", device="cpu", **settings).learn(6).save(path)
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+BIAS = "actor.mu.bias"
+WRONG_TENSORS = {
+    "a weight of float64": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].double()})),
+    "a weight of int8": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].to(th.int8)})),
+    "a weight of half": ("policy.pth", lambda w: w.update({BIAS: w[BIAS].half()})),
+    "a complex weight": ("policy.pth", lambda w: w.update({BIAS: w[BIAS] + 1j})),
+    "a weight of another shape": ("policy.pth", lambda w: w.update({BIAS: th.zeros(2)})),
+    "a weight that is a list": ("policy.pth", lambda w: w.update({BIAS: [0.0]})),
+    "an average of another kind": (
+        "actor.optimizer.pth",
+        lambda o: o["state"][0].update(exp_avg=o["state"][0]["exp_avg"].double()),
+    ),
+    "an average of another shape": (
+        "critic.optimizer.pth",
+        lambda o: o["state"][0].update(exp_avg=th.zeros(3)),
+    ),
+    "a count of steps that is a text": (
+        "actor.optimizer.pth",
+        lambda o: o["state"][0].update(step="many"),
+    ),
+    "averages of no parameter": (
+        "actor.optimizer.pth",
+        lambda o: o["state"].update({77: {"step": 1}}),
+    ),
+    "a learning rate that is a text": (
+        "actor.optimizer.pth",
+        lambda o: o["param_groups"][0].update(lr="fast"),
+    ),
+    "an infinite learning rate": (
+        "ent_coef_optimizer.pth",
+        lambda o: o["param_groups"][0].update(lr=float("inf")),
+    ),
+    "one beta": ("actor.optimizer.pth", lambda o: o["param_groups"][0].update(betas=(0.9,))),
+    "an entropy coefficient of another kind": (
+        "pytorch_variables.pth",
+        lambda v: v.update(log_ent_coef=v["log_ent_coef"].double()),
+    ),
+    "several entropy coefficients": (
+        "pytorch_variables.pth",
+        lambda v: v.update(log_ent_coef=th.zeros(3)),
+    ),
+}
+
+
+@pytest.mark.parametrize("wrong", WRONG_TENSORS)
+def test_tensors_that_such_a_model_does_not_have_are_refused(trained, tmp_path, wrong):
+    member, change = WRONG_TENSORS[wrong]
+    changed = {**trained, member: changed_tensor(trained[member], change)}
+    reason = member.replace(".", r"\.") + "|size mismatch|holds no such model"
+    with pytest.raises(UnsafeFileError, match=reason):
+        load_model(SAC, write(tmp_path / "model.zip", changed))
+
+
+def test_the_tensors_of_a_trained_model_are_loaded(trained, tmp_path):
+    assert isinstance(load_model(SAC, write(tmp_path / "model.zip", trained)), SAC)
+
+
 def test_a_pickle_among_the_tensors_is_not_run(genuine, tmp_path):
     mark = tmp_path / "mark"
     path = write(tmp_path / "model.zip", {**genuine, "policy.pth": tensors(Attack(mark))})
@@ -214,6 +288,20 @@ def test_tensors_that_were_deflated_are_refused(genuine, tmp_path):
     path = write(tmp_path / "model.zip", {**genuine, "policy.pth": inner.getvalue()})
     with pytest.raises(UnsafeFileError, match="compressed"):
         load_model(PPO, path)
+
+
+def test_a_zip_that_unpacks_out_of_proportion_is_refused(genuine, tmp_path):
+    path = write(tmp_path / "model.zip", genuine)
+    with zipfile.ZipFile(path, "a", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("tensors.pth", bytes(80 << 20))
+    assert path.stat().st_size < 1 << 20
+    tracemalloc.start()
+    try:
+        with pytest.raises(UnsafeFileError, match="out of proportion"):
+            load_model(PPO, path)
+        assert tracemalloc.get_traced_memory()[1] < 20e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("member", ["extra.py", "../escaped.pth", "/etc/passwd", "predict.pth"])

@@ -68,7 +68,7 @@ class Everything:
     def __init__(self, seed):
         self.rng = np.random.default_rng(seed)
         self.old_rng = np.random.RandomState(seed)
-        self.python_rng = random.Random(seed)
+        self.python_rng = random.Random(seed)  # noqa: S311
         self.torch_rng = th.Generator().manual_seed(seed)
         self.scalars = [1, -0.0, float("nan"), float("-inf"), "a", None, True, 2**100, 1 + 2j]
         self.tuple = (1, [2], Point(3, [4]))
@@ -197,7 +197,7 @@ def test_what_cannot_be_kept_is_refused_by_its_place(value):
 
 
 def test_exceptions_hold_more_than_attributes():
-    with pytest.raises(NotRecordableError, match="builtins.ValueError"):
+    with pytest.raises(NotRecordableError, match=r"builtins\.ValueError"):
         record({"it": Holder(ValueError("a"))})
 
 
