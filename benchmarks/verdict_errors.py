@@ -23,7 +23,14 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 from scipy import stats
 
-from verdicts import compare_speed, count_failures, judge_pairs, level_of_look
+from verdicts import (
+    compare_speed,
+    count_failures,
+    fail_more_often,
+    failure_threshold,
+    judge_pairs,
+    level_of_look,
+)
 
 Scores = NDArray[np.float64]
 Draw = Callable[[Generator, tuple[int, ...]], Scores]
@@ -183,6 +190,26 @@ def wrong_bound(share: float, rng: Generator) -> Callable[[int | None], bool]:
     return wrong
 
 
+def wrong_unreliable(share: float, rng: Generator) -> Callable[[int | None], bool]:
+    """An agent is said to fail more often than itself; what failure is depends on the runs."""
+
+    def wrong(n: int | None) -> bool:
+        scores = failing(share)(rng, (2, n or LOOKS[-1]))
+        looks = (
+            [(n, ALPHA)] if n else [(m, level_of_look(ALPHA, k + 1)) for k, m in enumerate(LOOKS)]
+        )
+        return any(unreliable(scores[:, :m], level) for m, level in looks)
+
+    return wrong
+
+
+def unreliable(scores: Scores, level: float) -> bool:
+    """Whether one of two agents is said to fail more often."""
+    threshold = failure_threshold(0.0, float(np.median(scores, axis=1).max()))
+    counts = {str(k): count_failures(row, threshold) for k, row in enumerate(scores)}
+    return bool(fail_more_often(counts, level))
+
+
 def wrong_of_many(draw: Draw, rng: Generator, n: int, studies: int) -> float:
     """Ten times the same agent: the share of studies that tell any two of them apart."""
     found = 0
@@ -222,6 +249,10 @@ def print_errors(studies: int) -> None:
         ("at most so many fail", f"{share:.0%} do", wrong_bound(share, rng))
         for share in (0.05, 0.1, 0.2, 0.5)
     ]
+    rows += [
+        ("fails more often: the same agent", f"fails in {share:.0%}", wrong_unreliable(share, rng))
+        for share in (0.05, 0.3, 0.5)
+    ]
     for claim, kind, wrong in rows:
         figures = [f"{100 * found:.1f}" for found in rate(wrong, studies)]
         print(f"| {claim} | {kind} | {' | '.join(figures)} |", flush=True)
@@ -242,8 +273,8 @@ def print_errors_of_many(studies: int) -> None:
 def adastop(first: Scores, second: Scores, group: int, rng: Generator, n_draws: int = 1000) -> bool:
     """Whether AdaStop tells two agents apart: groups of ``group`` seeds, ALPHA over all of them."""
     n_groups = len(first) // group
-    pooled = np.stack([first, second]).reshape(2, n_groups, group).transpose(1, 0, 2)
-    pooled = pooled.reshape(n_groups, 2 * group)
+    grouped = np.stack([first, second]).reshape(2, n_groups, group)
+    pooled = grouped.transpose(1, 0, 2).reshape(n_groups, 2 * group)
     order = rng.random((n_draws, n_groups, 2 * group)).argsort(axis=-1)
     drawn = np.take_along_axis(np.broadcast_to(pooled, order.shape), order, axis=-1)
     moved = drawn[..., :group].sum(-1) - drawn[..., group:].sum(-1)
@@ -329,6 +360,21 @@ def print_power_of_equivalence(studies: int) -> None:
         print(f"| {kind}, {margin:g} | {' | '.join(cells)} |", flush=True)
 
 
+def print_power_of_failures(studies: int) -> None:
+    """How often an agent that fails is said to fail more often than one that never does."""
+    rng = np.random.default_rng(4)
+    print(f"\nFailures told from none, per cent of {studies:,} studies\n")
+    print("| fails in | 5 seeds | 10 seeds | 20 seeds | 50 seeds |\n|---|---|---|---|---|")
+    for share in (0.1, 0.2, 0.4):
+        found = [
+            np.mean(
+                [unreliable(np.stack(failing_more(share)(rng, n)), ALPHA) for _ in range(studies)]
+            )
+            for n in (5, 10, 20, 50)
+        ]
+        print(f"| {share:.0%} | {' | '.join(f'{100 * each:.0f}' for each in found)} |", flush=True)
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
@@ -338,6 +384,7 @@ def main() -> None:
     print_errors_of_many(max(studies // 10, 1))
     print_power(max(studies // 5, 1))
     print_power_of_equivalence(max(studies // 5, 1))
+    print_power_of_failures(max(studies // 5, 1))
 
 
 if __name__ == "__main__":

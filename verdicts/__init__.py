@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from verdicts.comparisons import PairComparison, compare_pairs
     from verdicts.error_levels import level_of_look
     from verdicts.estimates import Estimate, Statistic, Summary, estimate, summarise
-    from verdicts.failures import FailureCount, count_failures, failure_threshold
+    from verdicts.failures import FailureCount, count_failures, fail_more_often, failure_threshold
     from verdicts.improvement import probability_of_improvement
     from verdicts.judgement import FEWEST_SEEDS, Verdict, judge_pairs
     from verdicts.learning_curves import (
@@ -62,6 +62,7 @@ __all__ = [
     "curve_band",
     "equivalent_p_value",
     "estimate",
+    "fail_more_often",
     "failure_threshold",
     "fewest_seeds",
     "final_score",
@@ -94,6 +95,7 @@ _HOMES = {
     "summarise": "verdicts.estimates",
     "FailureCount": "verdicts.failures",
     "count_failures": "verdicts.failures",
+    "fail_more_often": "verdicts.failures",
     "failure_threshold": "verdicts.failures",
     "probability_of_improvement": "verdicts.improvement",
     "FEWEST_SEEDS": "verdicts.judgement",

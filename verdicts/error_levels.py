@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # What the first of an unknown number of looks may spend.
-FIRST_SHARE = 0.65
+FIRST_SHARE = 0.9
 
 
 def level_of_look(alpha: float, look: int, n_looks: int | None = None) -> float:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
+
+from verdicts.paired import holm
 
 
 @dataclass(frozen=True)
@@ -54,3 +58,29 @@ def count_failures(scores: ArrayLike, threshold: float, level: float = 0.05) -> 
     n, n_failed = len(values), int((values < threshold).sum())
     most = 1.0 if n_failed == n else float(stats.beta.isf(level, n_failed + 1, n - n_failed))
     return FailureCount(n_failed, n, most)
+
+
+def fail_more_often(
+    counts: Mapping[str, FailureCount], level: float = 0.05
+) -> list[tuple[str, str]]:
+    """The pairs of agents of which the first is shown to fail more often than the second.
+
+    Fisher's exact test, after Holm's correction over all pairs.
+
+    Args:
+        counts: by agent.
+        level: the share of studies in which any of the pairs may be wrong.
+
+    Source: Fisher (1935), "The logic of inductive inference".
+    """
+    pairs = [
+        (a, b) if counts[a].n_failed * counts[b].n > counts[b].n_failed * counts[a].n else (b, a)
+        for a, b in combinations(counts, 2)
+        if min(counts[a].n, counts[b].n) > 0
+    ]
+    tables = [
+        [[each.n_failed, each.n - each.n_failed] for each in (counts[a], counts[b])]
+        for a, b in pairs
+    ]
+    p_values = holm([stats.fisher_exact(table).pvalue for table in tables])
+    return [pair for pair, p_value in zip(pairs, p_values, strict=True) if p_value <= level]

@@ -64,11 +64,9 @@ def judge_pairs(
     close = np.array([equivalent_p_value(finite[a], finite[b], margin) for a, b in tested])
     nothing = Judgement("undecided", np.nan, np.nan, np.nan)
     judged = dict.fromkeys(pairs, nothing)
-    for pair, *p_values in zip(tested, apart, holm(apart), holm(close), strict=True):
-        x, y = finite[pair[0]], finite[pair[1]]
-        judged[pair] = Judgement(
-            _verdict(x, y, margin, level, *p_values[1:]), *map(float, p_values)
-        )
+    for pair, raw, adjusted, equal in zip(tested, apart, holm(apart), holm(close), strict=True):
+        verdict = _verdict(finite[pair[0]], finite[pair[1]], margin, level, adjusted, equal)
+        judged[pair] = Judgement(verdict, float(raw), float(adjusted), float(equal))
     for a, b in known:
         judged[a, b] = _known(finite[a], finite[b], margin)
     return judged
@@ -91,12 +89,13 @@ def _verdict(
 def apart_beyond(first: Floats, second: Floats, margin: float, level: float) -> bool:
     """Whether one agent is ahead by more than the margin more often than the other is.
 
-    The sign test over runs in the order of their seeds, those within the margin left out.
+    The sign test, on two sides, over runs in the order of their seeds, those within the margin left
+    out.
     """
     n = min(len(first), len(second))
     apart = differences(first[:n], second[:n])
     above, below = int((apart > margin).sum()), int((apart < -margin).sum())
-    return bool(stats.binom.sf(max(above, below) - 1, above + below, 0.5) <= level)
+    return bool(2 * stats.binom.sf(max(above, below) - 1, above + below, 0.5) <= level)
 
 
 def _known(first: Floats, second: Floats, margin: float) -> Judgement:

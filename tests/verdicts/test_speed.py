@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from verdicts import compare_speed, count_failures, failure_threshold, steps_to_stay
+from verdicts import (
+    compare_speed,
+    count_failures,
+    fail_more_often,
+    failure_threshold,
+    steps_to_stay,
+)
 
 NEVER = np.inf
 
@@ -86,3 +92,16 @@ def test_what_counts_as_a_failure():
     # Where nobody is better than blind nothing sets a failure apart.
     assert np.isnan(failure_threshold(0.2, 0.2))
     assert count_failures([0, 1], failure_threshold(1, 0)).n_failed == 0
+
+
+def test_failing_more_often_is_fishers_test():
+    def count(n_failed, n):
+        return count_failures([0.0] * n_failed + [1.0] * (n - n_failed), 0.5)
+
+    # Six of ten against none: 2 * C(10, 6) / C(20, 6) = 0.011; five: 0.033.
+    assert fail_more_often({"x": count(0, 10), "y": count(6, 10)}) == [("y", "x")]
+    assert fail_more_often({"y": count(5, 10), "x": count(0, 10)}) == [("y", "x")]
+    assert fail_more_often({"y": count(4, 10), "x": count(0, 10)}) == []
+    # Of three pairs the surest has to be three times as sure.
+    assert fail_more_often({"y": count(5, 10), "x": count(0, 10), "z": count(2, 10)}) == []
+    assert fail_more_often({"x": count(0, 0), "y": count(4, 4)}) == []
