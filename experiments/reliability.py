@@ -22,16 +22,19 @@ from verdicts import (
 # Of the metrics, those on the scale of the best blind policy.
 ON_THE_SCALE = ("final", "best")
 
+# Where the agents live whose policies do not depend on what they go through.
+FIXED_POLICIES = ("agents.planning:", "agents.reference:")
+
 
 def agents_without_chance(results: StudyResults, table: pd.DataFrame) -> frozenset[str]:
-    """The agents that plan, where policies are evaluated exactly: all their runs are the same."""
+    """The agents that do not learn, where policies are evaluated exactly: every run is the same."""
     if not (table["exact"] == True).all():  # noqa: E712  # None is no False here
         return frozenset()
     return frozenset(
         agent.label
         for agent in results.study.agents
         if agent.algo in ALGORITHMS
-        and ALGORITHMS[agent.algo].entry_point.startswith("agents.planning:")
+        and ALGORITHMS[agent.algo].entry_point.startswith(FIXED_POLICIES)
     )
 
 

@@ -226,8 +226,8 @@ VERDICTS = {
         {"qlearning": [90, 91, 90, 91, 90], "sarsa": [90.1, 91, 90, 91, 90]},
         # 1 - (0.9 * 0.05 / 2) ** (1 / 5): one look of an open number, two agents.
         (
-            "sarsa and qlearning are equivalent in the typical run within 2; 0 of 5 runs each failed, "
-            "up to 53% could."
+            "sarsa and qlearning are equivalent in the typical run within 2; 0 of 5 runs each "
+            "failed, up to 53% could."
         ),
     ),
     "equivalent but for a failure": (
@@ -245,15 +245,16 @@ VERDICTS = {
     "too few": (
         {"qlearning": [10, 11, 12, 13], "sarsa": [90, 91, 92, 91]},
         (
-            "On Warehouse-v0, the agents are undecided: 4 seeds cannot tell 2 agents apart, whatever they "
-            "score; it takes 5 or more."
+            "On Warehouse-v0, the agents are undecided: 4 seeds cannot tell 2 agents apart, "
+            "whatever they score; it takes 5 or more."
         ),
     ),
     "none has learnt": (
         {"qlearning": [0, 0, 0, 1], "sarsa": [0, -5, 0, 90]},
         (
-            "On Warehouse-v0, none of the agents has learnt: over 4 seeds, no typical run is better "
-            "than the best blind policy's 0; the highest return of the final policy is 21.25 ["
+            "On Warehouse-v0, none of the agents has learnt: over 4 seeds, no typical run is "
+            "better than the best blind policy's 0; the "
+            "highest return of the final policy is 21.25 ["
         ),
     ),
     "undecided": (
@@ -283,8 +284,8 @@ VERDICTS = {
     "speed": (
         {"qlearning": [100] * 4, "sarsa": [195] * 4},
         (
-            "sarsa reaches a score of 0.95 and keeps it to the end in 4 of 4 runs, the median one from "
-            "step 50 on; qlearning in 4 of 4 runs, the median one from step 100 on."
+            "sarsa reaches a score of 0.95 and keeps it to the end in 4 of 4 runs, the median one "
+            "from step 50 on; qlearning in 4 of 4 runs, the median one from step 100 on."
         ),
     ),
     "too slow": (
@@ -556,3 +557,31 @@ def test_agents_that_were_trained_on_a_variant_are_known_and_told_of(tmp_path):
     assert curves["training"].on_variant == ("shaped",)
     assert curves["evaluation"].on_variant == ()
     assert told == ["Warehouse-v0", "all environments", "Warehouse-v0"]
+
+
+def test_agents_that_do_not_learn_are_told_apart_by_what_they_are(tmp_path):
+    agents = ("optimal", "value_iteration", "qlearning")
+    finals = {"optimal": [100] * 2, "value_iteration": [90] * 2, "qlearning": [100] * 2}
+    results = results_of(study_of(agents=agents, n_seeds=2), tmp_path, finals)
+    text = said(results)
+    assert "optimal is better than value_iteration (by 10)." in text
+    assert "all other pairs of agents are undecided: 2 seeds cannot tell 3 agents apart" in text
+    assert set(analyse(results).environments[0].failures) == {"qlearning"}
+    # Returns of sampled episodes depend on chance, whoever plays.
+    sampled = results.summary.assign(exact=False)
+    assert "better" not in said(replace(results, summary=sampled))
+
+
+def test_speed_is_told_where_it_is_shown(tmp_path):
+    planned = plan(study_of(n_seeds=6), tmp_path)
+    for run in planned:
+        quick = run.agent == "sarsa"
+        curve = [(step, 100.0 if quick or step > 70 else 0.0) for step in range(10, 101, 10)]
+        # A first crossing that is lost again.
+        curve[0] = (10, 100.0)
+        write_run(run, curve, known=True)
+    text = said(read_results(study_of(n_seeds=6), planned, tmp_path))
+    assert "sarsa reaches a score of 0.95 and keeps it to the end in 6 of 6 runs, the" in text
+    assert "from step 10 on; qlearning in 6 of 6 runs, the median one from step 80 on." in text
+    # At step 10 or before against one after step 70.
+    assert "sarsa arrives in fewer steps: qlearning needs at least 7 times as many." in text
