@@ -14,7 +14,7 @@ from verdicts.estimates import Estimate
 from verdicts.improvement import probability_of_improvement
 from verdicts.judgement import Judgement, Verdict, judge_pairs
 from verdicts.power import seeds_needed
-from verdicts.rank_tests import win_table
+from verdicts.rank_tests import wins_of
 from verdicts.score_arrays import Floats
 from verdicts.typical import typical_difference
 
@@ -191,4 +191,4 @@ def _seeds(first: Floats, second: Floats, margin: float, level: float) -> int | 
 
 def _share(first: Floats, second: Floats) -> float:
     """The share of pairs of runs that the first wins."""
-    return float(win_table(first, second).mean())
+    return float(wins_of(first, second).mean()) / len(second)

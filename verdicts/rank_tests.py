@@ -88,21 +88,23 @@ def share_p_value(first: Floats, second: Floats) -> float:
     proportions with small expected number of positive counts", Survey Methodology 24(2).
     """
     n = min(len(first), len(second))
-    wins = win_table(first, second)
-    share = float(wins.mean())
+    ahead, behind = wins_of(first, second) / len(second), wins_of(second, first) / len(first)
+    share = float(ahead.mean())
     if n < 2 or share <= 0.5:
         return 1.0
-    variance = _variance_of_mean(wins.mean(axis=1)) + _variance_of_mean(wins.mean(axis=0))
+    variance = _variance_of_mean(ahead) + _variance_of_mean(behind)
     effective = max(n, share * (1 - share) / variance) if variance > 0 else n
     won = share * effective
     return max(float(special.betainc(won, effective - won + 1, 0.5)), 0.5**n)
 
 
-def win_table(first: Floats, second: Floats) -> Floats:
-    """1 where a run of the first (rows) beats one of the second (columns), 0.5 where equal."""
-    apart = first[:, None] - second
-    slack = SAME * np.maximum(np.abs(first)[:, None], np.abs(second))
-    return np.where(np.abs(apart) <= slack, 0.5, (apart > 0).astype(np.float64))
+def wins_of(values: Floats, others: Floats) -> Floats:
+    """How many of the others each value beats, equal ones counting half."""
+    slack = np.where(np.isfinite(values), SAME * np.abs(values), 0.0)
+    ordered = np.sort(others)
+    below = np.searchsorted(ordered, values - slack, side="left")
+    up_to = np.searchsorted(ordered, values + slack, side="right")
+    return np.asarray((below + up_to) / 2)
 
 
 def doubled_ranks(scores: Floats) -> tuple[Floats, tuple[int, ...]]:

@@ -18,7 +18,7 @@ from verdicts import (
     seeds_needed,
     typical_difference,
 )
-from verdicts.rank_tests import rank_sum_p_value, share_p_value, win_table
+from verdicts.rank_tests import rank_sum_p_value, share_p_value, wins_of
 
 SCORES = st.lists(st.integers(0, 3), min_size=2, max_size=5)
 
@@ -49,7 +49,7 @@ def test_many_scores_with_ties_are_tested_as_counted_ones():
 
 
 def test_scores_that_differ_in_the_last_bits_are_equal():
-    assert win_table(np.array([0.3]), np.array([0.1 + 0.2])).item() == 0.5
+    assert wins_of(np.array([0.3]), np.array([0.1 + 0.2])).item() == 0.5
     assert rank_sum_p_value(np.full(9, 0.1 + 0.2), np.full(9, 0.3)) == 1
 
 
