@@ -317,6 +317,13 @@ def test_runs_that_all_agree():
     assert verdicts({"x": [1] * 8, "y": [1] * 8}, 0.1) == {("x", "y"): "equivalent"}
 
 
+def test_equivalence_is_corrected_for_pairs_too():
+    same = {name: [1] * 5 for name in "xyz"}
+    assert set(verdicts(same, 0.1).values()) == {"undecided"}
+    del same["z"]
+    assert set(verdicts(same, 0.1).values()) == {"equivalent"}
+
+
 def test_agents_without_chance_are_told_apart_by_what_they_are():
     scores = {"x": [1.0] * 2, "y": [1.0] * 2, "z": [0.9, NAN], "learner": [1.0] * 2}
     found = compare_pairs(scores, 0.01, certain="xyz", **QUICK)
