@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pandas as pd
 
+from experiments.reliability import agents_without_chance, failures, speeds
 from experiments.seed_values import RESAMPLING_SEED, values_over_seeds
 from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
@@ -15,19 +16,27 @@ from mdp.array_types import Floats
 from pipeline.environments import trains_on_variant
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import (
+    FEWEST_SEEDS,
     Band,
     Estimate,
+    FailureCount,
     PairComparison,
+    SpeedComparison,
     Summary,
     ThresholdSummary,
     compare_pairs,
     estimate,
+    fail_more_often,
+    fewest_seeds,
+    level_of_look,
     performance_profile,
     probability_of_improvement,
     summarise,
     summarise_steps,
 )
 
+LOOK = 1  # how often a study has been looked at
+ALPHA = 0.05  # of the studies, at most, say anything wrong on an environment
 MARGIN = 0.02  # of the way from the best blind policy to the optimum
 
 
@@ -48,6 +57,7 @@ class AgentAnalysis:
         last_episodes: mean return of the last training episodes.
         regret: on bandits, the sum over all pulls; else without a figure.
         steps_to_threshold: when the learning curve reached the threshold; None without one.
+        steps_to_stay: when it reached the threshold for good; likewise.
         episodes_to_threshold: likewise.
         success_rate: of the final policy; None where the environment does not say.
         seconds: time that training took.
@@ -70,6 +80,7 @@ class AgentAnalysis:
     success_rate: Estimate | None
     seconds: Estimate
     on_variant: bool = False
+    steps_to_stay: ThresholdSummary | None = None
 
 
 @dataclass(frozen=True)
@@ -87,6 +98,10 @@ class EnvironmentAnalysis:
         agents: the agents, the best first.
         pairs: every two of them, the better ranked first.
         missing: by agent, also those of which no run has finished, the runs that are not there.
+        fewest: with how few seeds any two agents can be told apart.
+        failures: by agent, the runs that failed; empty where nothing says what that is.
+        unreliable: the pairs of agents of which the first is shown to fail more often.
+        speeds: every two agents, as to which of them stays above the threshold sooner.
     """
 
     environment: str
@@ -99,6 +114,10 @@ class EnvironmentAnalysis:
     agents: tuple[AgentAnalysis, ...]
     pairs: tuple[PairComparison, ...]
     missing: Mapping[str, int] = field(default_factory=dict)
+    fewest: int = FEWEST_SEEDS
+    failures: Mapping[str, FailureCount] = field(default_factory=dict)
+    unreliable: tuple[tuple[str, str], ...] = ()
+    speeds: tuple[SpeedComparison, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -168,6 +187,13 @@ def _analyse_environment(results: StudyResults, environment: str) -> Environment
     if margin is None:
         span = 0.0 if optimum is None or blind is None else optimum - blind
         margin = MARGIN * span
+    names = [agent.agent for agent in agents]
+    scores = {name: sign * metric[name] for name in names}
+    certain = agents_without_chance(results, table)
+    level = level_of_look(ALPHA, LOOK)
+    pairs = compare_pairs(scores, margin, seed=RESAMPLING_SEED, look=LOOK, certain=certain)
+    failed = failures(study.metric, scores, blind, level, certain)
+    n_tested = sum(not pair.certain for pair in pairs)
     return EnvironmentAnalysis(
         environment=environment,
         env_id=str(table["env_id"].iloc[0]),
@@ -177,12 +203,12 @@ def _analyse_environment(results: StudyResults, environment: str) -> Environment
         margin=margin,
         exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is no False here
         agents=tuple(agents),
-        pairs=tuple(
-            compare_pairs(
-                {a.agent: sign * metric[a.agent] for a in agents}, margin, seed=RESAMPLING_SEED
-            )
-        ),
+        pairs=tuple(pairs),
         missing=missing,
+        fewest=max(fewest_seeds(level / max(n_tested, 1)), FEWEST_SEEDS),
+        failures=failed,
+        unreliable=tuple(fail_more_often(failed, level)),
+        speeds=speeds(results, environment, names, level),
     )
 
 
@@ -217,6 +243,7 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         last_episodes=mean("last_episodes"),
         regret=metric.mean if study.metric == "regret" else mean("regret"),
         steps_to_threshold=summarise_steps(values("steps_to_threshold")) if has_threshold else None,
+        steps_to_stay=summarise_steps(values("steps_to_stay")) if has_threshold else None,
         episodes_to_threshold=summarise_steps(values("episodes_to_threshold"))
         if has_threshold
         else None,

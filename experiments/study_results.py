@@ -24,7 +24,7 @@ from experiments.study_spec import StudySpec
 from mdp.array_types import Floats
 from pipeline.file_digests import DamagedFileError
 from pipeline.signs_of_life import Tell, tell_nobody
-from verdicts import area_under_curve, steps_to_threshold
+from verdicts import area_under_curve, steps_to_stay, steps_to_threshold
 
 LAST_EPISODES = 100
 TRAINING_POINTS = 100
@@ -111,6 +111,7 @@ RUN_COLUMNS = (
     "regret",  # on bandits, best expected rewards less those of the arms pulled, summed up
     "threshold",
     "steps_to_threshold",  # infinite where it was never reached
+    "steps_to_stay",  # until it was reached for good
     "episodes_to_threshold",
     "n_timesteps",
     "n_episodes",
@@ -259,9 +260,10 @@ def _summary_row(
     threshold = threshold_of(study, planned.spec.env_id, final)
     steps = evaluations["step"].to_numpy()
     values = evaluations["value"].to_numpy()
-    reached = float("nan")
+    reached = stayed = float("nan")
     if threshold is not None and len(steps):
         reached = steps_to_threshold(steps, values, threshold)
+        stayed = steps_to_stay(steps, values, threshold)
     return {
         "agent": planned.agent,
         "algo": planned.spec.algo,
@@ -280,6 +282,7 @@ def _summary_row(
         "regret": run_regret(planned),
         "threshold": threshold,
         "steps_to_threshold": reached,
+        "steps_to_stay": stayed,
         "episodes_to_threshold": _episodes_by(episodes, reached),
         "n_timesteps": info["n_timesteps"],
         "n_episodes": len(episodes.returns),

@@ -40,3 +40,8 @@ def interval_alone(estimate: Estimate) -> str:
 def enumeration(words: Sequence[str]) -> str:
     """Words joined by commas, the last by "and"."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)
+
+
+def seeds(n: int) -> str:
+    """So many seeds."""
+    return f"{n:,} seed{'s' if n != 1 else ''}"

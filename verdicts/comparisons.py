@@ -1,29 +1,22 @@
-"""Which of two agents is better, and how many seeds it would take to say."""
+"""Which of two agents is better, by how much, and how many seeds it would take to say."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from verdicts.bootstrap import N_RESAMPLES
+from verdicts.error_levels import level_of_look
 from verdicts.estimates import Estimate
 from verdicts.improvement import probability_of_improvement
-from verdicts.paired import (
-    holm,
-    mean_and_spread,
-    paired_difference,
-    paired_differences,
-    paired_test,
-)
-from verdicts.power import seeds_for_equivalence, seeds_needed
+from verdicts.judgement import Judgement, Verdict, judge_pairs
+from verdicts.power import seeds_needed
+from verdicts.rank_tests import wins_of
 from verdicts.score_arrays import Floats
-
-Verdict = Literal["better", "worse", "equivalent", "undecided"]
+from verdicts.typical import typical_difference
 
 _OPPOSITE: dict[Verdict, Verdict] = {
     "better": "worse",
@@ -39,17 +32,18 @@ class PairComparison:
 
     Attributes:
         first, second: their names.
-        difference: mean of first - second over the seeds that both have, with its interval, which
-            is not corrected for the number of pairs.
-        p_value: of the paired t test.
+        difference: the median difference between a run of the first and one of the second. The
+            intervals of all pairs hold together, and agree with the verdicts.
+        p_value: of "one of the two is ahead", by the rank-sum test.
         adjusted_p_value: the same after Holm's correction over all pairs.
         probability_of_improvement: that a run of the first scores higher than one of the second.
-        verdict: on the first: ``equivalent`` where the difference is shown to lie within the
-            margin; else ``better`` or ``worse`` by the adjusted p-value; else ``undecided``.
-        seeds_needed: where undecided, the number of seeds that would decide with 80 % power if the
-            difference is as observed: for equivalence where it lies within the margin, else for
-            ``better`` or ``worse``. None where that is more than 10,000, or there are too few
-            seeds to say.
+        verdict: on the first: ``equivalent`` where neither is shown to be ahead by more than the
+            margin in half of the pairs of runs; else ``better`` or ``worse`` by the adjusted
+            p-value; else ``undecided``.
+        seeds_needed: where undecided, about the number of seeds that would decide at the next look
+            with 80 % power if all is as observed. None where that is more than 10,000, or there
+            are too few seeds to say.
+        certain: whether neither agent depends on chance, so that their scores say all there is.
     """
 
     first: str
@@ -60,6 +54,7 @@ class PairComparison:
     probability_of_improvement: Estimate
     verdict: Verdict
     seeds_needed: int | None
+    certain: bool = False
 
     def swapped(self) -> PairComparison:
         """The same comparison seen from the second agent."""
@@ -83,43 +78,54 @@ def compare_pairs(
     seed: int,
     confidence: float = 0.95,
     n_resamples: int = N_RESAMPLES,
+    look: int = 1,
+    n_looks: int | None = None,
+    certain: Collection[str] = (),
 ) -> list[PairComparison]:
     """Compare every two agents, in the order of the mapping.
 
     Args:
-        scores: by agent, shape (n_seeds,), higher is better, the same seeds at the same places. A
-            seed counts for a pair where both are finite.
+        scores: by agent, shape (n_seeds,), higher is better. What is not finite is missing.
         margin: the largest difference, in the unit of the scores, that does not matter.
         seed: of the resampling.
-        confidence: of the intervals; verdicts err with the rest of the probability.
+        confidence: of the study: in so many studies no verdict is wrong, over all of its looks.
         n_resamples: how many resamples the intervals of the probabilities come from.
+        look: how often the study has been looked at, this time included, each with more seeds.
+        n_looks: how many looks there will be; see ``level_of_look``.
+        certain: the agents that do not depend on chance; see ``judge_pairs``.
 
     Raises:
-        ValueError: for arguments out of range, or scores that do not pair up.
+        ValueError: for arguments out of range, or agents with different numbers of seeds.
 
     Source: for equivalence, two one-sided tests: Schuirmann (1987), "A comparison of the two
     one-sided tests procedure and the power approach".
     """
     _check(scores, margin, confidence)
-    pairs = list(combinations(scores, 2))
-    p_values = np.array([paired_test(scores[one], scores[two]) for one, two in pairs])
-    alpha = 1 - confidence
-    level = alpha / max(1, np.isfinite(p_values).sum())
+    arrays = {name: np.asarray(values, dtype=np.float64) for name, values in scores.items()}
+    levels = [level_of_look(1 - confidence, look, n_looks)]
+    last = n_looks is not None and look >= n_looks
+    levels.append(levels[0] if last else level_of_look(1 - confidence, look + 1, n_looks))
+    judged = judge_pairs(arrays, margin, levels[0], certain)
+    n_pairs = max(1, sum(not each.certain for each in judged.values()))
     comparisons = []
-    for (one, two), p_value, adjusted in zip(pairs, p_values, holm(p_values), strict=True):
-        x, y = _paired(scores[one], scores[two])
-        verdict = _verdict(x, y, adjusted, margin, alpha)
+    for (one, two), judgement in judged.items():
+        x, y = arrays[one], arrays[two]
+        improvement = probability_of_improvement(
+            *_paired(x, y), seed=seed, confidence=confidence, n_resamples=n_resamples
+        )
+        x, y = x[np.isfinite(x)], y[np.isfinite(y)]
         comparison = PairComparison(
             first=one,
             second=two,
-            difference=paired_difference(x, y, confidence),
-            p_value=float(p_value),
-            adjusted_p_value=float(adjusted),
-            probability_of_improvement=probability_of_improvement(
-                x, y, seed=seed, confidence=confidence, n_resamples=n_resamples
-            ),
-            verdict=verdict,
-            seeds_needed=_seeds(x, y, margin, alpha, level) if verdict == "undecided" else None,
+            difference=_difference(x, y, margin, levels[0] / n_pairs, judgement),
+            p_value=judgement.p_value,
+            adjusted_p_value=judgement.adjusted_p_value,
+            probability_of_improvement=improvement,
+            verdict=judgement.verdict,
+            seeds_needed=_seeds(x, y, margin, levels[1] / n_pairs)
+            if judgement.verdict == "undecided"
+            else None,
+            certain=judgement.certain,
         )
         comparisons.append(comparison)
     return comparisons
@@ -136,30 +142,53 @@ def _check(scores: Mapping[str, ArrayLike], margin: float, confidence: float) ->
             f"agents have scores of different shapes, {shapes}: give all of them the same seeds, "
             "and NaN for a run that failed"
         )
+    for shape in set(shapes.values()):
+        if len(shape) != 1:
+            raise ValueError(f"scores have shape {shape}, they must have (n_seeds,)")
 
 
-def _paired(first: ArrayLike, second: ArrayLike) -> Floats:
+def _paired(first: Floats, second: Floats) -> Floats:
     """Both agents' scores, shape (2, n_seeds); NaN for both where one is not finite."""
-    both = np.array([first, second], dtype=np.float64)
+    both = np.array([first, second])
     return np.where(np.isfinite(both).all(axis=0), both, np.nan)
 
 
-def _verdict(
-    first: Floats, second: Floats, adjusted_p_value: float, margin: float, alpha: float
-) -> Verdict:
-    """Equivalence goes first: within the margin a difference does not matter, however sure."""
-    # Both one-sided tests at level alpha succeed where this interval lies inside the margin.
-    inner = paired_difference(first, second, 1 - 2 * alpha)
-    if -margin <= inner.low and inner.high <= margin:
-        return "equivalent"
-    if adjusted_p_value < alpha:
-        return "better" if inner.point > 0 else "worse"
-    return "undecided"
+def _difference(
+    first: Floats, second: Floats, margin: float, level: float, judgement: Judgement
+) -> Estimate:
+    """The typical difference, its interval made to say what the verdict says.
+
+    Holm's correction may decide what an interval that counts all pairs leaves open; the test for
+    unequal spreads may leave open what it decides. And who is shown to lie within the margin lies
+    within it: Stefansson, Kim and Hsu (1988), "On confidence sets in multiple comparisons".
+    """
+    found = typical_difference(first, second, level)
+    if judgement.certain:
+        return replace(found, low=found.point, high=found.point)
+    low, high = found.low, found.high
+    if judgement.verdict == "better":
+        low = max(low, min(found.point, 0.0))
+    elif judgement.verdict == "worse":
+        high = min(high, max(found.point, 0.0))
+    elif judgement.verdict == "equivalent":
+        low, high = max(low, -margin), min(high, margin)
+    else:
+        low, high = min(low, 0.0), max(high, 0.0)
+    return found if np.isnan(found.low) else replace(found, low=low, high=high)
 
 
-def _seeds(first: Floats, second: Floats, margin: float, alpha: float, level: float) -> int | None:
-    """Seeds until the verdict that the observed difference points to."""
-    mean, spread = mean_and_spread(paired_differences(first, second))
-    if abs(mean) < margin:
-        return seeds_for_equivalence(mean, spread, margin, alpha)
-    return seeds_needed(mean, spread, level)
+def _seeds(first: Floats, second: Floats, margin: float, level: float) -> int | None:
+    """Seeds until the verdict that the scores point to."""
+    n = min(len(first), len(second))
+    if n < 2:
+        return None
+    close = min(_share(first + margin, second), _share(second + margin, first))
+    ahead = max(_share(first, second), _share(second, first))
+    within = seeds_needed(close, level) if margin > 0 else None
+    guesses = [guess for guess in (within, seeds_needed(ahead, level / 2)) if guess is not None]
+    return max(n + 1, min(guesses)) if guesses else None
+
+
+def _share(first: Floats, second: Floats) -> float:
+    """The share of pairs of runs that the first wins."""
+    return float(wins_of(first, second).mean()) / len(second)

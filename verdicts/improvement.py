@@ -15,7 +15,8 @@ from verdicts.bootstrap import (
     resample_counts,
 )
 from verdicts.estimates import Estimate
-from verdicts.paired import SAME, differences, same_shape
+from verdicts.paired import differences, same_shape
+from verdicts.rank_tests import wins_of
 from verdicts.score_arrays import Counts, Floats
 
 # From here on the bootstrap and the normal interval look the same.
@@ -62,7 +63,7 @@ def probability_of_improvement(
     if min(sizes) == 0:
         return Estimate(np.nan, np.nan, np.nan, n, n_missing)
     # How often each seed wins, through its run of the first agent and through the other's.
-    wins = [(_wins_of(one, other), len(one) - _wins_of(other, one)) for one, other in pairs]
+    wins = [(wins_of(one, other), len(one) - wins_of(other, one)) for one, other in pairs]
     point = float(np.mean([ahead.sum() / len(ahead) ** 2 for ahead, _ in wins]))
     if point in {0, 1} and min(sizes) > 1:
         sure = ((1 - confidence) / 2) ** (1 / (min(sizes) * len(sizes)))
@@ -98,15 +99,6 @@ def _both_known(first: Floats, second: Floats) -> tuple[Floats, Floats]:
     """The scores of the seeds where neither is NaN."""
     both = ~np.isnan(first) & ~np.isnan(second)
     return first[both], second[both]
-
-
-def _wins_of(values: Floats, others: Floats) -> Floats:
-    """How many of the others each value beats, equal ones counting half."""
-    slack = np.where(np.isfinite(values), SAME * np.abs(values), 0.0)
-    ordered = np.sort(others)
-    below = np.searchsorted(ordered, values - slack, side="left")
-    up_to = np.searchsorted(ordered, values + slack, side="right")
-    return np.asarray((below + up_to) / 2)
 
 
 def _table(first: Floats, second: Floats) -> Floats:

@@ -171,6 +171,31 @@ def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) ->
     return float(x[reached.argmax()]) if reached.any() else float("inf")
 
 
+def steps_to_stay(steps: ArrayLike, values: ArrayLike, threshold: float) -> float:
+    """The first evaluation from which on a curve keeps to a threshold.
+
+    A curve that fluctuates crosses it by luck long before; with many evaluations nearly any does.
+
+    Args:
+        steps: shape (n_points,), not falling.
+        values: shape (n_points,).
+        threshold: in the unit of the values.
+
+    Returns:
+        The step; infinity if the last evaluation is below the threshold, NaN if there is none.
+
+    Raises:
+        ValueError: for steps that fall, or shapes that do not fit.
+    """
+    x, y = _curve(steps, values)
+    if np.isnan(y).all():
+        return float("nan")
+    x, y = x[~np.isnan(y)], y[~np.isnan(y)]
+    below = np.flatnonzero(y < threshold)
+    first = below[-1] + 1 if len(below) else 0
+    return float(x[first]) if first < len(x) else float("inf")
+
+
 def summarise_steps(steps: ArrayLike, confidence: float = 0.95) -> ThresholdSummary:
     """How soon runs reach a threshold, and how many do.
 

@@ -1,4 +1,4 @@
-"""Differences between two agents on the same seeds: how large, and whether they are chance."""
+"""Differences between two agents on the same seeds: how large."""
 
 from __future__ import annotations
 
@@ -61,29 +61,6 @@ def paired_difference(first: ArrayLike, second: ArrayLike, confidence: float = 0
     mean, spread = mean_and_spread(apart)
     half = _half_width(spread, len(apart), confidence)
     return Estimate(mean, mean - half, mean + half, len(apart), n_missing)
-
-
-def paired_test(first: ArrayLike, second: ArrayLike) -> float:
-    """The two-sided p-value of the paired t test.
-
-    It agrees with ``paired_difference``: p < 0.05 where the 95 % interval leaves out 0. Tests by
-    signs or ranks cannot fall below 2 / 2**n, so that five seeds could never show anything.
-
-    Returns:
-        The p-value: 1 where every difference is 0, 0 where all are equal but not 0; NaN for fewer
-        than two seeds.
-
-    Raises:
-        ValueError: for shapes that do not pair up.
-
-    Source: Colas, Sigaud and Oudeyer (2019), "A hitchhiker's guide to statistical comparisons of
-    reinforcement learning algorithms", who recommend a t test for few seeds.
-    """
-    apart = paired_differences(first, second)
-    mean, spread = mean_and_spread(apart)
-    if spread == 0:
-        return 1.0 if mean == 0 else 0.0
-    return float(2 * stats.t.sf(abs(mean) / spread * len(apart) ** 0.5, len(apart) - 1))
 
 
 def holm(p_values: ArrayLike) -> Floats:

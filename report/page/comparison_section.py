@@ -15,7 +15,7 @@ PHRASES: dict[Verdict, str] = {
     "better": "is better than",
     "worse": "is worse than",
     "equivalent": "is equivalent to",
-    "undecided": "cannot be told from",
+    "undecided": "is undecided against",
 }
 
 

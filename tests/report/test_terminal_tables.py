@@ -99,8 +99,8 @@ SENTENCES = [
     ),
     "On lake, first is better than second (by 50 [45, 55]).",
     (
-        "On lake, second reaches a score of 0.95 after 47 steps; first needs 2.064 times the steps "
-        "(medians over seeds)."
+        "On lake, second reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the "
+        "median one from step 50 on; first in 3 of 4 runs, the median one from step 100 on."
     ),
     "On lake, 1 of 4 runs of second is missing.",
     "On lake, no run of third has finished.",
