@@ -3,11 +3,11 @@
     python benchmarks/against_rl_zoo3.py                # five rounds, two to five minutes
     python benchmarks/against_rl_zoo3.py --repeats 1
 
-rl_zoo3 has an environment of its own, which is made if it is not there (see `make peers`).
 Both take rl_zoo3's own hyperparameters for CartPole-v1, 20,000 steps and the same interval between
 evaluations; all else is as each has it by default, the number of torch threads above all. Once
 alone, and once two at a time, as one trains several seeds; then the time is that until both are
-done. Wall-clock time and the processors' time, medians over the rounds.
+done. Wall-clock time and the processors' time, medians over the rounds. rl_zoo3 has an environment
+of its own, which is made first where it is not there.
 """
 
 from __future__ import annotations

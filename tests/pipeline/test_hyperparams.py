@@ -40,7 +40,6 @@ from pipeline.settings.literals import DottedName
 from pipeline.settings.strict_yaml import parse_yaml, read_yaml
 from tests.peers.peer_environment import peer_folder
 
-
 ZOO = peer_folder("rl_zoo3") / "hyperparams"
 # her.yml says of itself that it is no longer used: it is of an algorithm that there is no more.
 ZOO_ALGORITHMS: Mapping[str, type[BaseAlgorithm]] = {
