@@ -73,6 +73,7 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=5, metavar="N", help="rounds (default 5)")
     repeats = parser.parse_args().repeats
+    peer_python()  # so that making its environment counts for nobody
     table = Table("trainings at once", "program", "wall, s", "processors, s", "rl_zoo3 takes")
     with tempfile.TemporaryDirectory() as folder:
         for at_once in (1, 2):
