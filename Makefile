@@ -1,4 +1,5 @@
-# Every target sets up .venv once, and again only when pyproject.toml or constraints.txt changes.
+# Every target sets up .venv once, again when pyproject.toml changes, and anew when the pins do: pip
+# leaves what is no longer pinned.
 PYTHON ?= python3
 ARGS ?=
 PYTEST_ARGS ?= -n auto --maxprocesses 8 --dist worksteal
@@ -12,6 +13,7 @@ PACKAGES := safe_files snapshots mdp verdicts envs agents pipeline experiments r
 
 BIN := .venv/bin
 STAMP := .venv/.installed
+PINS := constraints.txt requirements.txt
 # MushroomRL needs an old NumPy and brings a PyTorch of its own: that comparison is run by itself.
 BENCHMARKS := $(filter-out benchmarks/against_mushroomrl.py,$(wildcard benchmarks/[a-z]*.py))
 
@@ -20,7 +22,7 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help train test lint format bench mutants wheel clean
+.PHONY: help train test peers lint format bench mutants wheel clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
@@ -29,8 +31,11 @@ help: ## List the targets
 train: $(STAMP) ## Train PPO on the warehouse, or what ARGS="--env ... --algo ..." says
 	$(BIN)/python train.py $(if $(strip $(ARGS)),$(ARGS),--env Warehouse-v0 --algo ppo)
 
-test: $(STAMP) ## Run the whole test suite; PYTEST_ARGS replaces its options
+test: peers ## Run the whole test suite; PYTEST_ARGS replaces its options
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+peers: $(STAMP) ## Set up rl_zoo3, which tests and a benchmark need, in .venv/peers
+	@$(BIN)/python tests/peers/peer_environment.py
 
 lint: $(STAMP) ## Check style, formatting, types and import contracts
 	$(BIN)/ruff check .
@@ -59,10 +64,12 @@ clean: ## Remove caches and builds; .venv and logs/ stay
 	find . -path ./.venv -prune -o -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The stamp is written last, so a set-up that failed half-way is taken up again.
-$(STAMP): pyproject.toml constraints.txt
+$(STAMP): pyproject.toml $(PINS)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 	  { echo "Yardstick needs Python 3.11 or newer; $(PYTHON) is not. Name one: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "Setting up .venv (once, some minutes: PyTorch is large)"
-	@test -x $(BIN)/pip || $(PYTHON) -m venv .venv
-	@$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'
+	@cat $(PINS) | cmp -s - .venv/pins || \
+	  { $(PYTHON) -m venv --clear .venv && cat $(PINS) >.venv/pins; }
+	@$(BIN)/python -m pip install --quiet --no-deps -r requirements.txt
+	@$(BIN)/python -m pip install --quiet --no-build-isolation -c constraints.txt -e '.[dev]'
 	@touch $@

@@ -6,13 +6,13 @@
 Both take rl_zoo3's own hyperparameters for CartPole-v1, 20,000 steps and the same interval between
 evaluations; all else is as each has it by default, the number of torch threads above all. Once
 alone, and once two at a time, as one trains several seeds; then the time is that until both are
-done. Wall-clock time and the processors' time, medians over the rounds.
+done. Wall-clock time and the processors' time, medians over the rounds. rl_zoo3 has an environment
+of its own, which is made first where it is not there.
 """
 
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import os
 import statistics
 import subprocess
@@ -24,6 +24,8 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from tests.peers.peer_environment import peer_folder, peer_python
+
 ROOT = Path(__file__).resolve().parent.parent
 SETTINGS = ("--algo", "ppo", "--env", "CartPole-v1", "-n", "20000", "--eval-freq", "25000")
 CONTENDERS = ("train.py", "rl_zoo3")
@@ -33,13 +35,10 @@ THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 def command(contender: str, seed: int, folder: str) -> list[str]:
     """One training, with its files in ``folder``."""
-    spec = importlib.util.find_spec("rl_zoo3")
-    if spec is None or spec.origin is None:
-        raise SystemExit("rl_zoo3 is not installed: pip install rl_zoo3")
-    hyperparams = Path(spec.origin).parent / "hyperparams" / "ppo.yml"
-    program = ["train.py"] if contender == "train.py" else ["-m", "rl_zoo3.train"]
+    hyperparams = peer_folder("rl_zoo3") / "hyperparams" / "ppo.yml"
+    ours, theirs = [sys.executable, "train.py"], [peer_python(), "-m", "rl_zoo3.train"]
     settings = [*SETTINGS, "--conf-file", str(hyperparams), "--seed", str(seed), "-f", folder]
-    return [sys.executable, *program, *settings]
+    return [*(ours if contender == "train.py" else theirs), *settings]
 
 
 def times(contender: str, at_once: int, folder: str) -> tuple[float, float]:
@@ -74,6 +73,7 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=5, metavar="N", help="rounds (default 5)")
     repeats = parser.parse_args().repeats
+    peer_python()  # so that making its environment counts for nobody
     table = Table("trainings at once", "program", "wall, s", "processors, s", "rl_zoo3 takes")
     with tempfile.TemporaryDirectory() as folder:
         for at_once in (1, 2):

@@ -14,7 +14,6 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
-from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = (
@@ -174,20 +173,6 @@ def test_only_commands_parse_arguments() -> None:
     users = [module_name(path) for path in sources() if "argparse" in imported_names(path)]
     assert users
     assert [name for name in users if not name.startswith("commands.")] == []
-
-
-def test_constraints_pin_a_version_inside_each_declared_range() -> None:
-    pins = {}
-    for line in (ROOT / "constraints.txt").read_text().splitlines():
-        if line and not line.startswith("#"):
-            name, version = line.split("==")
-            pins[canonicalize_name(name)] = Version(version)
-    extras = PROJECT["optional-dependencies"].values()
-    declared = [Requirement(line) for lines in (PROJECT["dependencies"], *extras) for line in lines]
-    others = [one for one in declared if one.name != PROJECT["name"]]
-    outside = [str(one) for one in others if pins[canonicalize_name(one.name)] not in one.specifier]
-    assert outside == []
-    assert all(version.local is None for version in pins.values())
 
 
 def test_no_module_is_longer_than_300_lines() -> None:

@@ -1,13 +1,13 @@
 """The page for those who come from rl_zoo3 is complete, and says what is so."""
 
 import ast
-import importlib.util
 import re
 from pathlib import Path
 
 import pytest
 
 from commands import enjoy_agent, train_agent
+from tests.peers.peer_environment import peer_folder
 
 PAGE = Path(__file__).parents[2] / "docs" / "from-rl-zoo3.md"
 COMMANDS = {"train": train_agent, "enjoy": enjoy_agent}
@@ -15,11 +15,10 @@ FLAG = re.compile(r"`(--?[a-zA-Z][\w-]*)")
 
 
 def flags_of_rl_zoo3(command):
-    """The option strings of each argument, read off its source: importing it has side effects."""
-    folder = Path(importlib.util.find_spec("rl_zoo3").origin).parent
+    """The option strings of each argument, read off its source."""
     calls = [
         node
-        for node in ast.walk(ast.parse((folder / f"{command}.py").read_text()))
+        for node in ast.walk(ast.parse((peer_folder("rl_zoo3") / f"{command}.py").read_text()))
         if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument"
     ]
     return {tuple(argument.value for argument in call.args) for call in calls}

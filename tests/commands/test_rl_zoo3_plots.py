@@ -13,6 +13,7 @@ import yaml
 
 import compare
 import train
+from tests.peers.peer_environment import peer_python
 
 ROOT = Path(compare.__file__).parent
 ENV_ID = "FrozenLake-v1"
@@ -53,9 +54,9 @@ for command in json.loads(sys.argv[1]):
 
 
 def zoo(*commands, cwd):
-    """What commands of rl_zoo3 print, in a process of their own: importing it changes Gymnasium."""
+    """What commands of rl_zoo3 print, in a process of the Python that has it."""
     result = subprocess.run(
-        [sys.executable, "-c", RUN, json.dumps([list(map(str, words)) for words in commands])],
+        [peer_python(), "-c", RUN, json.dumps([list(map(str, words)) for words in commands])],
         cwd=cwd,
         capture_output=True,
         text=True,

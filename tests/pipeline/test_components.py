@@ -1,6 +1,5 @@
 """Names in files become objects only of the kinds and packages that are admitted."""
 
-import importlib.util
 import math
 import pickle
 import subprocess
@@ -42,6 +41,7 @@ from pipeline.settings.components import (
 from pipeline.settings.hyperparam_entries import read_hyperparams
 from pipeline.settings.hyperparams import component_specs, split
 from pipeline.settings.literals import DottedName
+from tests.peers.peer_environment import peer_folder, peer_python
 
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
 CLIP = "gymnasium.wrappers.ClipReward"
@@ -87,7 +87,7 @@ def test_a_list_wraps_from_the_inside_out() -> None:
 
 
 def test_the_order_is_that_of_rl_zoo3() -> None:
-    # In a process of its own: importing rl_zoo3 patches Gymnasium.
+    # In a process of the Python that has it: importing rl_zoo3 patches Gymnasium.
     code = f"""
 import gymnasium as gym
 from rl_zoo3.utils import get_wrapper_class
@@ -97,7 +97,7 @@ env = get_wrapper_class({{"env_wrapper": spec}})(gym.make("CartPole-v1").unwrapp
 print(type(env).__name__, type(env.env).__name__)
 """
     done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
+        [peer_python(), "-W", "ignore", "-c", code], capture_output=True, text=True, check=True
     )
     ours = wrapped([{CLIP: {"max_reward": 1.0}}, "gymnasium.wrappers.OrderEnforcing"])
     assert isinstance(ours, OrderEnforcing)
@@ -188,10 +188,7 @@ def test_a_package_is_admitted_by_the_user(tmp_path: Path, monkeypatch: Any) -> 
 
 
 def test_an_entry_whose_wrapper_is_not_installed_is_readable() -> None:
-    spec = importlib.util.find_spec("rl_zoo3")
-    assert spec is not None
-    assert spec.origin is not None
-    path = Path(spec.origin).parent / "hyperparams" / "ppo.yml"
+    path = peer_folder("rl_zoo3") / "hyperparams" / "ppo.yml"
     found = [
         env_id
         for env_id, entry in yaml.safe_load(path.read_text()).items()
@@ -338,11 +335,8 @@ def test_the_hand_written_agents_take_their_arguments() -> None:
 
 @pytest.mark.parametrize("algorithm", [sb3.PPO, sb3.DQN, sb3.A2C, QRDQN])
 def test_every_rl_zoo3_entry_builds(algorithm: type[Any]) -> None:
-    spec = importlib.util.find_spec("rl_zoo3")
-    assert spec is not None
-    assert spec.origin is not None
     name = algorithm.__name__.lower()
-    path = Path(spec.origin).parent / "hyperparams" / f"{name}.yml"
+    path = peer_folder("rl_zoo3") / "hyperparams" / f"{name}.yml"
     for env_id in yaml.safe_load(path.read_text()):
         entry = split(read_hyperparams(name, env_id, path))
         assert build_algorithm_kwargs(algorithm, entry.algorithm, env_id).keys() == (

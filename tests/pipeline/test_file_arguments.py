@@ -1,7 +1,7 @@
 """Wrappers and callbacks of settings write nowhere but in the run folder."""
 
 import ast
-import importlib.util
+import importlib
 import inspect
 import pkgutil
 import warnings
@@ -16,6 +16,7 @@ from pipeline.errors import UserError
 from pipeline.settings.components import callbacks, vec_wrapper_factory, wrapper_factory
 from pipeline.settings.constructor_arguments import constructor_parameters
 from pipeline.settings.file_arguments import confined, names_a_place
+from tests.peers.peer_environment import peer_folder
 
 CALLBACKS = "stable_baselines3.common.callbacks"
 CHECKPOINT = f"{CALLBACKS}.CheckpointCallback"
@@ -106,8 +107,7 @@ def test_every_text_of_every_component_is_known(component_classes):
 
 
 def test_every_text_of_the_components_of_rl_zoo3_is_known():
-    """Read, not imported, which would change Gymnasium's time limit."""
-    folder = Path(importlib.util.find_spec("rl_zoo3").submodule_search_locations[0])
+    folder = peer_folder("rl_zoo3")
     found = set()
     for file in ("wrappers.py", "callbacks.py"):
         for node in ast.walk(ast.parse((folder / file).read_text())):

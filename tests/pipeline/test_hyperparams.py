@@ -1,6 +1,5 @@
 """Files of hyperparameters: rl_zoo3's load unchanged, and every mistake is told in one line."""
 
-import importlib.util
 import inspect
 import math
 import os
@@ -39,17 +38,9 @@ from pipeline.settings.hyperparams import (
 )
 from pipeline.settings.literals import DottedName
 from pipeline.settings.strict_yaml import parse_yaml, read_yaml
+from tests.peers.peer_environment import peer_folder
 
-
-def rl_zoo3_folder() -> Path:
-    # Found without importing it: that would patch Gymnasium for every other test.
-    spec = importlib.util.find_spec("rl_zoo3")
-    assert spec is not None
-    assert spec.origin is not None
-    return Path(spec.origin).parent / "hyperparams"
-
-
-ZOO = rl_zoo3_folder()
+ZOO = peer_folder("rl_zoo3") / "hyperparams"
 # her.yml says of itself that it is no longer used: it is of an algorithm that there is no more.
 ZOO_ALGORITHMS: Mapping[str, type[BaseAlgorithm]] = {
     path.stem: load_algorithm(path.stem) for path in sorted(ZOO.glob("*.yml")) if path.stem != "her"

@@ -1,6 +1,6 @@
 """rl_zoo3 finds, reads and plays our runs; its plots, and the library's, read our monitors.
 
-In processes of their own: importing rl_zoo3 changes Gymnasium's time limit.
+In processes of their own, of the Python that has it: importing it changes Gymnasium's time limit.
 """
 
 import csv
@@ -17,6 +17,7 @@ from stable_baselines3.common.results_plotter import ts2xy
 
 import train
 from pipeline.run_folder import Run
+from tests.peers.peer_environment import peer_python
 
 ROOT = Path(train.__file__).parent
 
@@ -79,7 +80,7 @@ ENTRY = {
 
 def python(program, *arguments, cwd=ROOT):
     result = subprocess.run(
-        [sys.executable, "-c", program, *map(str, arguments)],
+        [peer_python(), "-c", program, *map(str, arguments)],
         cwd=cwd,
         capture_output=True,
         text=True,
