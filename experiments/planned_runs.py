@@ -74,7 +74,7 @@ class PlannedRun:
             recorded = _recorded(run.read_info())
         except DamagedFileError:
             return False
-        return _identity(recorded) == _identity(self.spec.as_data())
+        return bool(_identity(recorded) == _identity(self.spec.as_data()))
 
     @property
     def differences(self) -> dict[str, tuple[Any, Any]]:
