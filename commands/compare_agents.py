@@ -171,8 +171,8 @@ def _compare(args: argparse.Namespace) -> int:
     from commands.terminal import table_console
     from experiments.child_processes import end_server, stop_all
     from experiments.run_limits import RunLimits
-    from experiments.study_lock import study_lock
     from experiments.study_plan import plan
+    from pipeline.folder_lock import folder_lock
 
     go_on_unread()
     root = Path(args.log_folder) / study.name
@@ -187,7 +187,7 @@ def _compare(args: argparse.Namespace) -> int:
         stop_all()
         _thread.interrupt_main(signal.SIGTERM)
 
-    with study_lock(root, stop, say):
+    with folder_lock(root, stop, say):
         try:
             return _do_study(args, study, planned, console, limits)
         except KeyboardInterrupt:

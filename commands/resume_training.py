@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,14 +13,22 @@ from commands.parsing import command_line, exit_code
 from commands.streams import go_on_unread
 from commands.train_flags import build_parser
 from pipeline.errors import UserError
+from pipeline.resuming.state_folder import remove_states
+from pipeline.resuming.unfinished_runs import (
+    go_on,
+    is_finished,
+    newest_unfinished,
+    recorded_training,
+    run_of_spec,
+)
 from pipeline.run_folder import Run
-from pipeline.stopping import StopRequest
+from pipeline.stopping import StopRequest, current
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from pipeline.preparation import Training
+    from pipeline.training import Outcome
 
 # What may be given beside --resume: how it is shown, kept and imported, and not what is done.
 _MAY_BE_GIVEN = (
@@ -42,7 +51,6 @@ def resume_run(args: argparse.Namespace, stop: StopRequest) -> int:
     """
     _check_given(args)
     from pipeline.models.recorded_runs import run_in
-    from pipeline.resuming.unfinished_runs import newest_unfinished, recorded_training
     from pipeline.user_modules import import_typed
 
     if args.resume:
@@ -62,8 +70,6 @@ def resume_same(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) ->
     Raises:
         UserError: if it cannot go on, or another process is at work on it.
     """
-    from pipeline.resuming.unfinished_runs import recorded_training, run_of_spec
-
     run = run_of_spec(spec, any_seed=args.seed < 0)
     if run is None:
         return None
@@ -86,56 +92,50 @@ def _check_given(args: argparse.Namespace) -> None:
 
 
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
-    from commands.run_output import print_header, print_outcome
+    from commands.run_output import print_header, print_line, print_outcome
     from commands.terminal import TextConsole
-    from pipeline.resuming.unfinished_runs import is_finished
-    from pipeline.signs_of_life import doing
+    from pipeline.run_folder import INTERRUPTED
+    from pipeline.run_lock import at_work_on, check_left
 
     spec = replace(spec, verbose=args.verbose, progress=args.progress)
     go_on_unread()
     console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
-    if is_finished(run):
-        return _nothing_to_do(args, run, console)
-    print_header(console, spec)
-    with stop.held():
-        with doing(console, "loading the libraries") as activity:
-            with stop.waiting(0.0):
-                from pipeline.resuming.claims import claimed
-                from pipeline.run_folder import INTERRUPTED
-                from pipeline.training import carry_out
-
-            activity.now("making the environments and the agent")
-            lock = ExitStack()
-            lock.enter_context(claimed(run))
-        with lock:
-            outcome = carry_out(_prepared(args, run, spec, console))
+    if not is_finished(run):
+        print_header(console, spec)
+        check_left(run)
+    with stop.held(), ExitStack() as lock:
+        with stop.waiting(0.0):
+            lock.enter_context(at_work_on(run, partial(print_line, console)))
+        if is_finished(run):
+            return _nothing_to_do(args, run, console)
+        outcome = _carried_out(args, run, spec, console)
         print_outcome(console, spec, outcome)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 
 def _nothing_to_do(args: argparse.Namespace, run: Run, console: Console) -> int:
-    from pipeline.resuming.state_folder import remove_states
-
     if not args.keep_state:  # of a process that was killed just before it did that
         remove_states(run.state_path)
     console.print(f"{run.path} is finished already", markup=False, highlight=False)
     return 0
 
 
-def _prepared(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console) -> Training:
-    """The run, set up to go on from its newest state."""
+def _carried_out(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console) -> Outcome:
+    """What comes out of the run, from its newest state on."""
+    from commands.run_output import print_line
     from pipeline.resuming.state_keeping import StateKeeping
-    from pipeline.resuming.unfinished_runs import go_on
     from pipeline.signs_of_life import doing
-    from pipeline.training import prepare
 
-    def say(line: str) -> None:
-        console.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+    say = partial(print_line, console)
+    with doing(console, "loading the libraries") as activity:
+        with current().waiting(0.0):
+            from pipeline.training import carry_out, prepare
 
-    with doing(console, "making the environments and the agent"):
-        keeping = go_on(run, StateKeeping(args.save_state_every, stays=args.keep_state), say)
+            activity.now("making the environments and the agent")
+            keeping = go_on(run, StateKeeping(args.save_state_every, stays=args.keep_state), say)
         if keeping.state is None:
             say("no state was saved: the run begins anew")
         else:
             say(f"going on from step {keeping.state.note['steps']:,}")
-        return prepare(spec, console, {}, command_line(), run, keeping)
+        training = prepare(spec, console, {}, command_line(), run, keeping)
+    return carry_out(training)

@@ -69,6 +69,11 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     console.print(f"[dim]{settings}[/]", highlight=False)
 
 
+def print_line(console: Console, line: str) -> None:
+    """Say something beside the figures, in one line however long it is."""
+    console.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+
+
 def print_refusal(console: Console, refusal: str | None) -> None:
     """Say why the environment's own model is not used, where that is so."""
     if refusal is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from commands.parsing import command_line, exit_code
@@ -50,7 +51,7 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
-    from commands.run_output import print_header, print_outcome, print_refusal
+    from commands.run_output import print_header, print_line, print_outcome, print_refusal
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
 
@@ -64,13 +65,15 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
             with stop.waiting(0.0):
                 from pipeline.resuming.state_keeping import StateKeeping
                 from pipeline.run_folder import INTERRUPTED
+                from pipeline.run_lock import at_work_on
                 from pipeline.training import carry_out, prepare
 
             activity.now("making the environments and the agent")
             keeping = StateKeeping(args.save_state_every, stays=args.keep_state)
             training = prepare(spec, console, _recorded(args), command_line(), keeping=keeping)
         print_refusal(console, training.refusal)
-        outcome = carry_out(training)
+        with at_work_on(training.run, partial(print_line, console)):
+            outcome = carry_out(training)
         print_outcome(console, spec, outcome)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 

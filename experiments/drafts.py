@@ -16,10 +16,10 @@ import shutil
 from collections.abc import Collection
 from pathlib import Path
 
-from experiments.folder_clock import seconds_silent
 from experiments.planned_runs import PlannedRun
 from pipeline import liveness
 from pipeline.files import portable_name
+from pipeline.folder_clock import seconds_silent
 
 FOLDER = ".drafts"
 # In a draft, what an interrupted run goes on from.

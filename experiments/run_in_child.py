@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from experiments.drafts import draft_path, take_over
-from experiments.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
 from experiments.planned_runs import PlannedRun
 from experiments.repair import move_aside
 from experiments.replaced_runs import make_room
 from experiments.run_or_go_on import do_or_go_on
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import put_in_place
+from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.signs_of_life import Heartbeat
 from pipeline.user_modules import import_again
 

@@ -23,6 +23,7 @@ from safe_files.regular_files import opened, read_file
 
 RECORD = "run.json"
 FIELD = "files"
+LOCK = ".lock"  # of the process at work
 STATE_FOLDER = "state"  # of what a run goes on from, which is no part of what it leaves
 VERSION_FIELD = "record_version"
 VERSION = 2  # of records with digests; those before had no such field
@@ -109,7 +110,7 @@ def digests_of(folder: Path) -> dict[str, str]:
     return {
         name: _digest(path, sys.maxsize)
         for name, path in names.items()
-        if name != RECORD and not (path.name.startswith(".") and path.suffix == ".tmp")
+        if name not in (RECORD, LOCK) and not (path.name.startswith(".") and path.suffix == ".tmp")
     }
 
 

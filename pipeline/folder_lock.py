@@ -1,4 +1,4 @@
-"""One driver at a time on a study: a file that says who is at work, and is not held by the dead.
+"""One process at a time on a study or a run: a file says who is at work, and the dead hold none.
 
 The file appears in one step, as a link to one that is written already; that works on network
 folders too. Its owner gives signs of life. On the machine where it was made the process itself is
@@ -18,15 +18,15 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from experiments.folder_clock import (
+from pipeline import liveness
+from pipeline.errors import UserError, visible
+from pipeline.folder_clock import (
     SECONDS_BETWEEN_SIGNS,
     give_sign,
     last_sign,
     remove_remains,
     seconds_silent,
 )
-from pipeline import liveness
-from pipeline.errors import UserError, visible
 from pipeline.signs_of_life import Heartbeat
 
 NAME = ".lock"
@@ -35,23 +35,23 @@ _SECONDS_BETWEEN_LOOKS = 0.2
 _LARGEST = 10_000  # bytes
 
 
-class StudyInUseError(UserError):
-    """Another driver is at work on the study."""
+class FolderInUseError(UserError):
+    """Another process is at work in the folder."""
 
 
 @contextmanager
-def study_lock(
+def folder_lock(
     root: Path, on_loss: Callable[[], object], say: Callable[[str], object]
 ) -> Iterator[None]:
-    """Be the only driver of a study inside the ``with`` statement.
+    """Be the only process at work in a folder inside the ``with`` statement.
 
     Args:
-        root: the study's folder; it is made, and removed again if nothing else came into it.
-        on_loss: called in another thread if another driver has taken this one for dead.
+        root: the folder; it is made, and removed again if nothing else came into it.
+        on_loss: called in another thread if another process has taken this one for dead.
         say: told in a line why it takes long, where it does.
 
     Raises:
-        StudyInUseError: if another driver is at work, saying who.
+        FolderInUseError: if another process is at work, saying who.
     """
     made = _make_folders(root)
     path, token = root / NAME, secrets.token_hex(16)
@@ -85,7 +85,7 @@ def _take(path: Path, token: str, say: Callable[[str], object]) -> None:
     while not _appears(path, json.dumps(mark)):
         owner = _read(path)
         if _is_at_work(path, owner, say):
-            raise StudyInUseError(_words(path.parent, owner))
+            raise FolderInUseError(_words(path.parent, owner))
         _remove_dead(path, owner)
 
 
@@ -143,14 +143,14 @@ def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object])
 def _remove_dead(path: Path, owner: dict[str, Any]) -> None:
     """Remove the lock of an owner that is gone, and no other that came meanwhile.
 
-    Of several drivers, one alone can give it the name that only this lock can get.
+    Of several processes, one alone can give it the name that only this lock can get.
     """
     digest = hashlib.sha256(repr(owner.get("token")).encode()).hexdigest()[:32]
     grave = path.with_name(f"{NAME}.{digest}.dead.tmp")
     try:
         grave.mkdir()
     except FileExistsError:
-        # Another driver is at it, or was killed while it was.
+        # Another is at it, or was killed while it was.
         with contextlib.suppress(OSError):
             if seconds_silent(grave) > SECONDS_BETWEEN_SIGNS:
                 grave.rmdir()
@@ -175,4 +175,4 @@ def _beat(path: Path, token: str, on_loss: Callable[[], object]) -> None:
 
 def _words(root: Path, owner: dict[str, Any]) -> str:
     who = f"process {owner.get('pid', '?')} on {owner.get('host', '?')}"
-    return visible(f"{root}: {who} is at work on this study since {owner.get('since', '?')}")
+    return visible(f"{root}: {who} is at work on it since {owner.get('since', '?')}")

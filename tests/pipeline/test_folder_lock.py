@@ -10,9 +10,9 @@ import time
 
 import pytest
 
-from experiments import study_lock as locks
-from experiments.study_lock import NAME, StudyInUseError, study_lock
+from pipeline import folder_lock as locks
 from pipeline import liveness
+from pipeline.folder_lock import NAME, FolderInUseError, folder_lock
 
 FOREIGN = {**liveness.mark(), "host": "elsewhere", "machine": "other", "boot": "other"}
 FOREIGN |= {"token": "t", "since": "2026-01-01 00:00:00"}
@@ -23,7 +23,7 @@ def never(*words):
 
 
 def lock(root, on_loss=never, say=never):
-    return study_lock(root, on_loss, say)
+    return folder_lock(root, on_loss, say)
 
 
 def leave_lock(root, owner, seconds=0.0):
@@ -43,7 +43,7 @@ def test_inside_nobody_else_is_let_in_and_afterwards_nothing_is_left(tmp_path):
             assert [path.name for path in root.iterdir()] == [NAME]
             who = re.escape(f"{root}: process {os.getpid()} on {liveness.mark()['host']} is at wor")
             with (
-                pytest.raises(StudyInUseError, match=f"^{who}k on this study since 20..-"),
+                pytest.raises(FolderInUseError, match=f"^{who}k on it since 20..-"),
                 lock(root),
             ):
                 never()
@@ -86,7 +86,7 @@ def test_one_elsewhere_that_shows_itself_is_at_work(tmp_path, monkeypatch):
     monkeypatch.setattr(time, "sleep", lambda seconds: os.utime(path))
     said = []
     with (
-        pytest.raises(StudyInUseError, match="on elsewhere is at work"),
+        pytest.raises(FolderInUseError, match="on elsewhere is at work"),
         lock(tmp_path, say=said.append),
     ):
         never()
@@ -116,7 +116,7 @@ def test_of_many_at_once_one_gets_the_lock_of_the_dead(tmp_path):
                 most.append(len(inside))
                 time.sleep(0.05)
                 inside.pop()
-        except StudyInUseError:
+        except FolderInUseError:
             refused.append(1)
 
     threads = [threading.Thread(target=drive) for _ in range(8)]
@@ -172,7 +172,7 @@ def test_without_links_it_works_too(tmp_path, monkeypatch):
         raise PermissionError(1, "Operation not permitted")
 
     monkeypatch.setattr(os, "link", refuse)
-    with lock(tmp_path), pytest.raises(StudyInUseError), lock(tmp_path):
+    with lock(tmp_path), pytest.raises(FolderInUseError), lock(tmp_path):
         never()
     assert list(tmp_path.iterdir()) == []
 
@@ -211,5 +211,5 @@ def wait_for(condition):
 
 def test_a_lock_cannot_speak_to_the_terminal(tmp_path, monkeypatch):
     leave_lock(tmp_path, {**liveness.mark(), "token": "\x1b[2J", "since": "\x1b]0;taken\x07"})
-    with pytest.raises(StudyInUseError, match=r"since \\x1b\]0;taken\\x07$"), lock(tmp_path):
+    with pytest.raises(FolderInUseError, match=r"since \\x1b\]0;taken\\x07$"), lock(tmp_path):
         never()
