@@ -6,6 +6,7 @@ import _thread
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.folder_lock import folder_lock
@@ -40,6 +41,6 @@ def check_left(run: Run) -> None:
         UserError: if somebody is.
     """
     info = run.read_info()
-    process = info.get(PROCESS)
+    process: Any = info.get(PROCESS)
     if info.get("state") == RUNNING and is_alive(process):
         raise UserError(f"{run.path}: process {process['pid']} is at work on it")
