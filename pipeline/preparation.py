@@ -40,6 +40,7 @@ from pipeline.models.continuation import continuing, load_to_continue, statistic
 from pipeline.models.model_loading import agent_class
 from pipeline.models.model_zips import telling_masks
 from pipeline.models.normalization import take_over
+from pipeline.number_watch import NumberWatch
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.run_folder import Run, environment_name
@@ -122,7 +123,7 @@ def set_up(
     exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = _evaluation(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
-    callbacks = _named_callbacks(spec, run, model)
+    callbacks = [NumberWatch(), *_named_callbacks(spec, run, model)]
     pulls = _pull_recorder(model, run, console) if is_bandit else None
     if pulls is not None:
         callbacks.append(pulls)

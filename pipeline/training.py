@@ -17,6 +17,7 @@ from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import value_map
+from pipeline.finite_numbers import NotFiniteError, check_model
 from pipeline.models.companions import final_replay_buffer_path
 from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
 from pipeline.pictures.learning_curve import draw_learning_curve
@@ -174,13 +175,25 @@ def _learn(training: Training) -> None:
         kwargs["log_interval"] = None
     elif spec.log_interval != -1:
         kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
-    training.model.learn(
-        spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
-        callback=training.callback,
-        tb_log_name=spec.algo,
-        reset_num_timesteps=spec.trained_agent is None,
-        **kwargs,
-    )
+    try:
+        training.model.learn(
+            spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
+            callback=training.callback,
+            tb_log_name=spec.algo,
+            reset_num_timesteps=spec.trained_agent is None,
+            **kwargs,
+        )
+    except (ValueError, RuntimeError) as error:
+        # PyTorch refuses distributions of nan, and does not say where they come from.
+        _blame_weights(training, error)
+        raise
+
+
+def _blame_weights(training: Training, error: Exception) -> None:
+    try:
+        check_model(training.model)
+    except NotFiniteError as cause:
+        raise cause from error
 
 
 def _finish(training: Training, state: str, seconds: float, activity: Activity) -> Outcome:

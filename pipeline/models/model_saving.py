@@ -7,10 +7,16 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from pipeline.files import replacing
+from pipeline.finite_numbers import check_model
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Write the agent to ``path``, whole or not at all."""
+    """Write the agent to ``path``, whole or not at all.
+
+    Raises:
+        NotFiniteError: if there are nan or infinity in what it has learnt: what is there stays.
+    """
+    check_model(model)
     with replacing(path) as draft:
         model.save(draft)
 
