@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import re
 import secrets
@@ -13,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from pipeline.json_text import json_text
 
 # Windows takes no more than 260 characters for a whole path, Linux no more than 255 bytes a name.
 LONGEST_NAME = 100  # bytes
@@ -79,5 +80,5 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Replace the file at ``path`` by ``data`` as indented JSON."""
-    write_text(path, json.dumps(data, indent=2) + "\n")
+    """Replace the file at ``path`` by ``data`` as indented JSON; nan is null there."""
+    write_text(path, json_text(data, indent=2) + "\n")
