@@ -49,17 +49,13 @@ def run_study(
     failures = _do_missing(console, planned, root, command, n_workers or available_cores())
     with doing(console, "reading the results") as activity:
         results = read_results(study, planned, root, activity.at)
-    if len(results.summary):
-        _judge(console, results, command, with_page=with_page)
-    for failure in failures:
-        console.print(
-            f"failed: {failure.planned.agent} on {failure.planned.environment}, "
-            f"seed {failure.planned.seed}: {failure.reason}; see {failure.log}",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
-    _print_left_out(console, results.left_out)
+    try:
+        if len(results.summary):
+            _judge(console, results, command, with_page=with_page)
+    finally:
+        for failure in failures:
+            _print_failure(console, failure)
+        _print_left_out(console, results.left_out)
     return 1 if failures or results.left_out else 0
 
 
@@ -69,6 +65,15 @@ def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) ->
         moved = move_damaged_aside(study, planned, activity.at)
     for damaged, place in moved:
         _say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
+
+
+def _print_failure(console: Console, failure: RunFailure) -> None:
+    run = failure.planned
+    details = "the details could not be written" if failure.log is None else f"see {failure.log}"
+    _say(
+        console,
+        f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}; {details}",
+    )
 
 
 def _print_left_out(console: Console, left_out: Sequence[LeftOut]) -> None:

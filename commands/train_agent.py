@@ -146,7 +146,12 @@ def main() -> int:
     from commands.train_request import train_spec
 
     spec = train_spec(args)
-    from commands.run_output import print_header, print_outcome, print_refusal
+    from commands.run_output import (
+        print_header,
+        print_outcome,
+        print_refusal,
+        telling_what_is_kept,
+    )
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
 
@@ -160,6 +165,7 @@ def main() -> int:
         activity.now("making the environments and the agent")
         training = prepare(spec, console, vars(args), command_line())
     print_refusal(console, training.refusal)
-    outcome = carry_out(training)
+    with telling_what_is_kept(training.run):
+        outcome = carry_out(training)
     print_outcome(console, spec, outcome)
     return INTERRUPT if outcome.state == INTERRUPTED else 0

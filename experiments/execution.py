@@ -29,12 +29,12 @@ class RunFailure:
     Attributes:
         planned: the run.
         reason: why, in one line.
-        log: the file with the details.
+        log: the file with the details; None where it could not be written.
     """
 
     planned: PlannedRun
     reason: str
-    log: Path
+    log: Path | None
 
 
 Listener = Callable[[PlannedRun, RunFailure | None], None]
@@ -86,6 +86,16 @@ def execute_on(
     return failures
 
 
+def _kept(log: Path, details: str) -> Path | None:
+    """The file with the details; None where it cannot be written, as on a full disk."""
+    try:
+        make_folder(log.parent)
+        write_text(log, details)
+    except OSError:
+        return None
+    return log
+
+
 def _supervised_run(planned: PlannedRun, root: Path, command: str) -> RunFailure | None:
     log = failure_log(root, planned)
     draft = draft_path(root, planned)
@@ -94,8 +104,6 @@ def _supervised_run(planned: PlannedRun, root: Path, command: str) -> RunFailure
     except StoppedError:
         return None
     except TaskFailedError as error:
-        make_folder(log.parent)
-        write_text(log, error.details)
-        return RunFailure(planned, str(error), log)
+        return RunFailure(planned, str(error), _kept(log, error.details))
     log.unlink(missing_ok=True)
     return None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
@@ -20,6 +21,9 @@ LONGEST_NAME = 100  # bytes
 
 _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
 _DEVICE = re.compile(r"(con|prn|aux|nul|(con(in|out)\$)|(com|lpt)[0-9¹²³]) *(\.|$)", re.IGNORECASE)
+
+# What happens to a file while it is written, of which the system does not say which it was.
+DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.EIO)})
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
 _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
@@ -60,17 +64,29 @@ def put_in_place(draft: Path, path: Path) -> None:
 
 
 @contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let a disk that is full, and the like, say where: at ``path``, unless it says so itself."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in DISK_ERRORS and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def replacing(path: Path) -> Iterator[Path]:
     """Give a name beside ``path`` to write to, and rename it into place once it is whole."""
     # A name that could be guessed might be there already, as a link to another's file.
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
-    try:
-        yield draft
-        with draft.open("rb+") as file:  # Windows flushes only what may be written
-            os.fsync(file.fileno())
-        put_in_place(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+    with naming(path):
+        try:
+            yield draft
+            with draft.open("rb+") as file:  # Windows flushes only what may be written
+                os.fsync(file.fileno())
+            put_in_place(draft, path)
+        finally:
+            draft.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:

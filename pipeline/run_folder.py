@@ -6,6 +6,7 @@ The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, so that its to
 
 from __future__ import annotations
 
+import contextlib
 import re
 import shutil
 from dataclasses import dataclass
@@ -14,12 +15,16 @@ from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.file_digests import FIELD, RECORD, RecordedFiles, digests_of, read_record, sealed
-from pipeline.files import portable_name, write_json
+from pipeline.files import naming, portable_name, write_json
 
 RUNNING = "running"
 FINISHED = "finished"
 INTERRUPTED = "interrupted"
 FAILED = "failed"
+
+# Kept by a run that is under way: where nothing else fits on the disk, its last word does.
+ROOM = ".room"
+ROOM_BYTES = 64 << 10
 
 
 class NoRunError(UserError):
@@ -195,8 +200,24 @@ class Run:
         """Set fields of ``run.json``."""
         write_json(self.info_path, sealed({**self.read_info(), **fields}))
 
+    def keep_room(self) -> None:
+        """Take the room on the disk that the run's last word needs."""
+        room = self.path / ROOM
+        with naming(room):
+            room.write_bytes(bytes(ROOM_BYTES))
+
+    def _give_room(self) -> None:
+        (self.path / ROOM).unlink(missing_ok=True)
+
+    def fail(self, reason: str) -> None:
+        """Note in ``run.json`` that the run has failed, if anything can be written at all."""
+        with contextlib.suppress(OSError):
+            self._give_room()
+            self.update_info(state=FAILED, reason=reason)
+
     def end(self, **fields: Any) -> None:
         """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
+        self._give_room()
         self.update_info(**fields, **{FIELD: digests_of(self.path)})
 
     @property

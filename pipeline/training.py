@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,11 +14,12 @@ import torch as th
 from rich.console import Console
 
 from mdp.machine_code import compile_timer
+from pipeline.broken_runs import blame_weights, close, give_up
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import value_map
-from pipeline.finite_numbers import NotFiniteError, check_model
+from pipeline.files import naming
 from pipeline.models.companions import final_replay_buffer_path
 from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
 from pipeline.pictures.learning_curve import draw_learning_curve
@@ -25,7 +27,7 @@ from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.pull_recording import PullSummary, summarise_pulls
-from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
+from pipeline.run_folder import FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.run_record import recorded_versions, write_arguments, write_settings
 from pipeline.signs_of_life import Activity, doing
 from pipeline.train_spec import TrainSpec
@@ -91,8 +93,9 @@ def prepare(
     suffix = f"_{uuid4()}" if spec.unique_id else ""
     if run is None:
         run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
-    with ExitStack() as undo, _library_errors_in_one_line():
+    with ExitStack() as undo, _library_errors_in_one_line(), naming(run.path):
         undo.callback(run.discard)
+        run.keep_room()
         training = set_up(spec, run, kwargs, console, undo)
         spec = training.spec  # with what an agent that goes on has brought along
         write_settings(run, spec, command)
@@ -126,11 +129,10 @@ def carry_out(training: Training) -> Outcome:
         UserError: if the agent finds at its first step that it cannot work so; no folder is left
             behind then.
     """
-    model = training.model
     started = time.monotonic()
     state = FINISHED
     try:
-        with compile_timer() as seconds_compiling:
+        with naming(training.run.path), compile_timer() as seconds_compiling:
             try:
                 _learn(training)
             except KeyboardInterrupt:
@@ -138,34 +140,18 @@ def carry_out(training: Training) -> Outcome:
             finally:
                 training.display.close()
             seconds = time.monotonic() - started - seconds_compiling()
-        with doing(training.display.console, "saving what was learnt") as activity:
-            return _finish(training, state, seconds, activity)
+        with (
+            naming(training.run.path),
+            doing(training.display.console, "saving what was learnt") as activity,
+        ):
+            outcome = _finish(training, state, seconds, activity)
     except BaseException as error:
-        _give_up(training, error)
+        with contextlib.suppress(OSError):  # what could not be written still cannot
+            close(training)
+        give_up(training, error)
         raise
-    finally:
-        training.eval_env.close()
-        if hasattr(model, "_logger"):
-            model.logger.close()
-        if model.env is not None:
-            model.env.close()
-
-
-def _give_up(training: Training, error: BaseException) -> None:
-    """Note the reason; or remove the folder, where the agent failed before its first step.
-
-    Raises:
-        UserError: in that case, where the agent's settings are at fault.
-    """
-    run, model = training.run, training.model
-    has_begun = model.num_timesteps > model._num_timesteps_at_start
-    if isinstance(error, ValueError | OSError) and not has_begun:
-        run.discard()
-        if isinstance(error, OSError):  # says for itself which file it was
-            return
-        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
-        raise UserError(message) from error
-    run.update_info(state=FAILED, reason=one_line(error))
+    close(training)
+    return outcome
 
 
 def _learn(training: Training) -> None:
@@ -184,16 +170,8 @@ def _learn(training: Training) -> None:
             **kwargs,
         )
     except (ValueError, RuntimeError) as error:
-        # PyTorch refuses distributions of nan, and does not say where they come from.
-        _blame_weights(training, error)
+        blame_weights(training.model, error)
         raise
-
-
-def _blame_weights(training: Training, error: Exception) -> None:
-    try:
-        check_model(training.model)
-    except NotFiniteError as cause:
-        raise cause from error
 
 
 def _finish(training: Training, state: str, seconds: float, activity: Activity) -> Outcome:

@@ -127,8 +127,9 @@ def evaluate(
 
     when = f"in the evaluation at step {model.num_timesteps:,}"
     env.seed(seed)
+    watched: Any = FinitePlayer(player(model, env), when)
     returns, lengths = evaluate_policy(
-        FinitePlayer(player(model, env), when),
+        watched,
         env,
         n_eval_episodes=n_episodes,
         deterministic=deterministic,

@@ -59,4 +59,5 @@ def test_a_record_of_odd_values_is_valid_and_whole(tmp_path):
     record = strictly(run.info_path.read_text(encoding="utf-8"))
     assert record == run.read_info()  # which holds it against its own digest
     assert record["spec"] == {"clip": math.inf, "scale": 0.5}
-    assert record["final"] is None and FIELD in record
+    assert record["final"] is None
+    assert FIELD in record
