@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NoReturn
 
+from commands.exhaustion import exhaustion
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
 
@@ -113,6 +114,11 @@ def _exit_code(main: Callable[[], int]) -> int:
     except OSError as error:
         place = f": {error.filename}" if error.filename else ""
         message = f"{error.strerror or one_line(error)}{place}"
+    except (MemoryError, RuntimeError, ImportError) as error:
+        exhausted = exhaustion(error)
+        if exhausted is None:
+            raise
+        message = exhausted
     except KeyboardInterrupt:
         print(f"{program}: interrupted", file=sys.stderr)
         return INTERRUPT

@@ -15,7 +15,7 @@ from experiments.bandit_batches import do_batch
 from experiments.planned_runs import PlannedRun
 from experiments.repair import move_aside
 from pipeline.file_digests import DamagedFileError
-from pipeline.files import portable_name, put_in_place
+from pipeline.files import portable_name, put_in_place, sync_folders
 from pipeline.run_folder import Run
 from pipeline.training import train
 from pipeline.user_modules import import_again
@@ -136,3 +136,4 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     except OSError:
         if not planned.is_finished:
             raise
+    sync_folders(*list(planned.path.parents)[:3])

@@ -15,7 +15,7 @@ from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.file_digests import FIELD, RECORD, RecordedFiles, digests_of, read_record, sealed
-from pipeline.files import naming, portable_name, write_json
+from pipeline.files import naming, portable_name, sync_file, sync_folders, write_json
 
 RUNNING = "running"
 FINISHED = "finished"
@@ -24,7 +24,7 @@ FAILED = "failed"
 
 # Kept by a run that is under way: where nothing else fits on the disk, its last word does.
 ROOM = ".room"
-ROOM_BYTES = 64 << 10
+ROOM_BYTES = 16 << 10
 
 
 class NoRunError(UserError):
@@ -216,9 +216,17 @@ class Run:
             self.update_info(state=FAILED, reason=reason)
 
     def end(self, **fields: Any) -> None:
-        """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
+        """Set fields of ``run.json``, the last file of a run, with the digests of all others.
+
+        Before that the disk has all others, and the way to them.
+        """
         self._give_room()
-        self.update_info(**fields, **{FIELD: digests_of(self.path)})
+        digests = digests_of(self.path)
+        for name in digests:
+            sync_file(self.path / name)
+        inner = {(self.path / name).parent for name in digests}
+        sync_folders(*inner, *[self.path, *self.path.parents][:3])
+        self.update_info(**fields, **{FIELD: digests})
 
     @property
     def files(self) -> RecordedFiles:
