@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from experiments.run_in_child import (
     remove_draft,
 )
 from experiments.study_spec import file_name
+from pipeline.errors import one_line
 from pipeline.files import write_text
 
 
@@ -105,5 +107,8 @@ def _supervised_run(planned: PlannedRun, root: Path, command: str) -> RunFailure
         return None
     except TaskFailedError as error:
         return RunFailure(planned, str(error), _kept(log, error.details))
+    except (OSError, EOFError, RuntimeError) as error:  # no room, process, thread or file left
+        reason = f"its process could not be started: {one_line(error)}"
+        return RunFailure(planned, reason, _kept(log, traceback.format_exc()))
     log.unlink(missing_ok=True)
     return None

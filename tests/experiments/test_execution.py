@@ -122,16 +122,25 @@ def test_a_record_is_whole(tmp_path):
     assert (info["state"], info["spec"]["seed"]) == ("finished", 0)
 
 
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (TaskFailedError("the disk is full", "Traceback"), "the disk is full"),
+        (EOFError("unexpected EOF"), "its process could not be started: unexpected EOF"),
+        (BlockingIOError(errno.EAGAIN, "none left"), "its process could not be started: [Errno"),
+    ],
+)
 def test_a_failure_whose_details_cannot_be_written_is_told_and_the_others_go_on(
-    tmp_path, monkeypatch
+    tmp_path, monkeypatch, error, reason
 ):
     def full(path, text):
         raise OSError(errno.ENOSPC, "No space left on device", str(path))
 
     def failing(*args, **kwargs):
-        raise TaskFailedError("the disk is full", "Traceback")
+        raise error
 
     monkeypatch.setattr(execution, "write_text", full)
     monkeypatch.setattr(execution, "supervise", failing)
     failure = execution._supervised_run(runs_of(tmp_path)[0], tmp_path, "compare.py")
-    assert (failure.reason, failure.log) == ("the disk is full", None)
+    assert failure.reason.startswith(reason)
+    assert failure.log is None
