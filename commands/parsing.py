@@ -16,6 +16,7 @@ from pathlib import Path
 from signal import SIGINT, Signals
 from typing import Any, NoReturn
 
+from commands.exhaustion import exhaustion
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
 from pipeline.stopping import default_for_signals, n_stops
@@ -131,6 +132,11 @@ def _exit_code(main: Callable[[], int]) -> int:
     except OSError as error:
         place = f": {error.filename}" if error.filename else ""
         message = f"{error.strerror or one_line(error)}{place}"
+    except (MemoryError, RuntimeError, ImportError) as error:
+        exhausted = exhaustion(error)
+        if exhausted is None:
+            raise
+        message = exhausted
     except KeyboardInterrupt as stop:
         number = getattr(stop, "number", SIGINT)
         how = "interrupted" if number == SIGINT else f"ended by {Signals(number).name}"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -10,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from commands.parsing import called_as
+from pipeline.errors import UserError
 from pipeline.module_records import as_flag
 from pipeline.run_folder import FINISHED, Run, numbered_runs
 from pipeline.train_spec import TrainSpec
@@ -105,6 +108,25 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     width = max(len(label) for label, _ in rows) + 2
     command = f"{'watch':<{width}}{watch_command(spec, outcome.run)}"
     console.print(command, highlight=False, markup=False, soft_wrap=True)
+
+
+@contextmanager
+def telling_what_is_kept(run: Run) -> Iterator[None]:
+    """Let the line about a run that fails end with the models that its folder keeps.
+
+    Raises:
+        UserError: that line; as it is where no folder is left.
+    """
+    try:
+        yield
+    except UserError as error:
+        if not run.path.exists():
+            raise
+        best, checkpoints = run.best_model_path, len(run.checkpoints())
+        kept = [best.name] if best.exists() else []
+        kept += [f"{checkpoints:,} checkpoint{'s'[: checkpoints > 1]}"] if checkpoints else []
+        models = " and ".join(kept) or "no model"
+        raise UserError(f"{error}; {run.path} keeps {models}") from error
 
 
 def watch_command(spec: TrainSpec, run: Run) -> str:

@@ -56,18 +56,14 @@ def run_study(
     failures = _do_missing(console, planned, root, command, n_workers, limits)
     with doing(console, "reading the results") as activity:
         results = read_results(study, planned, root, activity.at)
-    if len(results.summary):
-        _judge(console, results, command, with_page=with_page)
-        _print_mixed_versions(console, results)
-    for failure in failures:
-        console.print(
-            f"failed: {failure.planned.agent} on {failure.planned.environment}, "
-            f"seed {failure.planned.seed}: {failure.reason}; see {failure.log}",
-            markup=False,
-            highlight=False,
-            soft_wrap=True,
-        )
-    _print_left_out(console, results.left_out)
+    try:
+        if len(results.summary):
+            _judge(console, results, command, with_page=with_page)
+            _print_mixed_versions(console, results)
+    finally:
+        for failure in failures:
+            _print_failure(console, failure)
+        _print_left_out(console, results.left_out)
     if results.n_unchecked:
         runs = "1 run" if results.n_unchecked == 1 else f"{results.n_unchecked} runs"
         _say(console, f"{runs} of an earlier version recorded no digests: damage may go unseen")
@@ -98,6 +94,15 @@ def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) ->
         moved = move_damaged_aside(study, planned, activity.at)
     for damaged, place in moved:
         _say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
+
+
+def _print_failure(console: Console, failure: RunFailure) -> None:
+    run = failure.planned
+    details = "the details could not be written" if failure.log is None else f"see {failure.log}"
+    _say(
+        console,
+        f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}; {details}",
+    )
 
 
 def _print_left_out(console: Console, left_out: Sequence[LeftOut]) -> None:

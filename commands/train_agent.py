@@ -51,7 +51,13 @@ def _list(args: argparse.Namespace) -> int:
 
 
 def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
-    from commands.run_output import print_header, print_line, print_outcome, print_refusal
+    from commands.run_output import (
+        print_header,
+        print_line,
+        print_outcome,
+        print_refusal,
+        telling_what_is_kept,
+    )
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
 
@@ -72,7 +78,10 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
             keeping = StateKeeping(args.save_state_every, stays=args.keep_state)
             training = prepare(spec, console, _recorded(args), command_line(), keeping=keeping)
         print_refusal(console, training.refusal)
-        with at_work_on(training.run, partial(print_line, console)):
+        with (
+            at_work_on(training.run, partial(print_line, console)),
+            telling_what_is_kept(training.run),
+        ):
             outcome = carry_out(training)
         print_outcome(console, spec, outcome)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0

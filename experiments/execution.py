@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, as_completed
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from experiments.planned_runs import PlannedRun
 from experiments.run_in_child import do_planned_run
 from experiments.run_limits import RunLimits
 from experiments.study_spec import file_name
+from pipeline.errors import one_line
 from pipeline.files import write_text
 
 
@@ -32,12 +34,12 @@ class RunFailure:
     Attributes:
         planned: the run.
         reason: why, in one line.
-        log: the file with the details.
+        log: the file with the details; None where it could not be written.
     """
 
     planned: PlannedRun
     reason: str
-    log: Path
+    log: Path | None
 
 
 Listener = Callable[[PlannedRun, RunFailure | None], None]
@@ -102,6 +104,16 @@ def execute_on(
     return failures
 
 
+def _kept(log: Path, details: str) -> Path | None:
+    """The file with the details; None where it cannot be written, as on a full disk."""
+    try:
+        make_folder(log.parent)
+        write_text(log, details)
+    except OSError:
+        return None
+    return log
+
+
 def _supervised_run(
     planned: PlannedRun, root: Path, command: str, limits: RunLimits
 ) -> RunFailure | None:
@@ -114,8 +126,9 @@ def _supervised_run(
     except TaskFailedError as error:
         if not isinstance(error, TaskDiedError):
             leave_drafts(root, name, with_states=True)  # the next try begins anew
-        make_folder(log.parent)
-        write_text(log, error.details)
-        return RunFailure(planned, str(error), log)
+        return RunFailure(planned, str(error), _kept(log, error.details))
+    except (OSError, EOFError, RuntimeError) as error:  # no room, process, thread or file left
+        reason = f"its process could not be started: {one_line(error)}"
+        return RunFailure(planned, reason, _kept(log, traceback.format_exc()))
     log.unlink(missing_ok=True)
     return None

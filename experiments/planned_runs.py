@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.file_digests import DamagedFileError
+from pipeline.json_text import plain
 from pipeline.run_folder import FINISHED, Run, environment_name
 from pipeline.train_spec import TrainSpec, completed
 
@@ -125,7 +125,7 @@ class PlannedRun:
 
 def _identity(spec: Mapping[str, Any]) -> Any:
     kept = {key: value for key, value in spec.items() if key not in _MAY_DIFFER}
-    return json.loads(json.dumps(kept))
+    return plain(kept)
 
 
 def _recorded(info: Mapping[str, Any]) -> dict[str, Any]:

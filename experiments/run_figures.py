@@ -6,7 +6,6 @@ Runs of earlier versions recorded no digests: of these a file counts that has th
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -147,8 +146,6 @@ def _check_texts(run: Run, info: Mapping[str, Any]) -> None:
 
 
 def _is_figure(value: object) -> bool:
-    if isinstance(value, float) and math.isnan(value):
-        return True
     return isinstance(value, int | float) and abs(value) < LARGEST_FIGURE
 
 

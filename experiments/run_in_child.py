@@ -10,7 +10,7 @@ from experiments.repair import move_aside
 from experiments.replaced_runs import make_room
 from experiments.run_or_go_on import do_or_go_on
 from pipeline.file_digests import DamagedFileError
-from pipeline.files import put_in_place
+from pipeline.files import put_in_place, sync_folders
 from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.signs_of_life import Heartbeat
 from pipeline.user_modules import import_again
@@ -49,3 +49,4 @@ def _put_in_place(planned: PlannedRun, draft: Path) -> None:
     except OSError:
         if not planned.is_finished:
             raise
+    sync_folders(*list(planned.path.parents)[:3])

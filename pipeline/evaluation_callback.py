@@ -15,6 +15,7 @@ from agents.common.callback_horizons import Horizon, calls_until_multiple
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
+from pipeline.finite_numbers import check_model
 from pipeline.models.companions import statistics_path
 from pipeline.models.model_saving import save_model, save_normalization
 from pipeline.run_folder import Run
@@ -93,7 +94,12 @@ class EvaluationCallback(EvalCallback):
         return self.evaluate_now() if is_due else True
 
     def evaluate_now(self) -> bool:
-        """Evaluate the agent as it is; False where a callback asks to stop the training."""
+        """Evaluate the agent as it is; False where a callback asks to stop the training.
+
+        Raises:
+            NotFiniteError: if the agent, or what it meets, is not finite.
+        """
+        check_model(self.model)
         self.take_statistics()
         with self.during("evaluating"):
             evaluation = self.evaluator(self.model)

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.errors import UserError, one_line
+from pipeline.json_text import plain
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import opened, read_file
 
@@ -118,8 +119,8 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
     """The record with its own digest, where it has those of the run's files."""
     if FIELD not in record:
         return dict(record)
-    plain = json.loads(json.dumps(record))
-    return {**plain, FIELD: {**plain[FIELD], RECORD: _seal(plain)}}
+    whole: dict[str, Any] = plain(record)
+    return {**whole, FIELD: {**whole[FIELD], RECORD: _seal(whole)}}
 
 
 def read_record(path: Path) -> dict[str, Any]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
-import json
 import os
 import re
 import secrets
@@ -14,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pipeline.json_text import json_text
+
 # Windows takes no more than 260 characters for a whole path, Linux no more than 255 bytes a name.
 LONGEST_NAME = 100  # bytes
 
@@ -21,6 +23,12 @@ _REFUSED_SIGNS = re.compile(r'[<>:"/\\|?*\x00-\x1f]|[ .]+$')
 # What `replacing` writes to.
 _DRAFT = re.compile(r"\..+\.[0-9a-f]{16}\.tmp", re.DOTALL)
 _DEVICE = re.compile(r"(con|prn|aux|nul|(con(in|out)\$)|(com|lpt)[0-9¹²³]) *(\.|$)", re.IGNORECASE)
+
+# What happens to a file while it is written, of which the system does not say which it was.
+DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "EDQUOT", errno.EIO)})
+
+# Folders of others above one's own, and file systems that flush no folder.
+_CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
 _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
@@ -61,17 +69,73 @@ def put_in_place(draft: Path, path: Path) -> None:
 
 
 @contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let a disk that is full, and the like, say where: at ``path``, unless it says so itself."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in DISK_ERRORS and error.filename is None:
+            error.filename = str(path)
+        raise
+
+
+@contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a name beside ``path`` to write to, and rename it into place once it is whole."""
+    """Give a name beside ``path`` to write to, and rename it into place once it is whole.
+
+    Nobody meets a half-written file then, whatever becomes of the process. A power cut may still
+    take the file: see `lasting`.
+    """
     # A name that could be guessed might be there already, as a link to another's file.
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
-    try:
+    with naming(path):
+        try:
+            yield draft
+            put_in_place(draft, path)
+        finally:
+            draft.unlink(missing_ok=True)
+
+
+@contextmanager
+def lasting(path: Path) -> Iterator[Path]:
+    """As `replacing`, and after it the file is there for good, also after a power cut."""
+    with replacing(path) as draft:
         yield draft
-        with draft.open("rb+") as file:  # Windows flushes only what may be written
+        with naming(path):
+            sync_file(draft)
+    sync_folders(path.parent)
+
+
+if sys.platform == "win32":
+
+    def sync_file(path: Path) -> None:
+        """Wait until the disk has the contents of a file."""
+        with path.open("rb+") as file:  # only what may be written is flushed
             os.fsync(file.fileno())
-        put_in_place(draft, path)
-    finally:
-        draft.unlink(missing_ok=True)
+
+    def sync_folders(*folders: Path) -> None:
+        """Nothing: Windows keeps names in a journal of its own, and flushes no folder."""
+else:
+
+    def sync_file(path: Path) -> None:
+        """Wait until the disk has the contents of a file."""
+        _sync(path)
+
+    def sync_folders(*folders: Path) -> None:
+        """Wait until the disk has the names in the folders, as far as this user may ask for it."""
+        for folder in folders:
+            try:
+                _sync(folder)
+            except OSError as error:
+                if error.errno not in _CANNOT_SYNC:
+                    raise
+
+    def _sync(path: Path) -> None:
+        number = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
 
 
 def drafts_in(folder: Path) -> list[Path]:
@@ -86,5 +150,6 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Replace the file at ``path`` by ``data`` as indented JSON."""
-    write_text(path, json.dumps(data, indent=2) + "\n")
+    """Replace the file at ``path`` for good by ``data`` as indented JSON; nan is null there."""
+    with lasting(path) as draft:
+        draft.write_text(json_text(data, indent=2) + "\n", encoding="utf-8", newline="\n")

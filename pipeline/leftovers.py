@@ -52,7 +52,7 @@ def _unfinished(parent: Path, env_name: str) -> Iterator[Run]:
 def _is_mere_set_up(run: Run) -> bool:
     """Whether nothing lies in the folder but what is written before the first step."""
     own = re.compile(
-        rf"run\.json|\.lock|\d+\.monitor\.csv|{re.escape(run.env_name)}(/(config|args)\.yml|/command\.txt)?"
+        rf"run\.json|\.lock|\.room|\d+\.monitor\.csv|{re.escape(run.env_name)}(/(config|args)\.yml|/command\.txt)?"
         rf"|{COPIES}(/[^/]+\.py)?|([^/]+/)?\.[^/]+\.[0-9a-f]{{16}}\.tmp"
     )
     names = (path.relative_to(run.path).as_posix() for path in run.path.rglob("*"))

@@ -91,10 +91,14 @@ def play_episodes(
 
     Yields:
         Return and length of each episode as it ends.
+
+    Raises:
+        NotFiniteError: if an observation or a return is not finite.
     """
     from pipeline.evaluation.mask_telling import player
+    from pipeline.finite_numbers import FinitePlayer, check_numbers
 
-    choose = player(model, env).predict
+    choose = FinitePlayer(player(model, env), "while it is played").predict
     obs: Any = env.reset()
     state = None
     starts = np.ones(env.num_envs, dtype=bool)
@@ -110,6 +114,7 @@ def play_episodes(
             episode = infos[index].get("episode")
             if episode is not None:
                 due[index] -= 1
+                check_numbers(episode["r"], "return", f"of an episode of environment {index}")
                 yield episode["r"], episode["l"]
 
 

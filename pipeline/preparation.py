@@ -40,6 +40,7 @@ from pipeline.models.continuation import (
 from pipeline.models.model_loading import agent_class
 from pipeline.models.model_zips import ModelFile, telling_masks
 from pipeline.models.normalization import take_over
+from pipeline.number_watch import NumberWatch
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.resuming.resumed_logging import resumed_logger
@@ -144,8 +145,10 @@ def set_up(
     evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
     saver = StateSaver(run, keeping.interval, partial(_say, console), keeping.state)
     pulls = pull_recorder(model, run, console) if is_bandit else None
-    named = named_callbacks(spec, run, model)
-    saver.root = all_callbacks(spec, [saver, *named, *filter(None, [pulls]), evaluation], display)
+    # In this order: of a broken number nothing is kept, and no other callback sees a moment that a
+    # training goes back from.
+    first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
+    saver.root = all_callbacks(spec, [*first, *filter(None, [pulls]), evaluation], display)
     refusal = None if evaluation.value_maps is not None else model_refusal(spec)
     return Training(
         spec,

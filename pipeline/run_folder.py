@@ -6,6 +6,7 @@ The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, so that its to
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import secrets
@@ -26,7 +27,15 @@ from pipeline.file_digests import (
     read_record,
     sealed,
 )
-from pipeline.files import drafts_in, portable_name, put_in_place, write_json
+from pipeline.files import (
+    drafts_in,
+    naming,
+    portable_name,
+    put_in_place,
+    sync_file,
+    sync_folders,
+    write_json,
+)
 from pipeline.liveness import is_alive, mark
 
 RUNNING = "running"
@@ -52,6 +61,9 @@ OUTCOME = (
 )
 # The field of ``run.json`` that says, while a run is running, which process is at work on it.
 PROCESS = "process"
+# Kept by a run that is under way: where nothing else fits on the disk, its last word does.
+ROOM = ".room"
+ROOM_BYTES = 16 << 10
 
 
 class NoRunError(UserError):
@@ -252,11 +264,35 @@ class Run:
         info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
         write_json(self.info_path, {**info, "state": RUNNING, PROCESS: mark()})
 
+    def keep_room(self) -> None:
+        """Take the room on the disk that the run's last word needs."""
+        room = self.path / ROOM
+        with naming(room):
+            room.write_bytes(bytes(ROOM_BYTES))
+
+    def _give_room(self) -> None:
+        (self.path / ROOM).unlink(missing_ok=True)
+
+    def fail(self, reason: str) -> None:
+        """Note in ``run.json`` that the run has failed, if anything can be written at all."""
+        with contextlib.suppress(OSError):
+            self._give_room()
+            self.update_info(state=FAILED, reason=reason)
+
     def end(self, **fields: Any) -> None:
-        """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
+        """Set fields of ``run.json``, the last file of a run, with the digests of all others.
+
+        Before that the disk has all others, and the way to them.
+        """
+        self._give_room()
         for draft in drafts_in(self.path):  # of a file that was not to be finished any more
             draft.unlink(missing_ok=True)
-        self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
+        digests = digests_of(self.path)
+        for name in digests:
+            sync_file(self.path / name)
+        inner = {(self.path / name).parent for name in digests}
+        sync_folders(*inner, *[self.path, *self.path.parents][:3])
+        self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests})
 
     @property
     def files(self) -> RecordedFiles:

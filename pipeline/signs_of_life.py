@@ -74,8 +74,11 @@ class Heartbeat:
         """Begin to call the function."""
         self.stop()
         self._stopping.clear()
-        self._thread = threading.Thread(target=self._beat, daemon=True)
-        self._thread.start()
+        thread = threading.Thread(target=self._beat, daemon=True)
+        # Where the machine has no thread left, the work goes on without these signs.
+        with contextlib.suppress(RuntimeError):
+            thread.start()
+            self._thread = thread
 
     def stop(self) -> None:
         """Call it no more; harmless when called again."""

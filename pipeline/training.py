@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -14,8 +15,10 @@ import torch as th
 from rich.console import Console
 
 from mdp.machine_code import compile_timer
+from pipeline.broken_runs import blame_weights, close, give_up, has_begun
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation
+from pipeline.files import naming
 from pipeline.finishing import draw, judge, save
 from pipeline.leftovers import remove_leftovers
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
@@ -23,12 +26,11 @@ from pipeline.pull_recording import PullSummary
 from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
 from pipeline.resuming.state_folder import remove_states
 from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.run_folder import FAILED, FINISHED, INTERRUPTED, RUNNING, Run
+from pipeline.run_folder import FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.run_record import recorded_versions, write_arguments, write_settings
 from pipeline.signs_of_life import Activity, doing
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
-from pipeline.worker_processes import close_environments
 
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
@@ -115,25 +117,29 @@ def prepare(
             run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
         if not keeping.goes_on:
             undo.callback(run.discard)
-        with stop.waiting(0.0):
+        with stop.waiting(0.0), naming(run.path):
+            run.keep_room()
             training = set_up(spec, run, kwargs, console, undo, keeping)
-        spec = training.spec  # with what an agent that goes on has brought along
         if keeping.goes_on:
             run.reopen()
-            undo.pop_all()
-            return training
-        write_settings(run, spec, command)
-        write_arguments(run, spec, args)
-        run.update_info(
-            state=RUNNING,
-            env_name=run.env_name,
-            spec=spec.as_data(),
-            versions=recorded_versions(),
-            **({} if training.refusal is None else {"model_refused": training.refusal}),
-        )
-        stop.raise_if_asked()
+        else:
+            _record_beginning(training, args, command)
+            stop.raise_if_asked()
         undo.pop_all()
     return training
+
+
+def _record_beginning(training: Training, args: dict[str, Any], command: str) -> None:
+    run, spec = training.run, training.spec  # with what an agent that goes on has brought along
+    write_settings(run, spec, command)
+    write_arguments(run, spec, args)
+    run.update_info(
+        state=RUNNING,
+        env_name=run.env_name,
+        spec=spec.as_data(),
+        versions=recorded_versions(),
+        **({} if training.refusal is None else {"model_refused": training.refusal}),
+    )
 
 
 @contextmanager
@@ -156,19 +162,17 @@ def carry_out(training: Training) -> Outcome:
             behind then.
         KeyboardInterrupt: if it is stopped before that step, likewise.
     """
-    model = training.model
     with current().held():
         try:
-            return _train_and_finish(training)
+            with naming(training.run.path):
+                outcome = _train_and_finish(training)
         except BaseException as error:
-            _give_up(training, error)
+            with contextlib.suppress(OSError):  # what could not be written still cannot
+                close(training)
+            give_up(training, error)
             raise
-        finally:
-            if hasattr(model, "_logger"):
-                model.logger.close()
-            close_environments(training.eval_env)
-            if model.env is not None:
-                close_environments(model.env)
+        close(training)
+    return outcome
 
 
 def _train_and_finish(training: Training) -> Outcome:
@@ -179,7 +183,7 @@ def _train_and_finish(training: Training) -> Outcome:
             with current().waiting(SECONDS_TO_A_SAFE_MOMENT):
                 _learn(training)
         except KeyboardInterrupt:
-            if not _has_begun(training):
+            if not has_begun(training):
                 raise
             state = INTERRUPTED
         finally:
@@ -188,32 +192,6 @@ def _train_and_finish(training: Training) -> Outcome:
     seconds += training.saver.seconds_before
     with doing(training.display.console, "saving what was learnt") as activity:
         return _finish(training, state, seconds, activity)
-
-
-def _has_begun(training: Training) -> bool:
-    """Whether there is something that was learnt, by this process or the ones before it."""
-    model, is_back = training.model, training.saver.state is None
-    return is_back and model.num_timesteps > model._num_timesteps_at_start
-
-
-def _give_up(training: Training, error: BaseException) -> None:
-    """Note the reason; or remove the folder, where the agent failed before its first step.
-
-    Raises:
-        UserError: in that case, where the agent's settings are at fault.
-    """
-    run = training.run
-    has_begun = training.keeping.goes_on or _has_begun(training)
-    if isinstance(error, ValueError | OSError | KeyboardInterrupt) and not has_begun:
-        run.discard()
-        if not isinstance(error, ValueError):  # an OSError says for itself which file it was
-            return
-        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
-        raise UserError(message) from error
-    if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
-        run.update_info(state=INTERRUPTED)
-    else:
-        run.update_info(state=FAILED, reason=one_line(error))
 
 
 def _learn(training: Training) -> None:
@@ -227,13 +205,17 @@ def _learn(training: Training) -> None:
     before = 0 if begun is None else iterations_before(training.model, begun.note)
     if before and (interval := kwargs.get("log_interval", 1)) is not None:
         kwargs["log_interval"] = IterationInterval.after(before, interval)
-    training.model.learn(
-        spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
-        callback=training.callback,
-        tb_log_name=spec.algo,
-        reset_num_timesteps=spec.trained_agent is None,
-        **kwargs,
-    )
+    try:
+        training.model.learn(
+            spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
+            callback=training.callback,
+            tb_log_name=spec.algo,
+            reset_num_timesteps=spec.trained_agent is None,
+            **kwargs,
+        )
+    except (ValueError, RuntimeError) as error:
+        blame_weights(training.model, error)
+        raise
 
 
 def _finish(training: Training, state: str, seconds: float, activity: Activity) -> Outcome:

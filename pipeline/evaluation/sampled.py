@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from mdp.array_types import Floats
 from pipeline.evaluation.mask_telling import player
+from pipeline.finite_numbers import FinitePlayer, check_numbers
 
 # The agents of these packages take any number of observations at once.
 KNOWN_LIBRARIES = ("agents", "stable_baselines3")
@@ -114,6 +115,9 @@ def evaluate(
         n_episodes: how many episodes, shared evenly between the environments.
         seed: of the environments.
         deterministic: play the policy's best action rather than sample one.
+
+    Raises:
+        NotFiniteError: if an observation or a return is not finite.
     """
     successes: list[bool] = []
 
@@ -121,9 +125,11 @@ def evaluate(
         if local["done"] and "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
+    when = f"in the evaluation at step {model.num_timesteps:,}"
     env.seed(seed)
+    watched: Any = FinitePlayer(player(model, env), when)
     returns, lengths = evaluate_policy(
-        player(model, env),
+        watched,
         env,
         n_eval_episodes=n_episodes,
         deterministic=deterministic,
@@ -131,6 +137,7 @@ def evaluate(
         callback=note_success,
         warn=False,
     )
+    check_numbers(returns, "return", when)
     return Evaluation(
         np.asarray(returns, dtype=np.float64),
         np.asarray(lengths, dtype=np.int64),

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.files import replacing
+from pipeline.files import replacing, sync_folders
 from pipeline.resuming.state_folder import state_file, state_files
 from snapshots.recording import Snapshot
 from snapshots.snapshot_files import BadSnapshotError, read_snapshot, write_snapshot
@@ -53,7 +51,7 @@ def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, An
     folder.mkdir(exist_ok=True)
     with replacing(state_file(folder, number)) as draft:
         write_snapshot(draft, snapshot, {**note, "number": number}, user_key(APPLICATION))
-    flush_folder(folder)
+    sync_folders(folder)
 
 
 def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | None:
@@ -80,14 +78,3 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
     for reason in reasons:
         tell(f"{reason}; the state before it is taken")
     return max(found, key=lambda state: int(state.note["number"]), default=None)
-
-
-def flush_folder(folder: Path) -> None:
-    """Let names that were changed in a folder reach the disk, where the system knows how to."""
-    if sys.platform == "win32":
-        return
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -1,5 +1,6 @@
 """Doing the runs of a study: what each leaves behind, in what order, and on how many cores."""
 
+import errno
 import json
 import os
 from concurrent.futures import Future
@@ -7,6 +8,7 @@ from concurrent.futures import Future
 import pytest
 import yaml
 
+from experiments import execution
 from experiments.child_processes import StoppedError, TaskFailedError
 from experiments.drafts import draft_path
 from experiments.execution import available_cores, execute, execute_on, failure_log
@@ -127,3 +129,27 @@ def test_a_record_is_whole(tmp_path):
     do_run(planned, draft_path(tmp_path, planned), "c")
     info = json.loads(planned.run.info_path.read_text())
     assert (info["state"], info["spec"]["seed"]) == ("finished", 0)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (TaskFailedError("the disk is full", "Traceback"), "the disk is full"),
+        (EOFError("unexpected EOF"), "its process could not be started: unexpected EOF"),
+        (BlockingIOError(errno.EAGAIN, "none left"), "its process could not be started: [Errno"),
+    ],
+)
+def test_a_failure_whose_details_cannot_be_written_is_told_and_the_others_go_on(
+    tmp_path, monkeypatch, error, reason
+):
+    def full(path, text):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    def failing(*args, **kwargs):
+        raise error
+
+    monkeypatch.setattr(execution, "write_text", full)
+    monkeypatch.setattr(execution, "supervise", failing)
+    failure = execution._supervised_run(runs_of(tmp_path)[0], tmp_path, "compare.py")
+    assert failure.reason.startswith(reason)
+    assert failure.log is None

@@ -12,7 +12,15 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from pipeline import files
-from pipeline.files import portable_name, put_in_place, replacing, write_json, write_text
+from pipeline.files import (
+    lasting,
+    naming,
+    portable_name,
+    put_in_place,
+    replacing,
+    write_json,
+    write_text,
+)
 
 
 def names(folder):
@@ -77,10 +85,52 @@ def test_a_disk_that_fails_changes_nothing(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(files.os, "fsync", no_space)
-    with pytest.raises(OSError, match="No space left"):
-        write_text(path, "new")
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_json(path, "new")
+    assert caught.value.filename == str(path)
     assert path.read_text() == "old"
     assert names(tmp_path) == ["model.zip"]
+
+
+def test_what_lasts_is_on_the_disk_before_it_has_its_name_and_the_name_is_after(
+    tmp_path, monkeypatch
+):
+    path, done = tmp_path / "model.zip", []
+    put_in_place = files.put_in_place
+    monkeypatch.setattr(
+        files.os, "fsync", lambda number: done.append(Path(f"/proc/self/fd/{number}").readlink())
+    )
+    monkeypatch.setattr(
+        files, "put_in_place", lambda draft, to: (put_in_place(draft, to), done.append("renamed"))
+    )
+    with lasting(path) as draft:
+        draft.write_text("whole")
+    assert done == [draft, "renamed", tmp_path]
+
+
+def test_a_folder_that_cannot_be_flushed_is_passed_over_and_a_broken_disk_is_not(
+    tmp_path, monkeypatch
+):
+    def failing(code):
+        def fsync(_):
+            raise OSError(code, "no")
+
+        return fsync
+
+    monkeypatch.setattr(files.os, "fsync", failing(errno.EINVAL))
+    files.sync_folders(tmp_path)
+    monkeypatch.setattr(files.os, "fsync", failing(errno.EIO))
+    with pytest.raises(OSError, match="no"):
+        files.sync_folders(tmp_path)
+
+
+def test_a_disk_that_is_full_is_named_and_another_error_is_left_alone(tmp_path):
+    with pytest.raises(OSError, match="full") as caught, naming(tmp_path):
+        raise OSError(errno.ENOSPC, "full")
+    assert caught.value.filename == str(tmp_path)
+    with pytest.raises(BrokenPipeError) as caught, naming(tmp_path):
+        raise BrokenPipeError(errno.EPIPE, "gone")
+    assert caught.value.filename is None
 
 
 def test_what_cannot_be_json_leaves_the_old_file(tmp_path):

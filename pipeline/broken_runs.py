@@ -1,0 +1,68 @@
+"""What becomes of a run that breaks: everything closed, the reason noted, the folder left true."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from typing import Any
+
+from pipeline.errors import UserError, one_line
+from pipeline.files import DISK_ERRORS
+from pipeline.finite_numbers import NotFiniteError, check_model
+from pipeline.preparation import Training
+from pipeline.run_folder import INTERRUPTED
+from pipeline.worker_processes import close_environments
+
+
+def close(training: Training) -> None:
+    """Close what is open, each part also where another cannot be closed."""
+    model = training.model
+    with ExitStack() as stack:
+        if model.env is not None:
+            stack.callback(close_environments, model.env)
+        stack.callback(close_environments, training.eval_env)
+        if hasattr(model, "_logger"):
+            stack.callback(model.logger.close)
+
+
+def has_begun(training: Training) -> bool:
+    """Whether there is something that was learnt, by this process or the ones before it."""
+    model, is_back = training.model, training.saver.state is None
+    return is_back and model.num_timesteps > model._num_timesteps_at_start
+
+
+def give_up(training: Training, error: BaseException) -> None:
+    """Note the reason; or remove the folder, where the agent failed before its first step.
+
+    Raises:
+        UserError: in that case, where the agent's settings are at fault; and where the disk takes
+            no more.
+    """
+    run, is_new = training.run, not training.keeping.goes_on
+    is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt)
+    if is_new and is_expected and not has_begun(training):
+        run.discard()
+        if not isinstance(error, ValueError):  # an OSError says for itself which file it was
+            return
+        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
+        raise UserError(message) from error
+    if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
+        run.update_info(state=INTERRUPTED)
+        return
+    run.fail(one_line(error))
+    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        when = f"the run has failed at step {training.model.num_timesteps:,}"
+        raise UserError(f"{error.filename}: {error.strerror}: {when}") from error
+
+
+def blame_weights(model: Any, error: Exception) -> None:
+    """Say that an agent's weights are at fault, where they are.
+
+    PyTorch refuses distributions of nan, and does not say where they come from.
+
+    Raises:
+        NotFiniteError: naming them.
+    """
+    try:
+        check_model(model)
+    except NotFiniteError as cause:
+        raise cause from error

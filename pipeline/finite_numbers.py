@@ -1,0 +1,138 @@
+"""Numbers that are none: nan and infinity, found before anything is learnt or judged by them.
+
+Infinity is refused like nan, also where an observation space has no bounds: the first update of a
+network turns it into nan, and so does the first mean that it is part of.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from math import isfinite
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy import vdot
+from numpy.typing import NDArray
+
+from pipeline.errors import UserError
+
+# Single and double precision, whose scalar products are worked out by BLAS.
+_FAST = frozenset("fd")
+_WHOLE = frozenset("?bBhHiIlLqQ")
+
+
+class NotFiniteError(UserError):
+    """A number that has to be finite is not.
+
+    Args:
+        place: what it is, and when: "reward of environment 2 at step 1,234".
+        value: the number.
+    """
+
+    def __init__(self, place: str, value: float) -> None:
+        super().__init__(f"{place} is {value}")
+
+
+def is_finite(values: Any) -> bool:
+    """Whether all numbers are finite, of an array, of a mapping's arrays, or of None.
+
+    It is asked after each step of a training.
+    """
+    if type(values) is not np.ndarray:
+        return values is None or all(is_finite(array) for _, array in _parts(values))
+    kind = values.dtype.char
+    if kind in _FAST:
+        # One call instead of two and an array between; it overflows where values are merely large.
+        return isfinite(vdot(values, values)) or bool(np.isfinite(values).all())
+    return kind in _WHOLE or bool(np.isfinite(values).all())
+
+
+def check_numbers(values: Any, what: str, when: str) -> None:
+    """Make sure that numbers are finite.
+
+    Args:
+        values: an array, a mapping of names to arrays, or None.
+        what: what they are.
+        when: when they were met.
+
+    Raises:
+        NotFiniteError: naming the first that is not.
+    """
+    for name, array in _parts(values):
+        if not is_finite(array):
+            raise NotFiniteError(f"{what}{name} {when}", _culprit(array))
+
+
+def check_rows(values: Any, what: str, when: str) -> None:
+    """The same for values with a row for each environment, shape (n_envs, ...)."""
+    for name, array in _parts(values):
+        if not is_finite(array):
+            rows = np.isfinite(array).reshape(len(array), -1).all(axis=1)
+            i = int(np.argmin(rows))
+            raise NotFiniteError(f"{what}{name} of environment {i} {when}", _culprit(array[i]))
+
+
+def check_model(model: Any) -> None:
+    """Make sure that what an agent has learnt is finite: tables or weights, and its statistics.
+
+    Raises:
+        NotFiniteError: naming the table or the layer.
+    """
+    when = f"at step {model.num_timesteps:,}"
+    policy = getattr(model, "policy", None)
+    if isinstance(policy, th.nn.Module):
+        for name, tensor in policy.state_dict().items():
+            if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
+                values = tensor.detach().cpu().double().numpy()
+                raise NotFiniteError(f"a value in {name} of the agent {when}", _culprit(values))
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        for name in ("obs_rms", "ret_rms"):
+            _check_statistics(getattr(normalization, name, None), f"{name} of VecNormalize", when)
+
+
+class FinitePlayer:
+    """An agent that refuses to act on observations that are not finite.
+
+    Args:
+        player: anything with the library's ``predict``.
+        when: it is asked, for the message.
+    """
+
+    def __init__(self, player: Any, when: str) -> None:
+        self._player = player
+        self._when = when
+
+    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """The agent's own.
+
+        Raises:
+            NotFiniteError: naming the observation.
+        """
+        check_rows(observation, "observation", self._when)
+        actions, state = self._player.predict(observation, **kwargs)
+        return actions, state
+
+
+def _check_statistics(statistics: Any, what: str, when: str) -> None:
+    parts = statistics if isinstance(statistics, dict) else {"": statistics}
+    for name, part in parts.items():
+        if part is not None:
+            own = f"{what} ({name})" if name else what
+            check_numbers({"mean": part.mean, "variance": part.var}, own, when)
+
+
+def _parts(values: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays among values, each with how it is called in a message."""
+    if isinstance(values, Mapping):
+        for name, array in values.items():
+            yield f" {name!r}", np.asarray(array)
+    elif values is not None:
+        yield "", np.asarray(values)
+
+
+def _culprit(values: NDArray[Any]) -> float:
+    """The first number that is not finite."""
+    flat = np.ravel(values)
+    return float(np.real(flat[np.argmin(np.isfinite(flat))]))
