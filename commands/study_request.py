@@ -22,7 +22,7 @@ from experiments.study_spec import (
 )
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
-from pipeline.run_folder import environment_name
+from pipeline.run_files import environment_name
 from pipeline.settings.literals import parse_assignments
 from pipeline.user_modules import import_typed
 

@@ -9,7 +9,8 @@ from typing import Any
 
 from pipeline.file_digests import DamagedFileError
 from pipeline.json_text import plain
-from pipeline.run_folder import FINISHED, Run, environment_name
+from pipeline.run_files import environment_name
+from pipeline.run_folder import FINISHED, Run
 from pipeline.train_spec import TrainSpec, completed
 
 # What a run of the same settings may differ in: where it is written, what is shown meanwhile, and

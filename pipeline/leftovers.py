@@ -12,7 +12,8 @@ from pipeline.errors import UserError
 from pipeline.files import drafts_in
 from pipeline.liveness import is_alive
 from pipeline.module_records import COPIES
-from pipeline.run_folder import PROCESS, RUNNING, Run, environment_name, numbered_runs
+from pipeline.run_files import environment_name
+from pipeline.run_folder import PROCESS, RUNNING, Run, numbered_runs
 
 _CLAIM = re.compile(r"\.(.+)\.[0-9a-f]{16}\.tmp")
 

@@ -46,7 +46,8 @@ from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.resuming.resumed_logging import resumed_logger
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.state_saver import StateSaver
-from pipeline.run_folder import Run, environment_name
+from pipeline.run_files import environment_name
+from pipeline.run_folder import Run
 from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import (
     build_algorithm_kwargs,

@@ -54,6 +54,7 @@ class ProgressDisplay(BlockCallback):
         self.live = live
         self.on_variant = on_variant
         self.started = 0.0
+        self.has_begun = False
         self.updated = 0.0
         self.tenths_shown = 0
         self.figures = ""
@@ -66,7 +67,7 @@ class ProgressDisplay(BlockCallback):
         self.started = self.updated = time.monotonic()
         self.silence = Silence(SECONDS_BEFORE_THE_FIRST_LINE)
         self.notice.listen()
-        self.first_step = self.num_timesteps
+        self.first_step, self.has_begun = self.num_timesteps, False
         if self.live:
             self.bar = Progress(
                 SpinnerColumn(SPINNER),
@@ -83,6 +84,8 @@ class ProgressDisplay(BlockCallback):
 
     def _on_rollout_start(self) -> None:
         self.activity = ""
+        if not self.has_begun:  # a run that goes on is where it was by now
+            self.first_step, self.has_begun = self.model.num_timesteps, True
 
     def _on_rollout_end(self) -> None:
         self.activity = LEARNING

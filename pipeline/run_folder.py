@@ -1,4 +1,4 @@
-"""One run folder: its number, the names of its files, and its state.
+"""One run folder: its number, and what it says of itself.
 
 The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, so that its tools read our runs;
 ``run.json`` is ours and says what was asked for, how far it came, and what came out.
@@ -18,8 +18,6 @@ from typing import Any
 from pipeline.errors import UserError
 from pipeline.file_digests import (
     FIELD,
-    RECORD,
-    STATE_FOLDER,
     VERSION,
     VERSION_FIELD,
     RecordedFiles,
@@ -30,13 +28,13 @@ from pipeline.file_digests import (
 from pipeline.files import (
     drafts_in,
     naming,
-    portable_name,
     put_in_place,
     sync_file,
     sync_folders,
     write_json,
 )
 from pipeline.liveness import is_alive, mark
+from pipeline.run_files import RunFiles, environment_name
 
 RUNNING = "running"
 FINISHED = "finished"
@@ -74,11 +72,6 @@ class NoRunError(UserError):
         self.algo, self.env_id, self.log_folder = algo, env_id, log_folder
 
 
-def environment_name(env_id: str) -> str:
-    """The environment's id as a file name: no module before it, and no slash in it."""
-    return portable_name(env_id.rpartition(":")[2].replace("/", "-"))
-
-
 def _run_number(name: str, env_name: str) -> int:
     """The number in a run folder's name, with or without a unique suffix; 0 if it is none."""
     match = re.fullmatch(re.escape(env_name) + r"_(\d+)(?:_[0-9a-f-]{36})?", name)
@@ -86,16 +79,8 @@ def _run_number(name: str, env_name: str) -> int:
 
 
 @dataclass(frozen=True)
-class Run:
-    """A run folder.
-
-    Attributes:
-        path: the folder.
-        env_name: the environment's name in file names.
-    """
-
-    path: Path
-    env_name: str
+class Run(RunFiles):
+    """A run folder, and what it says of itself."""
 
     @classmethod
     def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
@@ -148,75 +133,9 @@ class Run:
         raise UserError(f"no run {number} of {algo} on {name} in {log_folder}: there is {numbers}")
 
     @property
-    def params_path(self) -> Path:
-        """The folder of the run's settings and normalisation statistics."""
-        return self.path / self.env_name
-
-    @property
-    def model_path(self) -> Path:
-        """The agent at the end of training."""
-        return self.path / f"{self.env_name}.zip"
-
-    @property
-    def best_model_path(self) -> Path:
-        """The agent that evaluated best."""
-        return self.path / "best_model.zip"
-
-    def checkpoint_path(self, n_steps: int) -> Path:
-        """The agent after ``n_steps`` steps."""
-        return self.path / f"rl_model_{n_steps}_steps.zip"
-
-    def checkpoints(self) -> list[Path]:
-        """The checkpoints that there are, by rising number of steps."""
-        steps = (
-            re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name) for path in self.path.iterdir()
-        )
-        return [self.checkpoint_path(n) for n in sorted(int(match[1]) for match in steps if match)]
-
-    @property
     def number(self) -> int:
         """The number in the folder's name; 0 if there is none."""
         return _run_number(self.path.name, self.env_name)
-
-    @property
-    def evaluations_path(self) -> Path:
-        """The evaluations during training."""
-        return self.path / "evaluations.npz"
-
-    @property
-    def vecnormalize_path(self) -> Path:
-        """The running statistics of VecNormalize."""
-        return self.params_path / "vecnormalize.pkl"
-
-    @property
-    def state_path(self) -> Path:
-        """The folder of the states that a training under way goes on from."""
-        return self.path / STATE_FOLDER
-
-    @property
-    def info_path(self) -> Path:
-        """What the run was asked for and what came out."""
-        return self.path / RECORD
-
-    @property
-    def curve_path(self) -> Path:
-        """The picture of the learning curve."""
-        return self.path / "learning_curve.png"
-
-    @property
-    def pulls_picture_path(self) -> Path:
-        """The picture of the pulls, on bandits."""
-        return self.path / "pulls.png"
-
-    @property
-    def value_maps_path(self) -> Path:
-        """The policy and its values during training, on grid worlds."""
-        return self.path / "value_maps.npz"
-
-    @property
-    def value_map_path(self) -> Path:
-        """The picture of the policy at the end of training, on grid worlds."""
-        return self.path / "value_map.png"
 
     def read_info(self) -> dict[str, Any]:
         """The contents of ``run.json``; empty where there is none.

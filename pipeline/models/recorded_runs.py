@@ -20,7 +20,8 @@ from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.file_digests import RECORD, DamagedFileError, read_record
-from pipeline.run_folder import Run, environment_name
+from pipeline.run_files import environment_name
+from pipeline.run_folder import Run
 from pipeline.settings.strict_yaml import read_saved_settings
 from safe_files.regular_files import read_file
 

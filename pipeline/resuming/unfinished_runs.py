@@ -14,7 +14,8 @@ from pipeline.file_digests import RECORD, DamagedFileError
 from pipeline.resuming.log_positions import cut_back, remove_events
 from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
 from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.run_folder import FINISHED, Run, environment_name, numbered_runs
+from pipeline.run_files import environment_name
+from pipeline.run_folder import FINISHED, Run, numbered_runs
 from pipeline.run_record import recorded_versions
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec, completed

@@ -13,7 +13,8 @@ import pytest
 from pipeline import run_folder
 from pipeline.errors import UserError
 from pipeline.liveness import mark
-from pipeline.run_folder import NoRunError, Run, environment_name, numbered_runs
+from pipeline.run_files import environment_name
+from pipeline.run_folder import NoRunError, Run, numbered_runs
 
 ROOT = Path(run_folder.__file__).parent.parent
 
