@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import csv
+import gzip
 import io
 import json
 import os
@@ -148,9 +150,13 @@ def _content(path: Path) -> Any:
     if path.name == "run.json":
         info = json.loads(path.read_text(encoding="utf-8"))
         return {k: v for k, v in info.items() if k not in ("seconds", "files", "spec", "process")}
-    # Durations stand in tables of studies, and in pictures the time on an axis.
-    told = {".png": "picture", ".csv": "table", ".txt": "command", ".yml": "settings"}
-    return told.get(path.suffix) or path.stat().st_size
+    if path.suffix in (".csv", ".gz"):
+        opened = gzip.open if path.suffix == ".gz" else open
+        with opened(path, "rt", encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+        return [{k: v for k, v in row.items() if k not in ("seconds", "path")} for row in rows]
+    # In what is left stand commands, durations and folders.
+    return path.suffix
 
 
 def _bits(value: Any) -> Any:
