@@ -87,7 +87,7 @@ _OTHER_FLAGS: Mapping[str, Sequence[str]] = {
     ),
     "log-folder": ("--folder",),
     "folder": ("--log-folder",),
-    **dict.fromkeys(("resume", "continue", "load", "pretrained"), ("--trained-agent",)),
+    **dict.fromkeys(("continue", "load", "pretrained"), ("--trained-agent",)),
     **dict.fromkeys(("workers", "n-jobs", "num-workers", "parallel"), ("--jobs",)),
     **dict.fromkeys(("seed", "n-seeds", "num-seeds"), ("--seeds",)),
     **dict.fromkeys(("config", "conf", "yaml", "yaml-file"), ("--conf-file",)),

@@ -82,8 +82,10 @@ def check_model(model: Any) -> None:
     when = f"at step {model.num_timesteps:,}"
     policy = getattr(model, "policy", None)
     if isinstance(policy, th.nn.Module):
+        infinite = getattr(policy, "may_be_infinite", ())
         for name, tensor in policy.state_dict().items():
-            if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
+            is_bad = th.isnan(tensor) if name in infinite else ~th.isfinite(tensor)
+            if tensor.is_floating_point() and bool(is_bad.any()):
                 values = tensor.detach().cpu().double().numpy()
                 raise NotFiniteError(f"a value in {name} of the agent {when}", _culprit(values))
     normalization = model.get_vec_normalize_env()

@@ -101,9 +101,6 @@ class StateSaver(StopAtSafeMoment):
         if not getattr(self.model, "tells_safe_moments", False):
             self._act()
 
-    def _on_step(self) -> bool:
-        return True
-
     def _act(self) -> None:
         if self.state is not None:
             state, self.state = self.state, None

@@ -42,22 +42,23 @@ def moments():
     """What is called at each moment: its owner, its name, and on which of the calls."""
     from agents.compiled import engine
     from commands import run_output
-    from pipeline import evaluation_callback, files, finishing, preparation, safe_moments, training
+    from pipeline import broken_runs, evaluation_callback, files, finishing, preparation
+    from pipeline.resuming.state_saver import StateSaver
     from pipeline.run_folder import Run
 
     calls = iter(range(10**9))
     return {
         "set-up": (preparation, "make_evaluation_env", always),
         "between": (run_output, "print_refusal", always),
-        "before the first step": (safe_moments.StopAtSafeMoment, "_on_training_start", always),
+        "before the first step": (StateSaver, "_on_training_start", always),
         "compiling": (engine, "run_block", always),
-        "training": (safe_moments.StopAtSafeMoment, "_on_step", lambda *_: next(calls) == 3),
+        "training": (StateSaver, "_on_step", lambda *_: next(calls) == 3),
         "evaluating": (evaluation_callback.EvaluationCallback, "_append_to_file", always),
         "saving": (files, "put_in_place", lambda draft, path: path.name == "FrozenLake-v1.zip"),
         "judging": (finishing, "_final_evaluation", always),
         "drawing": (finishing, "draw_learning_curve", always),
         "recording": (Run, "end", always),
-        "closing": (training, "close_environments", always),
+        "closing": (broken_runs, "close_environments", always),
     }
 
 

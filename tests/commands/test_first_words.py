@@ -20,16 +20,21 @@ COMMANDS = {"train": train.main, "enjoy": enjoy.main, "compare": compare.main}
 # Ends at the first import of a library that takes long.
 PROGRAM = """
 import sys
+class Enough(BaseException):
+    pass
 class Heavy:
     def find_spec(self, name, path=None, target=None):
         if name in {"torch", "numba", "pandas", "scipy", "matplotlib", "stable_baselines3"}:
             print("THEN", name)
             sys.stdout.flush()
-            raise SystemExit(0)
+            raise Enough
 sys.meta_path.insert(0, Heavy())
 from commands.parsing import run_command
 import COMMAND
-run_command(COMMAND.main)
+try:
+    run_command(COMMAND.main)
+except Enough:
+    pass
 """
 
 

@@ -45,7 +45,6 @@ def answer(module, words, capsys):
         (TRAIN, "--environment x", "did you mean '--env'?"),
         (TRAIN, "--num_threads 2", "did you mean '--num-threads'?"),
         (TRAIN, "--folder x", "did you mean '--log-folder'?"),
-        (TRAIN, "--resume x.zip", "did you mean '--trained-agent'?"),
         (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
         (TRAIN, "--n-jobs 2", "not searched for here"),
         (TRAIN, "--wandb-entity=me", "-tb DIR writes TensorBoard logs"),

@@ -150,6 +150,6 @@ def test_a_failure_whose_details_cannot_be_written_is_told_and_the_others_go_on(
 
     monkeypatch.setattr(execution, "write_text", full)
     monkeypatch.setattr(execution, "supervise", failing)
-    failure = execution._supervised_run(runs_of(tmp_path)[0], tmp_path, "compare.py")
+    failure = execution._supervised_run(runs_of(tmp_path)[0], tmp_path, "compare.py", RunLimits())
     assert failure.reason.startswith(reason)
     assert failure.log is None

@@ -93,6 +93,8 @@ def test_every_text_of_every_component_is_known(component_classes):
                 places.add(name)
                 # Nor does any write somewhere without being told where.
                 assert "prefix" in name or parameter.default in (inspect.Parameter.empty, None)
+            elif says.startswith("collections.abc.Callable"):
+                continue  # no file can name a function
             elif any(word in says for word in ("str", "Path", "Any")):
                 assert name in HARMLESS, (cls, name, says)
     assert places == {

@@ -172,6 +172,8 @@ class Counting(gym.Env):
 class Counter:
     """Acts by how often it was asked since its episode began, which only its state says."""
 
+    num_timesteps = 0
+
     def predict(self, observation, state=None, episode_start=None, deterministic=False):
         state = np.zeros(len(observation), int) if state is None else state
         actions = np.where(episode_start, 0, state)

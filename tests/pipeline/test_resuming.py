@@ -95,7 +95,7 @@ def until_cut_off(training, monkeypatch, n_states=2, steps=7):
         return True
 
     with monkeypatch.context() as context:
-        context.setattr("pipeline.training._give_up", lambda *_: None)
+        context.setattr("pipeline.training.give_up", lambda *_: None)
         context.setattr(StateSaver, "_on_step", on_step)
         with pytest.raises(CutOffError):
             carry_out(training)
