@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import train
+from agents import load_algorithm
 
 ROOT = Path(train.__file__).parent
 WORDS = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "600", "--seed", "0"]
@@ -70,8 +70,8 @@ CODES = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129}
 )
 def test_what_was_learnt_is_saved(train_stopped, moment, name):
     engine = "compiled" if moment == "compiling" else "interpreted"
-    if moment == "compiling":  # once before, so that it takes less than the patience for a signal
-        shutil.rmtree(train_stopped(engine=engine)[2])
+    if moment == "compiling":  # before, so that it takes less than the patience for a signal
+        load_algorithm("qlearning")("QTablePolicy", "FrozenLake-v1", engine=engine).learn(10)
     code, record, folder = train_stopped(engine=engine, **{moment: name})
     assert (code, record["state"], record["stopped_by"]) == (CODES[name], "interrupted", name)
     assert "process" not in record
