@@ -294,19 +294,19 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--kills", type=int, default=30, help="signals in all, at least")
     parser.add_argument("--jobs", type=int, default=max((os.cpu_count() or 2) // 2, 1))
-    parser.add_argument("--only", default="", help="commands whose name holds this")
+    parser.add_argument("--only", nargs="+", default=[], help="names of the commands to try")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="fault-campaign-") as folder:
         os.environ["XDG_CONFIG_HOME"] = str(Path(folder) / "config")
-        chosen = [case for case in cases(Path(folder)) if args.only in case.name]
+        chosen = [case for case in cases(Path(folder)) if case.name in args.only or not args.only]
         signals, seed = 0, 0
         with ThreadPoolExecutor(args.jobs) as pool:
             list(pool.map(in_peace, chosen))
             while signals < args.kills:
                 signals += sum(pool.map(disturbed, chosen, [seed] * len(chosen)))
                 seed += 1
-                print(f"{signals:,} signals", file=sys.stderr, flush=True)
-        Console(width=180).print(table(chosen))
+                print(f"{signals:,} signals", flush=True)
+                Console(width=180).print(table(chosen))
     bad = ("differing results", "damaged files", "orphans", "files left", "tracebacks")
     return int(any(case.counts[key] for case in chosen for key in (*bad, "never done")))
 
