@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from experiments.study_spec import StudySpec
 
 SEEDS = whole_number(1, 1_000_000)
+FIRST_SEED = whole_number(0, 2**31)
 
 EPILOG = """\
 examples:
@@ -61,7 +62,13 @@ def build_parser() -> argparse.ArgumentParser:
     add("study", nargs="?", metavar="STUDY.yml", help="a study file, or the name of one of ours")
     add("--env", nargs="+", default=[], metavar="ID", help="environments")
     add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (train --list has them)")
-    add("--seeds", type=SEEDS, metavar="N", help="seeds 0 to N-1 (default: the study's, or 10)")
+    add("--seeds", type=SEEDS, metavar="N", help="how many seeds (default: the study's, or 10)")
+    add(
+        "--first-seed",
+        type=FIRST_SEED,
+        metavar="N",
+        help="the first of them (default: the study's, or 0)",
+    )
     add("-n", "--n-timesteps", type=COUNT, metavar="N", help="environment steps of each run")
     add("--n-episodes", type=COUNT, metavar="N", help="episodes instead of steps")
     add(

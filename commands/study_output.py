@@ -116,7 +116,9 @@ def _print_left_out(console: Console, left_out: Sequence[LeftOut]) -> None:
 
 def _whose(damaged: LeftOut) -> str:
     run = damaged.planned
-    seeds = f"seeds 0 to {run.n_runs - 1}" if run.n_runs > 1 else f"seed {run.seed}"
+    seeds = (
+        f"seeds {run.seed} to {run.seed + run.n_runs - 1}" if run.n_runs > 1 else f"seed {run.seed}"
+    )
     return f"{run.agent} on {run.environment}, {seeds}: {damaged.reason}"
 
 

@@ -221,7 +221,7 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
     table = table[(table["environment"] == environment) & (table["agent"] == agent)]
 
     def values(column: str) -> Floats:
-        column_of = table.set_index("seed")[column].reindex(range(study.n_seeds))
+        column_of = table.set_index("seed")[column].reindex(study.seeds)
         return column_of.to_numpy(dtype=np.float64, na_value=np.nan)
 
     def mean(column: str) -> Estimate:

@@ -33,7 +33,7 @@ _PULLS = ("arms", "rewards", "regrets")  # what figures are made of, beside cont
 
 
 def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
-    """Do the runs with seeds 0 to ``n_runs`` - 1 and leave their statistics in the run folder."""
+    """Do ``n_runs`` runs, from the spec's seed on, and leave their statistics in the run folder."""
     started = time.monotonic()
     with compile_timer() as seconds_compiling:
         result, engine = _run(spec, n_runs)
@@ -63,7 +63,7 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
         algorithm_kwargs(spec),
         spec.env_id,
         spec.hyperparams.env_kwargs,
-        range(n_runs),
+        range(spec.seed, spec.seed + n_runs),
         spec.hyperparams.n_timesteps,
     )
     try:
@@ -77,7 +77,9 @@ def _check_rewards(result: BatchResult) -> None:
     for i, rewards in enumerate(result.rewards):
         if not is_finite(rewards):
             pull = int(np.argmin(np.isfinite(rewards)))
-            raise NotFiniteError(f"reward of seed {i} at step {pull + 1:,}", float(rewards[pull]))
+            raise NotFiniteError(
+                f"reward of run {i + 1:,} at step {pull + 1:,}", float(rewards[pull])
+            )
 
 
 def _statistics(env: gym.Env[Any, Any], result: BatchResult) -> PullStatistics:

@@ -65,7 +65,8 @@ def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
             "regret": regret,
         }
         for seed, (reward, regret) in enumerate(
-            zip(pulls.total_reward.tolist(), pulls.total_regret.tolist(), strict=True)
+            zip(pulls.total_reward.tolist(), pulls.total_regret.tolist(), strict=True),
+            start=planned.seed,
         )
     ]
 

@@ -18,7 +18,7 @@ def values_over_seeds(results: StudyResults, environment: str, column: str) -> d
     table = table[table["environment"] == environment]
     pivot = table.pivot(index="seed", columns="agent", values=column)
     pivot = pivot.reindex(
-        index=range(results.study.n_seeds), columns=[a.label for a in results.study.agents]
+        index=results.study.seeds, columns=[a.label for a in results.study.agents]
     )
     return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
 

@@ -35,7 +35,6 @@ BUDGETS = ("n_timesteps", "n_episodes")
 _STUDY_VALUES: dict[str, Any] = {
     "title": str,
     "description": str,
-    "seeds": int,
     "n_timesteps": int,
     "n_episodes": int,
     "tuned": bool,
@@ -51,11 +50,13 @@ _LIMITS: dict[str, Callable[[str], float]] = {
     "run_timeout": run_limits.seconds,
     "run_memory": run_limits.memory,
 }
-_STUDY_KEYS = (*_STUDY_VALUES, *_LIMITS, "agents", "environments", "settings", "sweep", "quick")
+_PARTS = ("agents", "environments", "seeds", "settings", "sweep", "quick")
+_STUDY_KEYS = (*_STUDY_VALUES, *_LIMITS, *_PARTS)
 _AGENT_KEYS = ("algo", "tuned", "conf_file", "summary", "sweep")
 _QUICK_VALUES: dict[str, Any] = {"seeds": int, "budget": float}
-_NOT_NEGATIVE = ("margin", "episodes_table")
-_AT_LEAST_ONE = ("seeds", "n_timesteps", "n_episodes", "eval_freq", "eval_episodes")
+_NOT_NEGATIVE = ("margin", "episodes_table", "first")
+_SEEDS = {"first": "first_seed", "count": "n_seeds"}
+_AT_LEAST_ONE = ("seeds", "count", "n_timesteps", "n_episodes", "eval_freq", "eval_episodes")
 
 Keys = tuple[str | int, ...]
 
@@ -143,7 +144,7 @@ def read_study(path: Path) -> StudySpec:
     data = document.mapping(data)
     document.check_names(data, _STUDY_KEYS)
     values = {"title": path.stem, **document.values(data, _STUDY_VALUES)}
-    values |= _run_limits(document, data)
+    values |= {**_run_limits(document, data), **_seeds(document, data.get("seeds"))}
     document.check_budget(data)
     shared = document.mapping(data.get("settings"), "settings")
     document.check_budget(shared, "settings")
@@ -155,11 +156,21 @@ def read_study(path: Path) -> StudySpec:
         name=path.stem,
         agents=_agents(document, data, tuned),
         environments=_environments(document, data, layered(shared, budget)),
-        n_seeds=values.pop("seeds", StudySpec.n_seeds),
         quick=QuickSpec(**document.values(quick, _QUICK_VALUES, "quick")),
         source=path,
         **values,
     )
+
+
+def _seeds(document: _Document, given: Any) -> dict[str, int]:
+    """How many seeds, or the first and how many."""
+    if given is None:
+        return {}
+    if not isinstance(given, dict):
+        return {"n_seeds": document.values({"seeds": given}, {"seeds": int})["seeds"]}
+    document.check_names(document.mapping(given, "seeds"), _SEEDS, "seeds")
+    values = document.values(given, dict.fromkeys(_SEEDS, int), "seeds")
+    return {_SEEDS[key]: value for key, value in values.items()}
 
 
 def _run_limits(document: _Document, data: Mapping[str, Any]) -> dict[str, float]:

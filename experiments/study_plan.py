@@ -59,9 +59,9 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
         check_pulls(study.n_seeds, specs[labels].hyperparams.n_timesteps or 0, " on ".join(labels))
     return [
         _planned_run(study, root, agent, environment, seed, spec, (agent, environment) in batches)
-        for seed in range(study.n_seeds)
+        for seed in study.seeds
         for (agent, environment), spec in specs.items()
-        if seed == 0 or (agent, environment) not in batches
+        if seed == study.first_seed or (agent, environment) not in batches
     ]
 
 
@@ -91,7 +91,7 @@ def _planned_run(
         spec,
         seed=seed,
         tensorboard_log=root / "tensorboard" / place if study.tensorboard else None,
-        save_every_n_episodes=study.render_every if seed == 0 else -1,
+        save_every_n_episodes=study.render_every if seed == study.first_seed else -1,
     )
     path, n_runs = root / "runs" / place, study.n_seeds if is_batch else 1
     return PlannedRun(agent, environment, seed, spec, path, is_batch, n_runs)
@@ -113,7 +113,7 @@ def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
 
     agents = {agent.label: agent for agent in study.agents}
     for run in planned:
-        if run.seed == 0:
+        if run.seed == study.first_seed:
             with _naming_the_place(agents[run.agent]):
                 algorithm_kwargs(run.spec)
                 callbacks = run.spec.hyperparams.callback

@@ -177,14 +177,14 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
         return None
     if planned.is_batch:
         return RunResults(batch_rows(planned))
-    _check_for_page(planned)
+    _check_for_page(study, planned)
     episodes = read_episodes(planned.run)
     evaluations = _evaluation_curve(planned, episodes)
     row = _summary_row(study, planned, episodes, evaluations)
     return RunResults([row], [evaluations, _training_curve(planned, episodes)])
 
 
-def _check_for_page(planned: PlannedRun) -> None:
+def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
     """Make sure of the files that the page opens later: maps, and the agent that is filmed."""
     run = planned.run
     files = run.files
@@ -192,7 +192,7 @@ def _check_for_page(planned: PlannedRun) -> None:
         if files.digests is None:
             read_value_maps(run)
         files.check(path)
-    if planned.seed == 0:
+    if planned.seed == study.first_seed:
         files.check(run.model_path)
 
 

@@ -118,7 +118,8 @@ class StudySpec:
         description: what it asks, and what is known beforehand.
         agents: what is compared.
         environments: where.
-        n_seeds: the seeds are 0 to ``n_seeds`` - 1.
+        n_seeds: how many seeds there are.
+        first_seed: the first of them; the others follow it.
         eval_freq: environment steps between two evaluations, or None for twenty in a run.
         eval_episodes: episodes of each evaluation that has to be sampled.
         metric: what the verdicts are about.
@@ -159,6 +160,12 @@ class StudySpec:
     run_timeout: float | None = None
     run_memory: int | None = None
     source: Path | None = None
+    first_seed: int = 0
+
+    @property
+    def seeds(self) -> range:
+        """The seeds."""
+        return range(self.first_seed, self.first_seed + self.n_seeds)
 
     def quickened(self) -> StudySpec:
         """The study with few seeds and a small budget, in a folder of its own."""

@@ -54,8 +54,8 @@ def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> RunSe
     values = values_over_seeds(results, environment.environment, results.study.metric)
     agents = []
     for agent in environment.agents:
-        seeds = np.flatnonzero(np.isfinite(values[agent.agent]))
-        runs = values[agent.agent][seeds]
+        there = np.flatnonzero(np.isfinite(values[agent.agent]))
+        runs, seeds = values[agent.agent][there], there + results.study.first_seed
         agents.append(AgentRuns(agent.agent, agent.metric.mean, seeds, runs))
     scale = linear_up_to((runs.values for runs in agents), environment.optimum)
     return RunSeries(tuple(agents), scale)

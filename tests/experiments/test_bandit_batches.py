@@ -223,6 +223,18 @@ def test_an_arm_is_recommended_where_one_is_the_best(
 # --- verdicts on what should be low ---------------------------------------------------------------
 
 
+def test_seeds_that_begin_later_are_the_same_runs(tmp_path, do_study):
+    agents = {"batch": {"algo": "ucb"}, "runs": {"algo": "ucb", "n_envs": 2}}
+    whole = do_study(study_of(agents, n_seeds=4), tmp_path / "whole")
+    later = replace(study_of(agents, n_seeds=2), first_seed=2)
+    part = do_study(later, tmp_path / "part")
+    columns = ["agent", "seed", "regret", "training"]
+    wanted = whole.summary.loc[whole.summary["seed"] >= 2, columns]
+    assert part.summary[columns].equals(wanted.reset_index(drop=True))
+    for environment in analyse(part).environments:
+        assert [agent.n_missing for agent in environment.agents] == [0, 0]
+
+
 def test_less_regret_is_better(tmp_path, do_study):
     agents = {
         "random": {"algo": "epsilon_greedy", "exploration_initial_eps": 1.0},

@@ -297,6 +297,15 @@ def test_quick_has_fewer_seeds_and_a_folder_of_its_own(read):
     assert read(BASE + "seeds: 1\n").quickened().n_seeds == 1
 
 
+def test_seeds_may_begin_anywhere(read):
+    assert read(BASE + "seeds: 3\n").seeds == range(3)
+    assert read(BASE + "seeds: {first: 1000, count: 4}\n").seeds == range(1000, 1004)
+    assert read(BASE + "seeds: {first: 7}\n").seeds == range(7, 17)
+    for wrong in ("{first: -1}", "{count: 0}", "{last: 3}", "[1, 2]"):
+        with pytest.raises(UserError, match="seeds"):
+            read(BASE + f"seeds: {wrong}\n")
+
+
 def test_every_metric_and_every_agent_is_known(read):
     for metric in METRICS:
         assert read(BASE + f"metric: {metric}\n").metric == metric
