@@ -171,7 +171,8 @@ class StateSaver(StopAtSafeMoment):
             restore(state.snapshot, roots, moved)
         except NotRestorableError as error:
             raise UserError(
-                f"{self.run.state_path} does not fit what its settings make today: {error}"
+                f"{self.run.state_path} does not fit what the run's settings make today: {error}; "
+                "remove it to begin the run anew"
             ) from error
         set_generators(roots["generators"])
         self.steps_at_save = self.model.num_timesteps
