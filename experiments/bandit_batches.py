@@ -21,6 +21,7 @@ from mdp.machine_code import compile_timer
 from pipeline.array_files import read_arrays
 from pipeline.environments import make_single_env
 from pipeline.file_digests import DamagedFileError
+from pipeline.finite_numbers import NotFiniteError, is_finite
 from pipeline.preparation import algorithm_kwargs
 from pipeline.pull_recording import PULLS_FILE
 from pipeline.run_folder import FINISHED, Run
@@ -36,6 +37,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     started = time.monotonic()
     with compile_timer() as seconds_compiling:
         result, engine = _run(spec, n_runs)
+    _check_rewards(result)
     env = make_single_env(spec)
     try:
         statistics = _statistics(env, result)
@@ -68,6 +70,14 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
         return run_batch(*arguments), "compiled batch"
     except NotCompilable as reason:
         return run_one_by_one(*arguments), f"one by one: {reason}"
+
+
+def _check_rewards(result: BatchResult) -> None:
+    """Refuse rewards that are not finite, before anything is judged by them."""
+    for i, rewards in enumerate(result.rewards):
+        if not is_finite(rewards):
+            pull = int(np.argmin(np.isfinite(rewards)))
+            raise NotFiniteError(f"reward of seed {i} at step {pull + 1:,}", float(rewards[pull]))
 
 
 def _statistics(env: gym.Env[Any, Any], result: BatchResult) -> PullStatistics:

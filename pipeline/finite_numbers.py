@@ -15,6 +15,7 @@ import torch as th
 from numpy import vdot
 from numpy.typing import NDArray
 
+from agents.bandits.score_policy import BanditPolicy
 from pipeline.errors import UserError
 
 # Single and double precision, whose scalar products are worked out by BLAS.
@@ -82,7 +83,10 @@ def check_model(model: Any) -> None:
     when = f"at step {model.num_timesteps:,}"
     policy = getattr(model, "policy", None)
     if isinstance(policy, th.nn.Module):
-        for name, tensor in policy.state_dict().items():
+        for name, table in policy.state_dict().items():
+            # The score of an arm that was never pulled says so by being infinite.
+            is_scores = name == "scores" and isinstance(policy, BanditPolicy)
+            tensor = table[policy.counts > 0] if is_scores else table
             if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
                 values = tensor.detach().cpu().double().numpy()
                 raise NotFiniteError(f"a value in {name} of the agent {when}", _culprit(values))
