@@ -86,7 +86,7 @@ def check_model(model: Any) -> None:
         for name, table in policy.state_dict().items():
             # The score of an arm that was never pulled says so by being infinite.
             is_scores = name == "scores" and isinstance(policy, BanditPolicy)
-            tensor = table[policy.counts > 0] if is_scores else table
+            tensor = table[policy.get_buffer("counts") > 0] if is_scores else table
             if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
                 values = tensor.detach().cpu().double().numpy()
                 raise NotFiniteError(f"a value in {name} of the agent {when}", _culprit(values))
