@@ -15,6 +15,7 @@ import torch as th
 from numpy import vdot
 from numpy.typing import NDArray
 
+from agents.bandits.score_policy import BanditPolicy
 from pipeline.errors import UserError
 
 # Single and double precision, whose scalar products are worked out by BLAS.
@@ -82,10 +83,11 @@ def check_model(model: Any) -> None:
     when = f"at step {model.num_timesteps:,}"
     policy = getattr(model, "policy", None)
     if isinstance(policy, th.nn.Module):
-        infinite = getattr(policy, "may_be_infinite", ())
-        for name, tensor in policy.state_dict().items():
-            is_bad = th.isnan(tensor) if name in infinite else ~th.isfinite(tensor)
-            if tensor.is_floating_point() and bool(is_bad.any()):
+        for name, table in policy.state_dict().items():
+            # The score of an arm that was never pulled says so by being infinite.
+            is_scores = name == "scores" and isinstance(policy, BanditPolicy)
+            tensor = table[policy.get_buffer("counts") > 0] if is_scores else table
+            if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
                 values = tensor.detach().cpu().double().numpy()
                 raise NotFiniteError(f"a value in {name} of the agent {when}", _culprit(values))
     normalization = model.get_vec_normalize_env()

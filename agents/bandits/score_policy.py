@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -32,9 +32,6 @@ class BanditPolicy(ArmPolicy):
         sums: sum of the rewards, float64 of shape (C, A).
         counts: number of the rewards, int64 of shape (C, A).
     """
-
-    # Of arms that were not tried yet.
-    may_be_infinite: ClassVar[tuple[str, ...]] = ("scores",)
 
     scores: th.Tensor
     sums: th.Tensor

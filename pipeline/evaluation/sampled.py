@@ -125,7 +125,8 @@ def evaluate(
         if local["done"] and "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
-    when = f"in the evaluation at step {model.num_timesteps:,}"
+    # Others that play have no count of their own.
+    when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
     env.seed(seed)
     watched: Any = FinitePlayer(player(model, env), when)
     returns, lengths = evaluate_policy(

@@ -15,6 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from agents.bandits.score_policy import BanditPolicy
+from experiments.bandit_batches import _check_rewards
 from pipeline.finite_numbers import NotFiniteError, check_model, check_rows, is_finite
 from pipeline.number_watch import NumberWatch
 
@@ -254,3 +256,22 @@ def test_losses_are_looked_at_and_other_entries_are_not():
     log["train/critic_loss"] = math.nan
     with pytest.raises(NotFiniteError, match="train/critic_loss at step 7 is nan"):
         watch.on_rollout_start()
+
+
+def test_an_arm_that_was_never_pulled_has_no_score():
+    scores = BanditPolicy(spaces.Discrete(1), spaces.Discrete(3), initial_score=-math.inf)
+    model = agent()
+    model.policy = scores
+    scores.scores[0, 1], scores.counts[0, 1] = 0.5, 1
+    check_model(model)
+    scores.counts[0, 2] = 1
+    with pytest.raises(NotFiniteError, match="scores of the agent at step 1,234 is -inf"):
+        check_model(model)
+
+
+def test_a_batch_of_bandits_is_looked_at_too():
+    rewards = np.ones((2, 5), dtype=np.float32)
+    _check_rewards(SimpleNamespace(rewards=rewards))
+    rewards[1, 3] = np.nan
+    with pytest.raises(NotFiniteError, match=r"^reward of seed 1 at step 4 is nan$"):
+        _check_rewards(SimpleNamespace(rewards=rewards))
