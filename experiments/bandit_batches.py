@@ -37,7 +37,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     started = time.monotonic()
     with compile_timer() as seconds_compiling:
         result, engine = _run(spec, n_runs)
-    _check_rewards(result)
+    _check_rewards(result, spec.seed)
     env = make_single_env(spec)
     try:
         statistics = _statistics(env, result)
@@ -72,14 +72,13 @@ def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
         return run_one_by_one(*arguments), f"one by one: {reason}"
 
 
-def _check_rewards(result: BatchResult) -> None:
+def _check_rewards(result: BatchResult, first_seed: int) -> None:
     """Refuse rewards that are not finite, before anything is judged by them."""
-    for i, rewards in enumerate(result.rewards):
+    for seed, rewards in enumerate(result.rewards, start=first_seed):
         if not is_finite(rewards):
             pull = int(np.argmin(np.isfinite(rewards)))
-            raise NotFiniteError(
-                f"reward of run {i + 1:,} at step {pull + 1:,}", float(rewards[pull])
-            )
+            what = f"reward of seed {seed} at step {pull + 1:,}"
+            raise NotFiniteError(what, float(rewards[pull]))
 
 
 def _statistics(env: gym.Env[Any, Any], result: BatchResult) -> PullStatistics:
