@@ -290,15 +290,28 @@ def test_what_cannot_be_kept_is_said_once(tmp_path, monkeypatch):
     assert "begins it anew" in told[0]
 
 
-def test_a_disk_that_is_full_ends_no_training(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ("write_snapshot", "no state was saved: {folder}: No space left on device"),
+        ("user_key", "no state can be kept: the key to saved states: No space left on device"),
+    ],
+)
+def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
+    tmp_path, monkeypatch, part, said
+):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(saved_states, "write_snapshot", full)
+    told = []
+    monkeypatch.setattr("pipeline.preparation._say", lambda _, line: told.append(line))
+    monkeypatch.setattr(saved_states, part, full)
     spec = spec_of(tmp_path, GRID, "qlearning", 600, {})
-    keeping = StateKeeping(SaveInterval(steps=200))
+    keeping = StateKeeping(SaveInterval(steps=50), stays=True)
     outcome = train(spec, Console(quiet=True), {}, "", keeping=keeping)
     assert outcome.state == "finished"
+    assert len(told) == 1
+    assert told[0].startswith(said.format(folder=outcome.run.state_path))
 
 
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
