@@ -369,12 +369,12 @@ def test_a_second_driver_says_who_is_at_work_and_touches_nothing(folder):
 
 
 def test_what_a_dead_driver_began_is_gone_on_with(folder):
-    """Until a run can go on from its state, what is taken over is begun anew; nothing is left."""
+    """What it left is taken over, and begun anew where it is no state; nothing is left."""
     process, study = begin_slowly(folder)
     drafts = list(study.glob(".drafts/*"))
     for draft in drafts:
         (draft / "state").mkdir()
-        (draft / "state" / "newest").touch()
+        (draft / "state" / "odd.state").touch()
     process.kill()
     process.communicate()
     wait_for(lambda: not session_of(process.pid) or not any(map(is_alive, session_of(process.pid))))
