@@ -32,6 +32,7 @@ from pipeline.run_record import recorded_versions, write_arguments, write_settin
 from pipeline.signs_of_life import Activity, doing
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
+from pipeline.worker_processes import deaths_told
 
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
@@ -214,14 +215,17 @@ def _learn(training: Training) -> None:
     before = 0 if begun is None else iterations_before(training.model, begun.note)
     if before and (interval := kwargs.get("log_interval", 1)) is not None:
         kwargs["log_interval"] = IterationInterval.after(before, interval)
+    env = training.model.get_env()
+    assert env is not None
     try:
-        training.model.learn(
-            spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
-            callback=training.callback,
-            tb_log_name=spec.algo,
-            reset_num_timesteps=spec.trained_agent is None,
-            **kwargs,
-        )
+        with deaths_told(env):
+            training.model.learn(
+                spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
+                callback=training.callback,
+                tb_log_name=spec.algo,
+                reset_num_timesteps=spec.trained_agent is None,
+                **kwargs,
+            )
     except (ValueError, RuntimeError) as error:
         blame_weights(training.model, error)
         raise
