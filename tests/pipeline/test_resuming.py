@@ -12,11 +12,13 @@ from rich.console import Console
 
 from agents import ALGORITHMS
 from pipeline.errors import UserError
+from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.resuming.unfinished_runs import go_on, newest_unfinished, recorded_training
 from pipeline.run_folder import Run
+from pipeline.run_lock import at_work_on
 from pipeline.settings.hyperparam_entries import override, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -273,7 +275,9 @@ def test_without_a_state_the_run_begins_anew(tmp_path, monkeypatch):
     run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
     for path in run.state_path.iterdir():
         path.unlink()
-    keeping = go_on(run, StateKeeping(), pytest.fail)
+    with at_work_on(run, pytest.fail):
+        keeping = go_on(run, StateKeeping(), pytest.fail)
+        assert (run.path / LOCK).exists()
     assert keeping.state is None
     again = replace(recorded_training(run, ()), verbose=0, pictures=False)
     carry_out(training_of(again, keeping, run))
