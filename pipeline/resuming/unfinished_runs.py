@@ -152,7 +152,7 @@ def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
 
 
 def _empty(run: Run) -> None:
-    """Remove what a run has left that saved no state, but for what it was asked for, and its lock."""
+    """Remove what a run without a state has left, but for what it was asked for, and its lock."""
     remove_states(run.state_path)
     logged = run.read_info().get("tensorboard")
     if isinstance(logged, str):
