@@ -5,8 +5,7 @@ from __future__ import annotations
 import _thread
 import argparse
 import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +23,7 @@ from commands.flag_values import (
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
 from commands.streams import go_on_unread
-from pipeline.errors import UserError
+from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.signs_of_life import doing
 from pipeline.stopping import stops_noticed
 
@@ -156,18 +155,8 @@ def main() -> int:
         from commands.compare_on_log import compare_on_log
 
         return compare_on_log(args)
-    with stops_noticed(), _no_other_exit():
+    with stops_noticed(), exits_as_mistakes():
         return _compare(args)
-
-
-@contextmanager
-def _no_other_exit() -> Iterator[None]:
-    """Let no environment or module of the user's end the command as if all were done."""
-    try:
-        yield
-    except SystemExit as stop:
-        code = "" if stop.code is None else f": {stop.code}"
-        raise UserError(f"a module or environment asked the program to exit{code}") from stop
 
 
 def _compare(args: argparse.Namespace) -> int:

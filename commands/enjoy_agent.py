@@ -17,6 +17,7 @@ from commands.flag_values import (
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
 from commands.streams import go_on_unread
+from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
@@ -131,12 +132,12 @@ def _add_flags_of_rl_zoo3(parser: argparse.ArgumentParser) -> None:
 
 def main() -> int:
     """Parse the arguments and play; the exit code."""
-    with stops_noticed():
-        return _play()
-
-
-def _play() -> int:
     args = build_parser().parse_args()
+    with stops_noticed(), exits_as_mistakes():
+        return _play(args)
+
+
+def _play(args: argparse.Namespace) -> int:
     from commands.enjoy_request import check_playing, model_request
     from pipeline.filming import check_film_path
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from commands.parsing import command_line, exit_code
 from commands.streams import go_on_unread
 from commands.train_flags import RESUMING, build_parser
+from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.stopping import StopRequest, stops_noticed
 
 if TYPE_CHECKING:
@@ -17,12 +18,12 @@ if TYPE_CHECKING:
 
 def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
-    with stops_noticed() as stop:
-        return _train(stop)
-
-
-def _train(stop: StopRequest) -> int:
     args = build_parser().parse_args()
+    with stops_noticed() as stop, exits_as_mistakes():
+        return _train(args, stop)
+
+
+def _train(args: argparse.Namespace, stop: StopRequest) -> int:
     if args.list:
         return _list(args)
     if args.resume is not None:

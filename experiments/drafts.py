@@ -18,14 +18,15 @@ from pathlib import Path
 
 from experiments.planned_runs import PlannedRun
 from pipeline import liveness
+from pipeline.file_digests import STATE_FOLDER
 from pipeline.files import portable_name
 from pipeline.folder_clock import seconds_silent
+from pipeline.resuming.state_folder import has_state
 
 FOLDER = ".drafts"
-# In a draft, what an interrupted run goes on from.
-STATE = "state"
 LONGEST_DRAFT_NAME = 150  # bytes, besides the numbers and names of process and machine
-# After this long without a sign, a process elsewhere counts as gone.
+# After this long without a sign, a process elsewhere counts as gone: sooner than a lock, so that
+# whoever takes over the lock of a driver finds its drafts to be free.
 SECONDS_OF_SILENCE = 45.0
 
 _OWNER = re.compile(r"(\d{1,10})-(\d{1,20})-([0-9a-f]{8})@")
@@ -71,10 +72,8 @@ def _is_dead(draft: Path) -> bool:
 
 def holds_state(draft: Path) -> bool:
     """Whether there is something in a draft to go on from."""
-    state = draft / STATE
-    with contextlib.suppress(OSError):
-        return not draft.is_symlink() and not state.is_symlink() and any(state.iterdir())
-    return False
+    state = draft / STATE_FOLDER
+    return not draft.is_symlink() and not state.is_symlink() and has_state(state)
 
 
 def _drafts(root: Path) -> list[Path]:

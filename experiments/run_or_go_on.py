@@ -13,12 +13,8 @@ from experiments.planned_runs import PlannedRun
 from pipeline.errors import UserError
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.unfinished_runs import go_on
-from pipeline.run_folder import FINISHED, Run
+from pipeline.run_folder import Run
 from pipeline.training import train
-
-
-class NotFinishedError(Exception):
-    """A training came back before its end, though nobody had stopped it."""
 
 
 def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
@@ -29,9 +25,6 @@ def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
         draft: its folder. It is there where another process has left it: the run goes on from its
             state if that is whole and of these very settings, and else begins anew.
         command: the command that asked for the study.
-
-    Raises:
-        NotFinishedError: if something in the run ended the training, as Ctrl-C would.
     """
     run = Run(draft, planned.run.env_name)
     keeping = _to_go_on_with(planned, run)
@@ -41,9 +34,7 @@ def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
         do_batch(planned.spec, planned.n_runs, run, command)
         return
     args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
-    outcome = train(planned.spec, Console(quiet=True), args, command, run, keeping)
-    if outcome.state != FINISHED:
-        raise NotFinishedError(f"KeyboardInterrupt in the run after {outcome.n_steps:,} steps")
+    train(planned.spec, Console(quiet=True), args, command, run, keeping)
 
 
 def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:

@@ -8,11 +8,13 @@ from typing import Any
 from pipeline.errors import UserError, one_line
 from pipeline.files import DISK_ERRORS
 from pipeline.finite_numbers import NotFiniteError, check_model
+from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.preparation import Training
 from pipeline.run_folder import INTERRUPTED
 from pipeline.worker_processes import close_environments
 
 
+@exits_as_mistakes()
 def close(training: Training) -> None:
     """Close what is open, each part also where another cannot be closed."""
     model = training.model

@@ -20,6 +20,7 @@ from typing import Any
 
 from pipeline import liveness
 from pipeline.errors import UserError, visible
+from pipeline.file_digests import LOCK
 from pipeline.folder_clock import (
     SECONDS_BETWEEN_SIGNS,
     give_sign,
@@ -29,7 +30,6 @@ from pipeline.folder_clock import (
 )
 from pipeline.signs_of_life import Heartbeat
 
-NAME = ".lock"
 SECONDS_OF_SILENCE = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2
 _LARGEST = 10_000  # bytes
@@ -54,7 +54,7 @@ def folder_lock(
         FolderInUseError: if another process is at work, saying who.
     """
     made = _make_folders(root)
-    path, token = root / NAME, secrets.token_hex(16)
+    path, token = root / LOCK, secrets.token_hex(16)
     try:
         _take(path, token, say)
         remove_remains(root)
@@ -91,7 +91,7 @@ def _take(path: Path, token: str, say: Callable[[str], object]) -> None:
 
 def _appears(path: Path, content: str) -> bool:
     """Let the lock appear, whole; whether it was not there."""
-    draft = path.with_name(f"{NAME}.{secrets.token_hex(8)}.tmp")
+    draft = path.with_name(f"{LOCK}.{secrets.token_hex(8)}.tmp")
     try:
         draft.write_text(content, encoding="utf-8")
         os.link(draft, path)
@@ -146,7 +146,7 @@ def _remove_dead(path: Path, owner: dict[str, Any]) -> None:
     Of several processes, one alone can give it the name that only this lock can get.
     """
     digest = hashlib.sha256(repr(owner.get("token")).encode()).hexdigest()[:32]
-    grave = path.with_name(f"{NAME}.{digest}.dead.tmp")
+    grave = path.with_name(f"{LOCK}.{digest}.dead.tmp")
     try:
         grave.mkdir()
     except FileExistsError:

@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from pipeline.errors import UserError
+from pipeline.file_digests import LOCK, RECORD
 from pipeline.files import drafts_in
 from pipeline.liveness import is_alive
 from pipeline.module_records import COPIES
 from pipeline.run_files import environment_name
-from pipeline.run_folder import PROCESS, RUNNING, Run, numbered_runs
+from pipeline.run_folder import PROCESS, ROOM, RUNNING, Run, numbered_runs
 
 _CLAIM = re.compile(r"\.(.+)\.[0-9a-f]{16}\.tmp")
 
@@ -52,8 +53,9 @@ def _unfinished(parent: Path, env_name: str) -> Iterator[Run]:
 
 def _is_mere_set_up(run: Run) -> bool:
     """Whether nothing lies in the folder but what is written before the first step."""
+    own_files = "|".join(map(re.escape, (RECORD, LOCK, ROOM)))
     own = re.compile(
-        rf"run\.json|\.lock|\.room|\d+\.monitor\.csv|{re.escape(run.env_name)}(/(config|args)\.yml|/command\.txt)?"
+        rf"{own_files}|\d+\.monitor\.csv|{re.escape(run.env_name)}(/(config|args)\.yml|/command\.txt)?"
         rf"|{COPIES}(/[^/]+\.py)?|([^/]+/)?\.[^/]+\.[0-9a-f]{{16}}\.tmp"
     )
     names = (path.relative_to(run.path).as_posix() for path in run.path.rglob("*"))

@@ -20,6 +20,7 @@ from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.files import naming
 from pipeline.finishing import draw, judge, save
+from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.leftovers import remove_leftovers
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.pull_recording import PullSummary
@@ -31,6 +32,7 @@ from pipeline.run_record import recorded_versions, write_arguments, write_settin
 from pipeline.signs_of_life import Activity, doing
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
+from pipeline.worker_processes import deaths_told
 
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
@@ -82,6 +84,7 @@ def train(
     return carry_out(prepare(spec, console, args, command, run, keeping))
 
 
+@exits_as_mistakes()
 def prepare(
     spec: TrainSpec,
     console: Console,
@@ -101,7 +104,8 @@ def prepare(
         keeping: what becomes of the state of the training.
 
     Raises:
-        UserError: if the spec does not work out; no folder is left behind then.
+        UserError: if the spec does not work out, or the environment asks the program to end; no
+            folder is left behind then.
         Stopped: if a signal asks for it, likewise.
     """
     if spec.num_threads > 0:
@@ -160,6 +164,7 @@ def carry_out(training: Training) -> Outcome:
     Raises:
         UserError: if the agent finds at its first step that it cannot work so; no folder is left
             behind then.
+        ForeignExitError: if the environment or a callback asks the program to end.
         KeyboardInterrupt: if it is stopped before that step, likewise.
     """
     with current().held():
@@ -167,11 +172,15 @@ def carry_out(training: Training) -> Outcome:
             with naming(training.run.path):
                 outcome = _train_and_finish(training)
         except BaseException as error:
-            with contextlib.suppress(OSError):  # what could not be written still cannot
+            with contextlib.suppress(BaseException):  # it would hide what the run broke by
                 close(training)
             give_up(training, error)
             raise
-        close(training)
+        try:
+            close(training)
+        except BaseException as error:
+            give_up(training, error)
+            raise
     return outcome
 
 
@@ -194,6 +203,7 @@ def _train_and_finish(training: Training) -> Outcome:
         return _finish(training, state, seconds, activity)
 
 
+@exits_as_mistakes()
 def _learn(training: Training) -> None:
     spec = training.spec
     kwargs: dict[str, Any] = {}
@@ -205,14 +215,17 @@ def _learn(training: Training) -> None:
     before = 0 if begun is None else iterations_before(training.model, begun.note)
     if before and (interval := kwargs.get("log_interval", 1)) is not None:
         kwargs["log_interval"] = IterationInterval.after(before, interval)
+    env = training.model.get_env()
+    assert env is not None
     try:
-        training.model.learn(
-            spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
-            callback=training.callback,
-            tb_log_name=spec.algo,
-            reset_num_timesteps=spec.trained_agent is None,
-            **kwargs,
-        )
+        with deaths_told(env):
+            training.model.learn(
+                spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS,
+                callback=training.callback,
+                tb_log_name=spec.algo,
+                reset_num_timesteps=spec.trained_agent is None,
+                **kwargs,
+            )
     except (ValueError, RuntimeError) as error:
         blame_weights(training.model, error)
         raise
@@ -224,7 +237,8 @@ def _finish(training: Training, state: str, seconds: float, activity: Activity) 
     pulls = save(training, state)
     final: Evaluation | None = None
     try:
-        with current().waiting(SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0):
+        seconds_left = SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0
+        with current().waiting(seconds_left), exits_as_mistakes():
             activity.now("evaluating the final policy")
             final = judge(training, state)
             activity.now("drawing the pictures")

@@ -1,4 +1,4 @@
-"""The processes of a SubprocVecEnv, when somebody asks the training to stop.
+"""The processes of a SubprocVecEnv, when one ends or somebody asks the training to stop.
 
 Ctrl-C in a terminal, a closed terminal and many a cluster signal to all processes at once. Workers
 that ended by themselves would take away the environments that the training still needs.
@@ -10,12 +10,20 @@ import contextlib
 import multiprocessing
 import signal
 import sys
-from typing import Any
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
+from pipeline.errors import UserError
 from pipeline.stopping import SIGNALS, Stopped, current
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.vec_env import VecEnv
 
 # After a stop was asked for: what takes longer is ended.
 SECONDS_FOR_CLOSING = 1.8
+# For a process whose pipe is closed.
+SECONDS_TO_END = 1.0
 
 
 def shield_workers() -> None:
@@ -30,6 +38,27 @@ def shield_workers() -> None:
             forkserver.ensure_running()
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
+def deaths_told(env: VecEnv) -> Iterator[None]:
+    """Say which process of a SubprocVecEnv has ended, where one has.
+
+    Raises:
+        UserError: naming it, in the place of what its pipe raises.
+    """
+    try:
+        yield
+    except (EOFError, ConnectionError) as error:
+        for number, process in enumerate(getattr(env.unwrapped, "processes", [])):
+            process.join(SECONDS_TO_END)
+            if process.exitcode is not None:
+                how = f"exit code {process.exitcode}"
+                if process.exitcode < 0:
+                    how = signal.Signals(-process.exitcode).name
+                message = f"--vec-env subproc: the process of environment {number} has ended: {how}"
+                raise UserError(message) from error
+        raise
 
 
 def close_environments(env: Any) -> None:

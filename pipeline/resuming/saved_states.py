@@ -39,7 +39,9 @@ def state_key() -> bytes:
     try:
         return user_key(APPLICATION)
     except OSError as error:
-        raise UserError(f"the key to saved states: {error}") from error
+        place = f"{error.filename}: " if error.filename else ""
+        reason = error.strerror or error
+        raise UserError(f"the key to saved states: {place}{reason}") from error
 
 
 def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, Any]) -> None:
@@ -47,10 +49,12 @@ def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, An
 
     Raises:
         OSError: if it cannot be written; the last one is there still.
+        UserError: if there is no key to write it under.
     """
+    key = state_key()
     folder.mkdir(exist_ok=True)
     with replacing(state_file(folder, number)) as draft:
-        write_snapshot(draft, snapshot, {**note, "number": number}, user_key(APPLICATION))
+        write_snapshot(draft, snapshot, {**note, "number": number}, key)
     sync_folders(folder)
 
 

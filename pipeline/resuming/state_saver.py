@@ -67,6 +67,7 @@ class StateSaver(StopAtSafeMoment):
         self.n_rollouts = int(note.get("rollouts", 0))
         self.seconds_before = float(note.get("seconds", 0.0))
         self.steps_at_save = 0
+        self.has_said_why_not = False
         self.saved_at = self.started = time.monotonic()
         self.pause = interval.seconds or SHORTEST_INTERVAL
 
@@ -122,12 +123,16 @@ class StateSaver(StopAtSafeMoment):
         begun = time.monotonic()
         try:
             self._write()
+            self.has_said_why_not = False
         except NotRecordableError as error:
             self._give_up(f"no state can be kept: {one_line(error)}")
         except UserError as error:
             self._give_up(f"no state can be kept: {error}")
         except OSError as error:
-            self.tell(f"no state was saved: {self.run.state_path}: {error.strerror}")
+            if not self.has_said_why_not:
+                self.has_said_why_not = True
+                reason = error.strerror or one_line(error)
+                self.tell(f"no state was saved: {self.run.state_path}: {reason}")
         self.saved_at = time.monotonic()
         self.steps_at_save = self.model.num_timesteps
         if self.interval.seconds == 0:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.file_digests import RECORD, DamagedFileError
+from pipeline.file_digests import LOCK, RECORD, DamagedFileError
 from pipeline.resuming.log_positions import cut_back, remove_events
 from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
 from pipeline.resuming.state_keeping import StateKeeping
@@ -152,13 +152,13 @@ def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
 
 
 def _empty(run: Run) -> None:
-    """Remove what a run has left that saved no state, but for what it was asked for."""
+    """Remove what a run without a state has left, but for what it was asked for, and its lock."""
     remove_states(run.state_path)
     logged = run.read_info().get("tensorboard")
     if isinstance(logged, str):
         remove_events(logged)
     for path in run.path.iterdir():
-        if path.name in (RECORD, run.env_name):
+        if path.name in (RECORD, LOCK, run.env_name):
             continue
         if path.is_dir() and not path.is_symlink():
             shutil.rmtree(path, ignore_errors=True)

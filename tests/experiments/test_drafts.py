@@ -35,7 +35,7 @@ def draft_of(root, process, machine=HERE, state=False, run=RUN):
     (draft / "inner" / "0.monitor.csv").write_text("half a li")
     if state:
         (draft / "state").mkdir()
-        (draft / "state" / "newest").write_text("far")
+        (draft / "state" / "odd.state").write_text("far")
     return draft
 
 
@@ -147,7 +147,7 @@ def test_the_next_process_takes_over_what_a_dead_one_has_left(tmp_path, dead_pid
     left = draft_of(tmp_path, dead_pid, state=True)
     assert take_over(own)
     assert not left.exists()
-    assert (own / "state" / "newest").read_text() == "far"
+    assert (own / "state" / "odd.state").read_text() == "far"
 
 
 def test_a_link_is_taken_over_by_nobody(tmp_path, dead_pid):

@@ -12,7 +12,8 @@ import pytest
 
 from pipeline import folder_lock as locks
 from pipeline import liveness
-from pipeline.folder_lock import NAME, FolderInUseError, folder_lock
+from pipeline.file_digests import LOCK
+from pipeline.folder_lock import FolderInUseError, folder_lock
 
 FOREIGN = {**liveness.mark(), "host": "elsewhere", "machine": "other", "boot": "other"}
 FOREIGN |= {"token": "t", "since": "2026-01-01 00:00:00"}
@@ -29,7 +30,7 @@ def lock(root, on_loss=never, say=never):
 def leave_lock(root, owner, seconds=0.0):
     """A lock whose owner gave its last sign so long ago."""
     root.mkdir(exist_ok=True)
-    path = root / NAME
+    path = root / LOCK
     path.write_text(owner if isinstance(owner, str) else json.dumps(owner))
     then = path.stat().st_mtime - seconds
     os.utime(path, (then, then))
@@ -40,14 +41,14 @@ def test_inside_nobody_else_is_let_in_and_afterwards_nothing_is_left(tmp_path):
     root = tmp_path / "logs" / "study"
     for _ in range(2):
         with lock(root):
-            assert [path.name for path in root.iterdir()] == [NAME]
+            assert [path.name for path in root.iterdir()] == [LOCK]
             who = re.escape(f"{root}: process {os.getpid()} on {liveness.mark()['host']} is at wor")
             with (
                 pytest.raises(FolderInUseError, match=f"^{who}k on it since 20..-"),
                 lock(root),
             ):
                 never()
-            assert [path.name for path in root.iterdir()] == [NAME]
+            assert [path.name for path in root.iterdir()] == [LOCK]
         assert list(tmp_path.iterdir()) == []
 
 
@@ -69,7 +70,7 @@ def test_a_dead_process_holds_nothing(tmp_path):
         pass
     leave_lock(tmp_path, {**liveness.mark(), "pid": process.pid, "began": 1, "token": "t"})
     with lock(tmp_path):
-        assert json.loads((tmp_path / NAME).read_text())["pid"] == os.getpid()
+        assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -92,7 +93,7 @@ def test_one_elsewhere_that_shows_itself_is_at_work(tmp_path, monkeypatch):
         never()
     (line,) = said
     assert line.startswith("waiting for a sign of life: ")
-    assert [entry.name for entry in tmp_path.iterdir()] == [NAME]
+    assert [entry.name for entry in tmp_path.iterdir()] == [LOCK]
 
 
 def test_one_elsewhere_that_stays_silent_is_gone(tmp_path, monkeypatch):
@@ -151,7 +152,7 @@ def test_who_was_killed_while_removing_a_lock_is_in_nobodys_way(tmp_path, monkey
 
 def test_what_the_killed_have_half_written_is_removed(tmp_path):
     half = f".summary.csv.{'0a' * 8}.tmp"
-    names = [half, f".{'0a' * 8}.tmp", f"{NAME}.{'0a' * 8}.tmp", f"figures/{half}", "figures/fresh"]
+    names = [half, f".{'0a' * 8}.tmp", f"{LOCK}.{'0a' * 8}.tmp", f"figures/{half}", "figures/fresh"]
     kept = [".mine.tmp", f"runs/agent/{half}", f".new.{'0b' * 8}.tmp", "figures/fresh"]
     for name in {*names, *kept}:
         path = tmp_path / name
@@ -193,13 +194,13 @@ def test_who_was_taken_for_dead_learns_of_it(tmp_path, monkeypatch):
     monkeypatch.setattr(locks, "SECONDS_BETWEEN_SIGNS", 0.01)
     lost = threading.Event()
     with lock(tmp_path, on_loss=lost.set):
-        before = (tmp_path / NAME).stat().st_mtime_ns
-        wait_for(lambda: (tmp_path / NAME).stat().st_mtime_ns > before)
+        before = (tmp_path / LOCK).stat().st_mtime_ns
+        wait_for(lambda: (tmp_path / LOCK).stat().st_mtime_ns > before)
         assert not lost.is_set()
         leave_lock(tmp_path, FOREIGN)
         assert lost.wait(10)
     # That of the other is left to it.
-    assert json.loads((tmp_path / NAME).read_text()) == FOREIGN
+    assert json.loads((tmp_path / LOCK).read_text()) == FOREIGN
 
 
 def wait_for(condition):

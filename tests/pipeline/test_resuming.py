@@ -12,11 +12,13 @@ from rich.console import Console
 
 from agents import ALGORITHMS
 from pipeline.errors import UserError
+from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.resuming.unfinished_runs import go_on, newest_unfinished, recorded_training
 from pipeline.run_folder import Run
+from pipeline.run_lock import at_work_on
 from pipeline.settings.hyperparam_entries import override, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -273,7 +275,9 @@ def test_without_a_state_the_run_begins_anew(tmp_path, monkeypatch):
     run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
     for path in run.state_path.iterdir():
         path.unlink()
-    keeping = go_on(run, StateKeeping(), pytest.fail)
+    with at_work_on(run, pytest.fail):
+        keeping = go_on(run, StateKeeping(), pytest.fail)
+        assert (run.path / LOCK).exists()
     assert keeping.state is None
     again = replace(recorded_training(run, ()), verbose=0, pictures=False)
     carry_out(training_of(again, keeping, run))
@@ -290,15 +294,28 @@ def test_what_cannot_be_kept_is_said_once(tmp_path, monkeypatch):
     assert "begins it anew" in told[0]
 
 
-def test_a_disk_that_is_full_ends_no_training(tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [
+        ("write_snapshot", "no state was saved: {folder}: No space left on device"),
+        ("user_key", "no state can be kept: the key to saved states: No space left on device"),
+    ],
+)
+def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
+    tmp_path, monkeypatch, part, said
+):
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(saved_states, "write_snapshot", full)
+    told = []
+    monkeypatch.setattr("pipeline.preparation._say", lambda _, line: told.append(line))
+    monkeypatch.setattr(saved_states, part, full)
     spec = spec_of(tmp_path, GRID, "qlearning", 600, {})
-    keeping = StateKeeping(SaveInterval(steps=200))
+    keeping = StateKeeping(SaveInterval(steps=50), stays=True)
     outcome = train(spec, Console(quiet=True), {}, "", keeping=keeping)
     assert outcome.state == "finished"
+    assert len(told) == 1
+    assert told[0].startswith(said.format(folder=outcome.run.state_path))
 
 
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):

@@ -10,8 +10,9 @@ from pathlib import Path
 import pytest
 
 from pipeline import worker_processes
+from pipeline.errors import UserError
 from pipeline.stopping import Stopped, stops_noticed
-from pipeline.worker_processes import close_environments
+from pipeline.worker_processes import close_environments, deaths_told
 
 SCRIPT = """
 import multiprocessing, os, signal, time
@@ -86,3 +87,32 @@ def test_environments_that_do_not_close_hold_nobody_up(monkeypatch):
         with pytest.raises(Stopped):
             stop.raise_if_asked()
     assert time.monotonic() - started < 10
+
+
+class Pipes:
+    """Stands for a SubprocVecEnv, one of whose processes has been killed."""
+
+    def __init__(self, *exit_codes):
+        self.unwrapped = self
+        self.processes = [Ended(code) for code in exit_codes]
+
+
+class Ended:
+    def __init__(self, exitcode):
+        self.exitcode = exitcode
+
+    def join(self, seconds):
+        assert seconds <= 1
+
+
+@pytest.mark.parametrize(("code", "how"), [(-9, "SIGKILL"), (1, "exit code 1"), (0, "exit code 0")])
+@pytest.mark.parametrize("error", [EOFError, BrokenPipeError, ConnectionResetError])
+def test_a_process_that_has_ended_is_named(error, code, how):
+    said = f"environment 1 has ended: {how}$"
+    with pytest.raises(UserError, match=said), deaths_told(Pipes(None, code)):
+        raise error
+
+
+def test_where_none_has_ended_the_error_stays():
+    with pytest.raises(EOFError), deaths_told(Pipes(None, None)):
+        raise EOFError
