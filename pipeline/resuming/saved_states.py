@@ -47,10 +47,12 @@ def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, An
 
     Raises:
         OSError: if it cannot be written; the last one is there still.
+        UserError: if there is no key to write it under.
     """
+    key = state_key()
     folder.mkdir(exist_ok=True)
     with replacing(state_file(folder, number)) as draft:
-        write_snapshot(draft, snapshot, {**note, "number": number}, user_key(APPLICATION))
+        write_snapshot(draft, snapshot, {**note, "number": number}, key)
     sync_folders(folder)
 
 

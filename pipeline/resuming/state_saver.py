@@ -21,9 +21,11 @@ from pipeline.resuming.log_positions import log_positions
 from pipeline.resuming.saved_states import SavedState, save_state
 from pipeline.resuming.state_folder import settings_digest
 from pipeline.resuming.state_keeping import SaveInterval
+from pipeline.resuming.user_state import put_back, user_state
 from pipeline.run_folder import Run
 from pipeline.safe_moments import StopAtSafeMoment
 from pipeline.stopping import current
+from pipeline.user_modules import UserModule
 from snapshots.filling import NotRestorableError
 from snapshots.kinds import NotRecordableError
 from snapshots.recording import record
@@ -38,7 +40,8 @@ class StateSaver(StopAtSafeMoment):
     """Saves all that a training consists of, between two updates; the first of the callbacks.
 
     The state is that of the agent with its environments, of all other callbacks with the
-    environments that they evaluate on, and of the generators that libraries share.
+    environments that they evaluate on, of the user's modules, and of the generators that libraries
+    share.
 
     Args:
         run: whose folder the states go to.
@@ -58,6 +61,8 @@ class StateSaver(StopAtSafeMoment):
         super().__init__()
         self.run = run
         self.root: BaseCallback = self
+        self.modules: tuple[UserModule, ...] = ()
+        self.told: set[str] = set()
         self.interval = interval
         self.tell = tell
         self.state = state
@@ -127,11 +132,17 @@ class StateSaver(StopAtSafeMoment):
         except UserError as error:
             self._give_up(f"no state can be kept: {error}")
         except OSError as error:
-            self.tell(f"no state was saved: {self.run.state_path}: {error.strerror}")
+            self._tell_once(f"no state was saved: {self.run.state_path}: {error.strerror or error}")
         self.saved_at = time.monotonic()
         self.steps_at_save = self.model.num_timesteps
         if self.interval.seconds == 0:
             self.pause = max((self.saved_at - begun) / SHARE_OF_TIME, SHORTEST_INTERVAL)
+
+    def _tell_once(self, line: str) -> None:
+        """Say a line that would be the same at each state, as long as a disk is full."""
+        if line not in self.told:
+            self.told.add(line)
+            self.tell(line)
 
     def _give_up(self, reason: str) -> None:
         self.is_off = True
@@ -162,6 +173,7 @@ class StateSaver(StopAtSafeMoment):
             "callbacks": self.root,
             "pending": pending,
             "generators": generator_states(),
+            "modules": user_state(self.modules),
         }
 
     def _go_back_to(self, state: SavedState) -> None:
@@ -173,6 +185,7 @@ class StateSaver(StopAtSafeMoment):
             raise UserError(
                 f"{self.run.state_path} does not fit what its settings make today: {error}"
             ) from error
+        put_back(self.modules, roots["modules"])
         set_generators(roots["generators"])
         self.steps_at_save = self.model.num_timesteps
         self.saved_at = time.monotonic()
