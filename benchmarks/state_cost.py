@@ -36,11 +36,11 @@ def main() -> None:
     saved: list[tuple[float, int]] = []
     save = StateSaver.save
 
-    def timed(saver: StateSaver) -> None:
+    def timed(self: StateSaver) -> None:
         begun = time.perf_counter()
-        save(saver)
+        save(self)
         seconds = time.perf_counter() - begun
-        files = saver.run.state_path.glob("*.state")
+        files = self.run.state_path.glob("*.state")
         saved.append((seconds, max((path.stat().st_size for path in files), default=0)))
 
     StateSaver.save = timed  # type: ignore[method-assign]

@@ -122,7 +122,7 @@ def _array(file: BufferedReader, entry: dict[str, Any]) -> NDArray[Any]:
     dtype = np.lib.format.descr_to_dtype(_as_descr(entry["dtype"]))
     held = np.zeros(entry["shape"], dtype)
     flat = held.reshape(-1).view(np.uint8)
-    file.readinto(flat[: entry["bytes"]])  # of a replay buffer, a second copy may be too much
+    file.readinto(flat[: entry["bytes"]].data)  # of a replay buffer, a second copy may be too much
     return held
 
 
