@@ -57,6 +57,8 @@ OUTCOME = (
     FIELD,
     VERSION_FIELD,
 )
+# The field of ``run.json`` with the folder of TensorBoard's log, where there is one.
+TENSORBOARD = "tensorboard"
 # The field of ``run.json`` that says, while a run is running, which process is at work on it.
 PROCESS = "process"
 # Kept by a run that is under way: where nothing else fits on the disk, its last word does.

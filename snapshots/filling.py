@@ -52,19 +52,19 @@ def fill_torch_generator(held: NDArray[np.uint8], existing: Any) -> th.Generator
     return result
 
 
-def fill_generator(
+def fill_bit_generator(
     name: str, seeds: dict[str, Any] | None, state: Any, existing: Any
-) -> np.random.Generator:
-    """NumPy's generator in that state; another one where it was seeded otherwise.
+) -> np.random.BitGenerator:
+    """A source of bits in that state; another one where it was seeded otherwise.
 
     Raises:
-        NotRestorableError: if there is no bit generator of that name.
+        NotRestorableError: if there is none of that name.
     """
-    if isinstance(existing, np.random.Generator) and seeds == _seeds_of(existing):
-        result = existing
+    if type(existing).__name__ == name and seeds == _seeds_of(existing):
+        result: np.random.BitGenerator = existing
     else:
-        result = _new_generator(name, seeds)
-    result.bit_generator.state = state
+        result = _new_bit_generator(name, seeds)
+    result.state = state
     return result
 
 
@@ -83,15 +83,16 @@ def fill_random(state: Any, existing: Any) -> random.Random:
     return result
 
 
-def _seeds_of(generator: np.random.Generator) -> Any:
-    seeds = generator.bit_generator.seed_seq
+def _seeds_of(source: np.random.BitGenerator) -> Any:
+    seeds = source.seed_seq
     return seeds.state if isinstance(seeds, np.random.SeedSequence) else None
 
 
-def _new_generator(name: str, seeds: dict[str, Any] | None) -> np.random.Generator:
+def _new_bit_generator(name: str, seeds: dict[str, Any] | None) -> np.random.BitGenerator:
     if name not in _BIT_GENERATORS:
         raise NotRestorableError(f"there is no bit generator {name}")
-    source = getattr(np.random, name)
-    return np.random.Generator(
-        source() if seeds is None else source(np.random.SeedSequence(**seeds))
+    make = getattr(np.random, name)
+    found: np.random.BitGenerator = (
+        make() if seeds is None else make(np.random.SeedSequence(**seeds))
     )
+    return found

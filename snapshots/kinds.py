@@ -41,11 +41,12 @@ _CONSTANT_TYPES = (
     classmethod,
     pathlib.PurePath,
     re.Pattern,
-    io.IOBase,
     logging.Logger,
     threading.Thread,
     threading.Event,
     weakref.ref,
+    types.EllipsisType,
+    types.NotImplementedType,
     np.dtype,
     np.ufunc,
     th.dtype,
@@ -54,7 +55,19 @@ _CONSTANT_TYPES = (
     *_LOCKS,
 )
 # Compiled functions, windows and their clocks, writers of rows: made anew when they are needed.
-_CONSTANT_MODULES = ("numba", "llvmlite", "pygame", "_csv", "moviepy", "tensorboard", "rich")
+_CONSTANT_MODULES = (
+    "numba",
+    "llvmlite",
+    "pygame",
+    "_csv",
+    "moviepy",
+    "tensorboard",
+    "rich",
+    "typing",
+)
+# Among these is what holds data: it cannot be copied, and must not be taken for code.
+_HOLDING_MODULES = ("numba.typed", "numba.experimental")
+_GAME_DATA = ("Rect", "FRect", "Vector2", "Vector3", "Color", "Mask", "PixelArray", "BufferProxy")
 
 # What a network said last: made anew before it is looked at again.
 TRANSIENT_TYPES = (th.distributions.Distribution,)
@@ -83,7 +96,13 @@ def is_constant(value: Any, more: tuple[type, ...] = ()) -> bool:
         more: further types of which that is so.
     """
     kind = type(value)
+    if kind.__module__.startswith(_HOLDING_MODULES):
+        return False
+    if isinstance(value, io.IOBase):
+        return value.closed or value in (sys.stdin, sys.__stdin__) or not value.readable()
     top = kind.__module__.partition(".")[0]
+    if top == "pygame" and (kind.__name__ in _GAME_DATA or not hides_state(kind)):
+        return False
     return isinstance(value, (*_CONSTANT_TYPES, *more)) or top in _CONSTANT_MODULES
 
 

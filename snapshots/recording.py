@@ -7,17 +7,18 @@ import enum
 import functools
 import math
 import random
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from types import BuiltinFunctionType, FunctionType
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
+from snapshots.functions import code_of, is_callable_of_ours
 from snapshots.kinds import (
     NotRecordableError,
     hides_state,
@@ -27,6 +28,8 @@ from snapshots.kinds import (
     name_of,
     slots,
 )
+from snapshots.leaves import LeafRecorder
+from snapshots.shared_memory import bases, place_in
 
 # Stands for an object that has a number: `["@", 3]`. Plain scalars stand for themselves.
 REFERENCE = "@"
@@ -35,6 +38,9 @@ NUMBER = "#"  # a float that JSON has no word for: `["#", "nan"]`
 _SCALARS = (type(None), bool, int, str)
 
 LONG_LIST = 1000
+# Whose subclasses may have attributes, or methods of their own.
+DERIVED = (list, dict, set, frozenset, deque, tuple, np.ndarray, random.Random)
+
 _LARGEST = 2**62  # of the numbers of long lists, which have to fit 64 bits
 
 
@@ -70,12 +76,13 @@ def record(roots: dict[str, Any], constants: tuple[type, ...] = ()) -> Snapshot:
         for name, value in roots.items():
             with recorder.at(name):
                 recorder.snapshot.roots[name] = recorder.cell(value)
+        recorder.tell_views()
     except RecursionError:
         raise NotRecordableError(recorder.place, "objects lie too deep inside each other") from None
     return recorder.snapshot
 
 
-class _Recorder:
+class _Recorder(LeafRecorder):
     def __init__(self, constants: tuple[type, ...]) -> None:
         self.snapshot = Snapshot()
         self._constants = constants
@@ -83,6 +90,7 @@ class _Recorder:
         # An object that goes would leave its id to another.
         self._alive: list[Any] = []
         self._path: list[str] = []
+        self._views: dict[int, NDArray[Any]] = {}
 
     @property
     def place(self) -> str:
@@ -114,17 +122,21 @@ class _Recorder:
         for types, describe in _DESCRIPTIONS:
             if isinstance(value, types):
                 described: dict[str, Any] = describe(self, value)
-                return described
+                return described | self._added(value)
+        if is_callable_of_ours(value):
+            return self._function(value)
         if is_constant(value, self._constants):
             is_found_by_name = isinstance(value, type | FunctionType | BuiltinFunctionType)
             return {"kind": "constant", "class": name_of(value) if is_found_by_name else ""}
         return self._object(value)
 
-    def _array(self, values: NDArray[Any]) -> int:
+    def keep(self, values: NDArray[Any]) -> int:
+        """The number of an array that the snapshot is to keep."""
         self.snapshot.arrays.append(values)
         return len(self.snapshot.arrays) - 1
 
-    def _cells(self, values: Iterable[Any]) -> list[Any]:
+    def cells(self, values: Iterable[Any]) -> list[Any]:
+        """What stands for each of some values."""
         cells = []
         for i, value in enumerate(values):
             with self.at(f"[{i}]"):
@@ -154,98 +166,79 @@ class _Recorder:
         ]
         return {"kind": "object", "class": name_of(kind), "attributes": self._named(kept)}
 
+    def _added(self, value: Any) -> dict[str, Any]:
+        """What a class that is derived from a plain one adds to it: its name and attributes."""
+        kind = type(value)
+        if kind.__module__ in ("builtins", "collections") or not isinstance(value, DERIVED):
+            return {}
+        names = [name for name in slots(kind) if hasattr(value, name)]
+        attributes = {name: getattr(value, name) for name in names}
+        attributes.update(getattr(value, "__dict__", {}))
+        is_plain = isinstance(value, np.memmap) or not isinstance(value, list | dict | set | deque)
+        if is_plain and (not attributes or isinstance(value, np.memmap)):
+            return {}
+        return {"class": name_of(kind), "attributes": self._named(attributes.items())}
+
+    def _function(self, value: FunctionType | MethodType) -> dict[str, Any]:
+        """A function with what it has closed over, or a method with its object."""
+        if isinstance(value, MethodType):
+            with self.at(".__self__"):
+                held = [self.cell(value.__self__)]
+            return {"kind": "method", "name": value.__func__.__name__, "items": held}
+        with self.at("()"):
+            cells = [cell.cell_contents for cell in value.__closure__ or ()]
+            held = self.cells(cells)
+        return {"kind": "function", "class": name_of(value), "code": code_of(value), "items": held}
+
+    def tell_views(self) -> None:
+        """Say of the arrays that lie in the memory of another where they do."""
+        for number, value in list(self._views.items()):
+            for base in bases(value):
+                found = self._numbers.get(id(base))
+                if found is not None and found != number:
+                    node = self.snapshot.nodes[number]
+                    # For its type alone: the base holds the rest.
+                    self.snapshot.arrays[node["array"]] = np.empty(0, value.dtype)
+                    node |= {"kind": "view", "base": [REFERENCE, found], **place_in(base, value)}
+                    break
+
     def _dict(self, value: dict[Any, Any]) -> dict[str, Any]:
         items = []
         for key, held in value.items():
             with self.at(f"[{key!r}]" if isinstance(key, str | int) else "[...]"):
                 items.append([self.cell(key), self.cell(held)])
-        return {"kind": "dict", "class": name_of(type(value)), "items": items}
+        node = {"kind": "dict", "class": name_of(type(value)), "items": items}
+        if isinstance(value, defaultdict):
+            node["factory"] = self.cell(value.default_factory)
+        return node
 
     def _list(self, value: list[Any]) -> dict[str, Any]:
-        if len(value) >= LONG_LIST:
+        if type(value) is list and len(value) >= LONG_LIST:
             # Years of rewards, say: as text they would take as long as all else together.
             for kind in (float, int):
                 if all(type(item) is kind and abs(item) < _LARGEST for item in value):
-                    return {"kind": "numbers", "array": self._array(np.array(value, kind))}
-        return {"kind": "list", "items": self._cells(value)}
+                    return {"kind": "numbers", "array": self.keep(np.array(value, kind))}
+        return {"kind": "list", "items": self.cells(value)}
 
     def _tuple(self, value: tuple[Any, ...]) -> dict[str, Any]:
-        return {"kind": "tuple", "class": name_of(type(value)), "items": self._cells(value)}
+        return {"kind": "tuple", "class": name_of(type(value)), "items": self.cells(value)}
 
     def _set(self, value: set[Any] | frozenset[Any]) -> dict[str, Any]:
-        return {"kind": type(value).__name__, "items": self._cells(value)}
+        kind = "set" if isinstance(value, set) else "frozenset"
+        return {"kind": kind, "items": self.cells(value)}
 
     def _deque(self, value: deque[Any]) -> dict[str, Any]:
-        return {"kind": "deque", "longest": value.maxlen, "items": self._cells(value)}
-
-    def _bytes(self, value: bytes | bytearray) -> dict[str, Any]:
-        return {"kind": type(value).__name__, "array": self._array(_as_array(value))}
-
-    def _plain_array(self, value: array.array[Any]) -> dict[str, Any]:
-        held = _as_array(value.tobytes())
-        return {"kind": "array.array", "type": value.typecode, "array": self._array(held)}
+        return {"kind": "deque", "longest": value.maxlen, "items": self.cells(value)}
 
     def _ndarray(self, value: NDArray[Any]) -> dict[str, Any]:
         if value.dtype == object:
-            return {"kind": "objects", "shape": value.shape, "items": self._cells(value.flat)}
+            return {"kind": "objects", "shape": value.shape, "items": self.cells(value.flat)}
         if value.dtype.hasobject:
             raise NotRecordableError(self.place, "records of objects cannot be copied")
-        return {"kind": "ndarray", "array": self._array(value)}
-
-    def _number(self, value: np.generic) -> dict[str, Any]:
-        return {"kind": "number", "array": self._array(np.asarray(value))}
-
-    def _complex(self, value: complex) -> dict[str, Any]:
-        return {"kind": "complex", "items": self._cells([value.real, value.imag])}
-
-    def _range(self, value: range) -> dict[str, Any]:
-        return {"kind": "range", "items": [value.start, value.stop, value.step]}
-
-    def _partial(self, value: functools.partial[Any]) -> dict[str, Any]:
-        return {"kind": "partial", "items": self._cells([value.func, value.args, value.keywords])}
-
-    def _enum(self, value: enum.Enum) -> dict[str, Any]:
-        return {"kind": "enum", "class": name_of(type(value)), "name": value.name}
-
-    def _tensor(self, value: th.Tensor) -> dict[str, Any]:
-        if value.is_sparse or value.is_quantized:
-            raise NotRecordableError(self.place, "only dense tensors can be copied")
-        plain = value.detach().cpu().contiguous()
-        # NumPy has no bfloat16 and its like: their bytes are kept.
-        held = plain.reshape(-1).view(th.uint8).numpy() if plain.numel() else np.zeros(0, np.uint8)
-        return {
-            "kind": "tensor",
-            "type": str(plain.dtype).removeprefix("torch."),
-            "shape": list(plain.shape),
-            "array": self._array(held),
-            "is_trained": bool(value.requires_grad and value.is_leaf),
-        }
-
-    def _optimizer(self, value: th.optim.Optimizer) -> dict[str, Any]:
-        return {"kind": "optimizer", "state": self.cell(value.state_dict())}
-
-    def _torch_generator(self, value: th.Generator) -> dict[str, Any]:
-        return {"kind": "torch generator", "array": self._array(value.get_state().numpy())}
-
-    def _generator(self, value: np.random.Generator) -> dict[str, Any]:
-        source = value.bit_generator
-        seeds = source.seed_seq
-        return {
-            "kind": "generator",
-            "class": type(source).__name__,
-            "state": self.cell(source.state),
-            "seeds": self.cell(seeds.state if isinstance(seeds, np.random.SeedSequence) else None),
-        }
-
-    def _random_state(self, value: np.random.RandomState) -> dict[str, Any]:
-        return {"kind": "RandomState", "state": self.cell(value.get_state(legacy=False))}
-
-    def _random(self, value: random.Random) -> dict[str, Any]:
-        return {"kind": "Random", "state": self.cell(value.getstate())}
-
-
-def _as_array(content: bytes | bytearray) -> NDArray[np.uint8]:
-    return np.frombuffer(content, np.uint8) if content else np.zeros(0, np.uint8)
+        if type(value) is np.ndarray and isinstance(value.base, np.ndarray):
+            self._views[self._numbers[id(value)]] = value
+        is_owner = not isinstance(value.base, np.ndarray)
+        return {"kind": "ndarray", "array": self.keep(value), "is_owner": is_owner}
 
 
 # The first that fits counts.
@@ -257,6 +250,7 @@ _DESCRIPTIONS: tuple[tuple[Any, Any], ...] = (
     (th.optim.Optimizer, _Recorder._optimizer),
     (th.Generator, _Recorder._torch_generator),
     (np.random.Generator, _Recorder._generator),
+    (np.random.BitGenerator, _Recorder._bit_generator),
     (np.random.RandomState, _Recorder._random_state),
     (random.Random, _Recorder._random),
     (dict, _Recorder._dict),

@@ -2,31 +2,24 @@
 
 from __future__ import annotations
 
-import array
-import functools
 import os
-from collections import OrderedDict, defaultdict, deque
+from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
-import torch as th
 from numpy.typing import NDArray
 
+from snapshots.derived_types import as_derived, empty_of
 from snapshots.filling import (
     NotRestorableError,
     fill_array,
-    fill_generator,
-    fill_random,
-    fill_random_state,
-    fill_tensor,
-    fill_torch_generator,
 )
+from snapshots.functions import fill_function, fill_method
 from snapshots.kinds import find, hides_state, is_transient, left_out, name_of, slots
+from snapshots.leaf_filling import MISSING, LeafFiller
 from snapshots.recording import REFERENCE, Snapshot
-
-# Of a snapshot that fits, every value was there when it was taken.
-_MISSING: Any = object()
+from snapshots.shared_memory import is_view, view_at
 
 
 def restore(
@@ -48,7 +41,7 @@ def restore(
             raise NotRestorableError(f"{name} is not what was recorded")
 
 
-class _Restorer:
+class _Restorer(LeafFiller):
     def __init__(self, snapshot: Snapshot, moved: Mapping[str, str]) -> None:
         self._snapshot = snapshot
         self._moved = moved
@@ -57,7 +50,7 @@ class _Restorer:
         # By id, which stays theirs as long as they are held here.
         self._claimed: dict[int, Any] = {}
 
-    def value(self, cell: Any, existing: Any = _MISSING) -> Any:
+    def value(self, cell: Any, existing: Any = MISSING) -> Any:
         """The value that a cell stands for; ``existing`` itself where it can be filled."""
         if isinstance(cell, str):
             return self._text(cell)
@@ -71,9 +64,20 @@ class _Restorer:
             # What were two objects must not become one.
             is_taken = id(existing) in self._claimed and node["kind"] != "constant"
             self._claimed[id(existing)] = existing
-            filled = _FILLERS[node["kind"]](self, content, node, _MISSING if is_taken else existing)
-            self._done[content] = filled
+            self._done[content] = self._filled(content, node, MISSING if is_taken else existing)
         return self._done[content]
+
+    def _filled(self, number: int, node: dict[str, Any], existing: Any) -> Any:
+        fill = _FILLERS[node["kind"]]
+        if node["kind"] == "object" or "attributes" not in node:
+            return fill(self, number, node, existing)
+        kind = self.class_of(node, existing)
+        if type(existing) is not kind:
+            existing = empty_of(kind, node)
+        filled = as_derived(fill(self, number, node, existing), kind)
+        self._done[number] = filled
+        self._fill_attributes(node, filled)
+        return filled
 
     def _text(self, text: str) -> str:
         for before, now in self._moved.items():
@@ -81,25 +85,25 @@ class _Restorer:
                 return now + text[len(before) :]
         return text
 
-    def _missing(self, what: str) -> NotRestorableError:
+    def missing(self, what: str) -> NotRestorableError:
         return NotRestorableError(f"{what} is missing in {'.'.join(self._path) or 'it'}")
 
-    def _values(self, cells: list[Any], existing: Any = ()) -> list[Any]:
+    def values(self, cells: list[Any], existing: Any = ()) -> list[Any]:
         found = list(existing)
-        known = found + [_MISSING] * (len(cells) - len(found))
+        known = found + [MISSING] * (len(cells) - len(found))
         return [self.value(cell, old) for cell, old in zip(cells, known, strict=False)]
 
-    def _held(self, node: dict[str, Any]) -> NDArray[Any]:
+    def held(self, node: dict[str, Any]) -> NDArray[Any]:
         array: NDArray[Any] = self._snapshot.arrays[node["array"]]
         return array
 
-    def _class(self, node: dict[str, Any], existing: Any) -> Any:
+    def class_of(self, node: dict[str, Any], existing: Any) -> Any:
         """The class that a node names: that of what is there, or one that is imported already."""
         if name_of(type(existing)) == node["class"]:
             return type(existing)
         found = find(node["class"])
         if not isinstance(found, type):
-            raise self._missing(f"the class {node['class']}")
+            raise self.missing(f"the class {node['class']}")
         return found
 
     def _constant(self, number: int, node: dict[str, Any], existing: Any) -> Any:
@@ -107,17 +111,22 @@ class _Restorer:
             found = find(node["class"])
             if found is not None:
                 return found
-        if existing is _MISSING:
-            raise self._missing(node["class"] or "a part")
+        if existing is MISSING:
+            raise self.missing(node["class"] or "a part")
         return existing
 
     def _object(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        kind = self._class(node, existing)
+        kind = self.class_of(node, existing)
         if type(existing) is not kind:
             if hides_state(kind):
-                raise self._missing(node["class"])
+                raise self.missing(node["class"])
             existing = object.__new__(kind)
         self._done[number] = existing
+        self._fill_attributes(node, existing)
+        return existing
+
+    def _fill_attributes(self, node: dict[str, Any], existing: Any) -> None:
+        kind = type(existing)
         skipped = left_out(kind)
         attributes = dict(node["attributes"])
         inside, in_slots = getattr(existing, "__dict__", {}), set(slots(kind))
@@ -127,56 +136,60 @@ class _Restorer:
         for name, cell in attributes.items():
             self._path.append(name)
             if name in in_slots:
-                new = self.value(cell, getattr(existing, name, _MISSING))
+                new = self.value(cell, getattr(existing, name, MISSING))
                 object.__setattr__(existing, name, new)
             else:
-                inside[name] = self.value(cell, inside.get(name, _MISSING))
+                inside[name] = self.value(cell, inside.get(name, MISSING))
             self._path.pop()
-        return existing
 
     def _dict(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        kind = self._class(node, existing)
+        kind = self.class_of(node, existing)
         if type(existing) is not kind:
-            if kind not in (dict, OrderedDict, defaultdict):
-                raise self._missing(node["class"])
+            if kind not in (dict, OrderedDict, defaultdict, Counter):
+                raise self.missing(node["class"])
             existing = kind()
         self._done[number] = existing
+        if "factory" in node:
+            existing.default_factory = self.value(node["factory"], existing.default_factory)
         before = dict(existing)
-        keys = [*before, *[_MISSING] * len(node["items"])]
+        keys = [*before, *[MISSING] * len(node["items"])]
         existing.clear()
         for (key_cell, cell), old_key in zip(node["items"], keys, strict=False):
             key = self.value(key_cell, old_key)
-            existing[key] = self.value(cell, before.get(key, _MISSING))
+            existing[key] = self.value(cell, before.get(key, MISSING))
         return existing
 
     def _list(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         result = existing if isinstance(existing, list) else []
         self._done[number] = result
         before = list(result)
-        result[:] = self._values(node["items"], before)
+        result[:] = self.values(node["items"], before)
         return result
 
     def _numbers(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         result = existing if isinstance(existing, list) else []
-        result[:] = self._held(node).tolist()
+        result[:] = self.held(node).tolist()
         return result
 
     def _tuple(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        kind = self._class(node, existing)
+        kind = self.class_of(node, existing)
         before = existing if isinstance(existing, tuple) else ()
-        values = self._values(node["items"], before)
+        values = self.values(node["items"], before)
         is_same = type(existing) is kind and len(before) == len(values)
         if is_same and all(new is old for new, old in zip(values, before, strict=True)):
             return existing
-        if hasattr(kind, "_fields"):
-            return tuple.__new__(kind, values)
-        return kind(values)
+        if not issubclass(kind, tuple):
+            raise self.missing(node["class"])
+        return tuple.__new__(kind, values)
 
     def _set(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        values = self._values(node["items"])
+        values = self.values(node["items"])
         if node["kind"] == "frozenset":
-            return frozenset(values)
+            is_same = isinstance(existing, frozenset) and list(existing) == values
+            return existing if is_same else frozenset(values)
         result = existing if isinstance(existing, set) else set()
+        if list(result) == values:  # it keeps its order, whatever that came of
+            return result
         result.clear()
         result.update(values)
         return result
@@ -187,21 +200,34 @@ class _Restorer:
         self._done[number] = result
         before = list(result)
         result.clear()
-        result.extend(self._values(node["items"], before))
-        return result
-
-    def _bytes(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        content = self._held(node).tobytes()
-        return content if node["kind"] == "bytes" else bytearray(content)
-
-    def _plain_array(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        result = existing if isinstance(existing, array.array) else array.array(node["type"])
-        del result[:]
-        result.frombytes(self._held(node).tobytes())
+        result.extend(self.values(node["items"], before))
         return result
 
     def _ndarray(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return fill_array(self._held(node), existing)
+        # What has a memory of its own must not write into what another looks at.
+        is_others = node["is_owner"] and is_view(existing)
+        return fill_array(self.held(node), MISSING if is_others else existing)
+
+    def _view(self, number: int, node: dict[str, Any], existing: Any) -> Any:
+        base = self.value(node["base"], existing.base if is_view(existing) else MISSING)
+        return view_at(base, self.held(node).dtype, node, existing)
+
+    def _function(self, number: int, node: dict[str, Any], existing: Any) -> Any:
+        try:
+            function = fill_function(node, existing)
+        except LookupError as error:
+            raise self.missing(str(error)) from error
+        self._done[number] = function
+        for cell, held in zip(function.__closure__ or (), node["items"], strict=True):
+            before = cell.cell_contents
+            after = self.value(held, before)
+            if after is not before:
+                cell.cell_contents = after
+        return function
+
+    def _method(self, number: int, node: dict[str, Any], existing: Any) -> Any:
+        owner = self.value(node["items"][0], getattr(existing, "__self__", MISSING))
+        return fill_method(node["name"], owner, existing)
 
     def _objects(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         shape = tuple(node["shape"])
@@ -209,54 +235,11 @@ class _Restorer:
         result = existing if is_same and existing.shape == shape else np.empty(shape, object)
         self._done[number] = result
         flat = result.reshape(-1)
-        for i, value in enumerate(self._values(node["items"], list(flat))):
+        for i, value in enumerate(self.values(node["items"], list(flat))):
             flat[i] = value
         if result.size and flat.base is not result:
             result[...] = flat.reshape(shape)
         return result
-
-    def _number(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return self._held(node)[()]
-
-    def _complex(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return complex(*self._values(node["items"]))
-
-    def _range(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return range(*node["items"])
-
-    def _partial(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        is_same = isinstance(existing, functools.partial)
-        before = [existing.func, existing.args, existing.keywords] if is_same else []
-        function, arguments, keywords = self._values(node["items"], before)
-        return functools.partial(function, *arguments, **keywords)
-
-    def _enum(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return self._class(node, existing)[node["name"]]
-
-    def _tensor(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return fill_tensor(
-            self._held(node), node["type"], node["shape"], node["is_trained"], existing
-        )
-
-    def _optimizer(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        if not isinstance(existing, th.optim.Optimizer):
-            raise self._missing("an optimizer")
-        existing.load_state_dict(self.value(node["state"]))
-        return existing
-
-    def _torch_generator(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return fill_torch_generator(self._held(node), existing)
-
-    def _generator(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return fill_generator(
-            node["class"], self.value(node["seeds"]), self.value(node["state"]), existing
-        )
-
-    def _random_state(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return fill_random_state(self.value(node["state"]), existing)
-
-    def _random(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return fill_random(self.value(node["state"]), existing)
 
 
 _Filler = Callable[[_Restorer, int, dict[str, Any], Any], Any]
@@ -284,7 +267,11 @@ _FILLERS: dict[str, _Filler] = {
     "tensor": _Restorer._tensor,
     "optimizer": _Restorer._optimizer,
     "torch generator": _Restorer._torch_generator,
+    "view": _Restorer._view,
+    "function": _Restorer._function,
+    "method": _Restorer._method,
     "generator": _Restorer._generator,
+    "bit generator": _Restorer._bit_generator,
     "RandomState": _Restorer._random_state,
     "Random": _Restorer._random,
 }

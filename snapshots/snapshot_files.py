@@ -18,15 +18,16 @@ import hashlib
 import hmac
 import json
 import os
+from io import BufferedReader
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from snapshots.recording import Snapshot
 
-MAGIC = b"snapshot 1\n".ljust(16, b"\0")
+MAGIC = b"snapshot 2\n".ljust(16, b"\0")
 LONGEST_TREE = 1 << 30  # bytes
 _PIECE = 1 << 20  # bytes
 _CODE_AT = len(MAGIC)
@@ -98,7 +99,7 @@ def read_snapshot(path: Path, key: bytes) -> tuple[Snapshot, dict[str, Any]]:
     return Snapshot(tree["roots"], tree["nodes"], arrays), tree["note"]
 
 
-def _code_of(file: BinaryIO, key: bytes) -> bytes:
+def _code_of(file: BufferedReader, key: bytes) -> bytes:
     code = hmac.new(key, digestmod="sha256")
     while piece := file.read(_PIECE):
         code.update(piece)
@@ -117,11 +118,11 @@ def _content(array: NDArray[Any]) -> NDArray[np.uint8]:
     return flat[:0]
 
 
-def _array(file: BinaryIO, entry: dict[str, Any]) -> NDArray[Any]:
+def _array(file: BufferedReader, entry: dict[str, Any]) -> NDArray[Any]:
     dtype = np.lib.format.descr_to_dtype(_as_descr(entry["dtype"]))
     held = np.zeros(entry["shape"], dtype)
     flat = held.reshape(-1).view(np.uint8)
-    flat[: entry["bytes"]] = np.frombuffer(file.read(entry["bytes"]), np.uint8)
+    file.readinto(flat[: entry["bytes"]].data)  # of a replay buffer, a second copy may be too much
     return held
 
 

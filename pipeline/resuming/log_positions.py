@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -46,9 +47,11 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, i
 
 
 def remove_events(log_folder: str) -> None:
-    """Remove TensorBoard's files of a run that begins anew."""
+    """Remove TensorBoard's files of a run that begins anew, and their folder if it is empty."""
     for path in _event_files(log_folder):
         path.unlink()
+    with contextlib.suppress(OSError):
+        Path(log_folder).rmdir()
 
 
 def _monitor_files(run_folder: Path) -> list[Path]:

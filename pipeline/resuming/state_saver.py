@@ -21,9 +21,11 @@ from pipeline.resuming.log_positions import log_positions
 from pipeline.resuming.saved_states import SavedState, save_state
 from pipeline.resuming.state_folder import settings_digest
 from pipeline.resuming.state_keeping import SaveInterval
-from pipeline.run_folder import Run
+from pipeline.resuming.user_state import put_back, user_state
+from pipeline.run_folder import TENSORBOARD, Run
 from pipeline.safe_moments import StopAtSafeMoment
 from pipeline.stopping import current
+from pipeline.user_modules import UserModule
 from snapshots.filling import NotRestorableError
 from snapshots.kinds import NotRecordableError
 from snapshots.recording import record
@@ -38,7 +40,8 @@ class StateSaver(StopAtSafeMoment):
     """Saves all that a training consists of, between two updates; the first of the callbacks.
 
     The state is that of the agent with its environments, of all other callbacks with the
-    environments that they evaluate on, and of the generators that libraries share.
+    environments that they evaluate on, of the user's modules, and of the generators that libraries
+    share.
 
     Args:
         run: whose folder the states go to.
@@ -58,6 +61,8 @@ class StateSaver(StopAtSafeMoment):
         super().__init__()
         self.run = run
         self.root: BaseCallback = self
+        self.modules: tuple[UserModule, ...] = ()
+        self.told: set[str] = set()
         self.interval = interval
         self.tell = tell
         self.state = state
@@ -67,7 +72,6 @@ class StateSaver(StopAtSafeMoment):
         self.n_rollouts = int(note.get("rollouts", 0))
         self.seconds_before = float(note.get("seconds", 0.0))
         self.steps_at_save = 0
-        self.has_said_why_not = False
         self.saved_at = self.started = time.monotonic()
         self.pause = interval.seconds or SHORTEST_INTERVAL
 
@@ -95,6 +99,8 @@ class StateSaver(StopAtSafeMoment):
             self.save()
 
     def _on_training_start(self) -> None:
+        if (folder := _log_folder(self.model)) is not None:
+            self.run.update_info(**{TENSORBOARD: folder})
         self.steps_at_save = self.model.num_timesteps
         self.saved_at = self.started = time.monotonic()
 
@@ -123,20 +129,23 @@ class StateSaver(StopAtSafeMoment):
         begun = time.monotonic()
         try:
             self._write()
-            self.has_said_why_not = False
         except NotRecordableError as error:
             self._give_up(f"no state can be kept: {one_line(error)}")
         except UserError as error:
             self._give_up(f"no state can be kept: {error}")
         except OSError as error:
-            if not self.has_said_why_not:
-                self.has_said_why_not = True
-                reason = error.strerror or one_line(error)
-                self.tell(f"no state was saved: {self.run.state_path}: {reason}")
+            reason = error.strerror or one_line(error)
+            self._tell_once(f"no state was saved: {self.run.state_path}: {reason}")
         self.saved_at = time.monotonic()
         self.steps_at_save = self.model.num_timesteps
         if self.interval.seconds == 0:
             self.pause = max((self.saved_at - begun) / SHARE_OF_TIME, SHORTEST_INTERVAL)
+
+    def _tell_once(self, line: str) -> None:
+        """Say a line that would be the same at each state, as long as a disk is full."""
+        if line not in self.told:
+            self.told.add(line)
+            self.tell(line)
 
     def _give_up(self, reason: str) -> None:
         self.is_off = True
@@ -167,6 +176,7 @@ class StateSaver(StopAtSafeMoment):
             "callbacks": self.root,
             "pending": pending,
             "generators": generator_states(),
+            "modules": user_state(self.modules),
         }
 
     def _go_back_to(self, state: SavedState) -> None:
@@ -179,6 +189,7 @@ class StateSaver(StopAtSafeMoment):
                 f"{self.run.state_path} does not fit what the run's settings make today: {error}; "
                 "remove it to begin the run anew"
             ) from error
+        put_back(self.modules, roots["modules"])
         set_generators(roots["generators"])
         self.steps_at_save = self.model.num_timesteps
         self.saved_at = time.monotonic()

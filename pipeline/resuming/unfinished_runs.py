@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.file_digests import LOCK, RECORD, DamagedFileError
+from pipeline.file_digests import DamagedFileError
 from pipeline.resuming.log_positions import cut_back, remove_events
 from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_files import environment_name
-from pipeline.run_folder import FINISHED, Run, numbered_runs
+from pipeline.run_folder import FINISHED, TENSORBOARD, Run, numbered_runs
 from pipeline.run_record import recorded_versions
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec, completed
@@ -119,7 +118,7 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
     _tell_versions(run, tell)
     state = newest_state(run.state_path, tell) if has_state(run.state_path) else None
     if state is None:
-        _empty(run)
+        _forget(run)
     else:
         if state.note["spec"] != settings_digest(run.recorded_spec()):
             raise UserError(f"{run.state_path} holds the state of a run of other settings")
@@ -151,16 +150,9 @@ def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
         tell(f"the run began with other versions, so that its result may differ: {what}")
 
 
-def _empty(run: Run) -> None:
-    """Remove what a run without a state has left, but for what it was asked for, and its lock."""
+def _forget(run: Run) -> None:
+    """Remove what a run without a state would not write over, beginning anew."""
     remove_states(run.state_path)
-    logged = run.read_info().get("tensorboard")
+    logged = run.read_info().get(TENSORBOARD)
     if isinstance(logged, str):
         remove_events(logged)
-    for path in run.path.iterdir():
-        if path.name in (RECORD, LOCK, run.env_name):
-            continue
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)

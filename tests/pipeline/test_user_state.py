@@ -1,0 +1,107 @@
+"""What the user's modules keep outside of objects, and what is said where nothing can be kept."""
+
+import sys
+
+import pytest
+
+from pipeline.resuming import saved_states
+from pipeline.resuming.state_keeping import SaveInterval
+from pipeline.resuming.state_saver import StateSaver
+from pipeline.resuming.user_state import put_back, user_state
+from pipeline.run_folder import Run
+from pipeline.user_modules import import_typed
+from snapshots.recording import Snapshot, record
+from snapshots.restoring import restore
+
+SOURCE = """
+import random
+from typing import TypeVar
+
+T = TypeVar("T")
+steps = 0
+seen = []
+rng = random.Random(1)
+
+class Thing:
+    made = 0
+    names = ["a"]
+
+    def step(self):
+        global steps
+        steps += 1
+        seen.append(rng.random())
+        Thing.made += 1
+        self.names.append("b")
+"""
+
+
+@pytest.fixture
+def things(tmp_path, monkeypatch):
+    path = tmp_path / "things_with_globals.py"
+    path.write_text(SOURCE)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    modules = import_typed([str(path)])
+    yield modules, sys.modules["things_with_globals"]
+    del sys.modules["things_with_globals"]
+
+
+def test_globals_and_attributes_of_classes_go_back(things):
+    modules, module = things
+    thing = module.Thing()
+    thing.step()
+    snapshot = record({"modules": user_state(modules)})
+    seen = list(module.seen)
+    thing.step()
+    after = list(module.seen)
+    state = user_state(modules)
+    restore(snapshot, {"modules": state})
+    put_back(modules, state)
+    assert (module.steps, module.Thing.made, module.Thing.names) == (1, 1, ["a", "b"])
+    assert module.seen == seen
+    thing.step()
+    assert module.seen == after
+    assert module.Thing is type(thing)
+
+
+def test_what_is_installed_is_left_alone():
+    assert user_state(import_typed(["json"])) == {}
+
+
+def saver_of(tmp_path, monkeypatch):
+    told = []
+    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), told.append)
+    saver.model = type("Model", (), {"num_timesteps": 0})()
+    return saver, told
+
+
+def test_a_disk_that_stays_full_is_told_once(tmp_path, monkeypatch):
+    saver, told = saver_of(tmp_path, monkeypatch)
+
+    def write(self):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(StateSaver, "_write", write)
+    for _ in range(3):
+        saver.save()
+    assert len(told) == 1
+    assert told[0].endswith("No space left on device")
+    assert not saver.is_off
+
+
+def test_a_user_without_a_home_keeps_no_states(tmp_path, monkeypatch):
+    saver, told = saver_of(tmp_path, monkeypatch)
+
+    def no_home(_):
+        raise FileNotFoundError("the user has no home folder")
+
+    monkeypatch.setattr(saved_states, "user_key", no_home)
+
+    def write(self):
+        saved_states.save_state(tmp_path / "state", 1, Snapshot(), {})
+
+    monkeypatch.setattr(StateSaver, "_write", write)
+    saver.save()
+    assert len(told) == 1
+    assert "the user has no home folder" in told[0]
+    assert saver.is_off
+    assert not (tmp_path / "state").exists()
