@@ -8,6 +8,8 @@ import sys
 from collections.abc import Iterator
 from typing import Any, TextIO
 
+from pipeline.foreign_exits import OwnExit
+
 
 class Output:
     """A standard stream, and what happens once it takes nothing more.
@@ -31,7 +33,7 @@ class Output:
         """Write, as far as it can be written.
 
         Raises:
-            SystemExit: if the reader has gone, as ``head`` does, and the work was for him alone.
+            OwnExit: if the reader has gone, as ``head`` does, and the work was for him alone.
             OSError: if it cannot be written otherwise, likewise.
         """
         self._attempt(self._stream.write, text)
@@ -50,7 +52,7 @@ class Output:
         if self.failure is None or self.goes_on:
             return
         if isinstance(self.failure, BrokenPipeError):
-            raise SystemExit(0)
+            raise OwnExit(0)
         raise self.failure
 
     def _give_up(self, error: OSError) -> None:

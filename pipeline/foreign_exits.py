@@ -12,6 +12,10 @@ from pipeline.errors import UserError
 from pipeline.stopping import Stopped, current
 
 
+class OwnExit(SystemExit):  # no more an error than the one it is derived from
+    """The end of a command by its own will."""
+
+
 class ForeignExitError(UserError):
     """SystemExit or KeyboardInterrupt from code of the user's, where nobody pressed Ctrl-C.
 
@@ -36,6 +40,8 @@ def exits_as_mistakes() -> Iterator[None]:
     """
     try:
         yield
+    except OwnExit:
+        raise
     except (SystemExit, KeyboardInterrupt) as error:
         if isinstance(error, KeyboardInterrupt) and _may_be_of_a_signal(error):
             raise
