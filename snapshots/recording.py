@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+import contextlib
 import enum
 import functools
 import math
@@ -40,8 +41,6 @@ _SCALARS = (type(None), bool, int, str)
 LONG_LIST = 1000
 # Whose subclasses may have attributes, or methods of their own.
 DERIVED = (list, dict, set, frozenset, deque, tuple, np.ndarray, random.Random)
-
-_LARGEST = 2**62  # of the numbers of long lists, which have to fit 64 bits
 
 
 @dataclass
@@ -215,9 +214,11 @@ class _Recorder(LeafRecorder):
     def _list(self, value: list[Any]) -> dict[str, Any]:
         if type(value) is list and len(value) >= LONG_LIST:
             # Years of rewards, say: as text they would take as long as all else together.
-            for kind in (float, int):
-                if all(type(item) is kind and abs(item) < _LARGEST for item in value):
-                    return {"kind": "numbers", "array": self.keep(np.array(value, kind))}
+            kinds = set(map(type, value))
+            if kinds in ({float}, {int}):
+                with contextlib.suppress(OverflowError):  # of whole numbers beyond 64 bits
+                    array = np.array(value, float if kinds == {float} else np.int64)
+                    return {"kind": "numbers", "array": self.keep(array)}
         return {"kind": "list", "items": self.cells(value)}
 
     def _tuple(self, value: tuple[Any, ...]) -> dict[str, Any]:

@@ -252,6 +252,14 @@ def test_any_data(tmp_path_factory, data):
     assert repr(other.held) == repr(data)
 
 
+@pytest.mark.parametrize("odd", [0.5, float("nan"), 3, 2**63, -(2**63), True, None, "a"])
+@pytest.mark.parametrize("usual", [0.25, 7])
+def test_long_lists(tmp_path, usual, odd):
+    numbers, other = [usual] * 1500 + [odd], Holder([])
+    restore(through_file(record({"it": Holder(numbers)}), tmp_path), {"it": other})
+    assert [(type(n), repr(n)) for n in other.held] == [(type(n), repr(n)) for n in numbers]
+
+
 def test_zeros_at_the_end_take_no_room(tmp_path):
     buffer = np.zeros((1000, 100))
     buffer[2, 3] = 1.0
