@@ -35,7 +35,9 @@ def put_back(modules: Iterable[UserModule], state: Mapping[str, Mapping[str, Any
 
 def _holders(modules: Iterable[UserModule]) -> Iterator[tuple[str, ModuleType | type]]:
     typed = [module for module in modules if module.path is not None]
-    for name, module in sorted(sys.modules.items()):
+    if not typed:
+        return
+    for name, module in list(sys.modules.items()):
         if not any(_is_of(module, name, user) for user in typed):
             continue
         yield name, module
