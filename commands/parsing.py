@@ -108,8 +108,8 @@ def run_command(main: Callable[[], int]) -> NoReturn:
         code = _exit_code(main)
         if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
             code = code or MISTAKE
+    default_for_signals()  # what is left to do would tell of one in a traceback
     if n_stops() > before:
-        default_for_signals()  # what is left to do would tell of a further one in a traceback
         codes.append(code)
     sys.exit(code)
 
