@@ -15,10 +15,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import csv
-import gzip
-import io
-import json
 import os
 import random
 import signal
@@ -26,17 +22,16 @@ import subprocess
 import sys
 import tempfile
 import time
-import zipfile
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import torch as th
 from rich.console import Console
 from rich.table import Table
+
+from _run_contents import contents
 
 ROOT = Path(__file__).resolve().parents[1]
 SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGINT twice")
@@ -129,42 +124,6 @@ def cases(folder: Path) -> list[Case]:
     for case in found:
         case.folder.mkdir(parents=True)
     return found
-
-
-def contents(logs: Path) -> dict[str, Any]:
-    """What the files of a run or a study say, but for moments and durations; by relative name."""
-    files = sorted(path for path in logs.rglob("*") if path.is_file())
-    return {path.relative_to(logs).as_posix(): _content(path) for path in files}
-
-
-def _content(path: Path) -> Any:
-    if path.suffix == ".zip":
-        with zipfile.ZipFile(path) as members:
-            tensors = [n for n in members.namelist() if n.endswith(".pth")]
-            return [_bits(th.load(io.BytesIO(members.read(name)))) for name in tensors]
-    if path.suffix == ".npz":
-        return {name: array.tobytes() for name, array in np.load(path).items()}
-    if path.name.endswith("monitor.csv"):
-        lines = path.read_text(encoding="utf-8").splitlines()
-        return [line.split(",")[:2] for line in lines[1:]]
-    if path.name == "run.json":
-        info = json.loads(path.read_text(encoding="utf-8"))
-        return {k: v for k, v in info.items() if k not in ("seconds", "files", "spec", "process")}
-    if path.suffix in (".csv", ".gz"):
-        opened = gzip.open if path.suffix == ".gz" else open
-        with opened(path, "rt", encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-        return [{k: v for k, v in row.items() if k not in ("seconds", "path")} for row in rows]
-    # In what is left stand commands, durations and folders.
-    return path.suffix
-
-
-def _bits(value: Any) -> Any:
-    if isinstance(value, th.Tensor):
-        return value.detach().numpy().tobytes()
-    if isinstance(value, dict):
-        return [(name, _bits(held)) for name, held in value.items()]
-    return [_bits(held) for held in value] if isinstance(value, list | tuple) else value
 
 
 def in_peace(case: Case) -> None:

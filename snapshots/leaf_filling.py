@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import enum
 import functools
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -24,28 +25,28 @@ from snapshots.filling import (
 MISSING: Any = object()
 
 
-class LeafFiller:
+class LeafFiller(ABC):
     """Fills numbers, texts, tensors and generators; `snapshots.restoring` has the rest."""
 
+    @abstractmethod
     def value(self, cell: Any, existing: Any = MISSING) -> Any:
         """The value that a cell stands for."""
-        raise NotImplementedError
 
+    @abstractmethod
     def values(self, cells: list[Any], existing: Any = ()) -> list[Any]:
         """The values that some cells stand for."""
-        raise NotImplementedError
 
+    @abstractmethod
     def held(self, node: dict[str, Any]) -> NDArray[Any]:
         """The array of a node."""
-        raise NotImplementedError
 
+    @abstractmethod
     def class_of(self, node: dict[str, Any], existing: Any) -> Any:
         """The class that a node names."""
-        raise NotImplementedError
 
+    @abstractmethod
     def missing(self, what: str) -> NotRestorableError:
         """Says that something is not there."""
-        raise NotImplementedError
 
     def _bytes(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         content = self.held(node).tobytes()

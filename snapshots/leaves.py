@@ -6,6 +6,7 @@ import array
 import enum
 import functools
 import random
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from typing import Any
 
@@ -16,25 +17,25 @@ from numpy.typing import NDArray
 from snapshots.kinds import NotRecordableError, name_of
 
 
-class LeafRecorder:
+class LeafRecorder(ABC):
     """Describes numbers, texts, tensors and generators; `snapshots.recording` has the rest."""
 
     @property
+    @abstractmethod
     def place(self) -> str:
         """Where the value that is being recorded lies."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cell(self, value: Any) -> Any:
         """What stands for a value."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cells(self, values: Iterable[Any]) -> list[Any]:
         """What stands for each of some values."""
-        raise NotImplementedError
 
+    @abstractmethod
     def keep(self, values: NDArray[Any]) -> int:
         """The number of an array that the snapshot is to keep."""
-        raise NotImplementedError
 
     def _bytes(self, value: bytes | bytearray) -> dict[str, Any]:
         return {"kind": type(value).__name__, "array": self.keep(_as_array(value))}

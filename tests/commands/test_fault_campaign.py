@@ -16,7 +16,11 @@ def test_killed_trainings_end_as_they_would_have(tmp_path):
     words = ["--kills", "4", "--jobs", "2", "--only", *COMMANDS]
     result = subprocess.run(
         [sys.executable, str(script), *words],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(tmp_path)},
+        env={
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(ROOT), str(script.parent)]),
+            "TMPDIR": str(tmp_path),
+        },
         capture_output=True,
         text=True,
         check=False,
