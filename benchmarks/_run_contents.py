@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 import torch as th
 
+TIMES = ("seconds", "cpu_seconds")
+
 
 def contents(logs: Path) -> dict[str, Any]:
     """What the files of a run or a study say, but for moments and durations; by relative name."""
@@ -32,12 +34,12 @@ def _content(path: Path) -> Any:
         return [line.split(",")[:2] for line in lines[1:]]
     if path.name == "run.json":
         info = json.loads(path.read_text(encoding="utf-8"))
-        return {k: v for k, v in info.items() if k not in ("seconds", "files", "spec", "process")}
+        return {k: v for k, v in info.items() if k not in (*TIMES, "files", "spec", "process")}
     if path.suffix in (".csv", ".gz"):
         opened = gzip.open if path.suffix == ".gz" else open
         with opened(path, "rt", encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
-        return [{k: v for k, v in row.items() if k not in ("seconds", "path")} for row in rows]
+        return [{k: v for k, v in row.items() if k not in (*TIMES, "path")} for row in rows]
     # In what is left stand commands, durations and folders.
     return path.suffix
 

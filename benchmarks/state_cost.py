@@ -63,7 +63,7 @@ def main() -> None:
         total, n = sum(seconds for seconds, _ in saved), max(len(saved), 1)
         largest = max((size for _, size in saved), default=0) / 1e6
         name = f"{algo} {settings.get('engine', '')} on {env_id}"
-        share = f"{total / outcome.seconds:.2%}"
+        share = f"{total / outcome.taken.seconds:.2%}"
         table.add_row(name, str(len(saved)), f"{1000 * total / n:.1f}", f"{largest:.2f}", share)
     Console().print(table)
 

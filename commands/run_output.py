@@ -87,9 +87,11 @@ def print_refusal(console: Console, refusal: str | None) -> None:
 
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
-    speed = outcome.n_steps / max(outcome.seconds, 1e-9)
+    speed = outcome.n_steps / max(outcome.taken.seconds, 1e-9)
     done = "trained" if outcome.state == FINISHED else "interrupted"
-    rows = [(done, f"{outcome.n_steps:,} steps in {outcome.seconds:.1f} s ({speed:,.0f} steps/s)")]
+    rows = [
+        (done, f"{outcome.n_steps:,} steps in {outcome.taken.seconds:.1f} s ({speed:,.0f} steps/s)")
+    ]
     if outcome.engine:
         rows.append(("engine", outcome.engine))
     if outcome.pulls is not None:

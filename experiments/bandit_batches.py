@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ from agents.compiled.compile_envs import NotCompilable
 from experiments.pull_statistics import PullStatistics, pull_statistics
 from mdp.array_types import Floats
 from mdp.machine_code import compile_timer
+from mdp.work_time import WorkTime
 from pipeline.array_files import read_arrays
 from pipeline.environments import make_single_env
 from pipeline.file_digests import DamagedFileError
@@ -34,8 +34,8 @@ _PULLS = ("arms", "rewards", "regrets")  # what figures are made of, beside cont
 
 def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     """Do ``n_runs`` runs, from the spec's seed on, and leave their statistics in the run folder."""
-    started = time.monotonic()
-    with compile_timer() as seconds_compiling:
+    started = WorkTime.now()
+    with compile_timer() as time_compiling:
         result, engine = _run(spec, n_runs)
     _check_rewards(result, spec.seed)
     env = make_single_env(spec)
@@ -52,8 +52,8 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
         n_runs=n_runs,
         n_timesteps=len(result.arms[0]),
         versions=recorded_versions(),
-        seconds=round(time.monotonic() - started - seconds_compiling(), 3),
         engine=engine,
+        **(WorkTime.now() - started - time_compiling()).as_data(),
     )
 
 

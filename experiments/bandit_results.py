@@ -41,6 +41,7 @@ def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
         DamagedFileError: if a file of the batch is missing or changed, or holds anything else.
     """
     info = read_outcome(planned.run, ("seconds",))
+    cpu_seconds = info.get("cpu_seconds")
     path = planned.path / STATISTICS_FILE
     pulls = PullStatistics.load(path)
     if pulls.total_reward.size != planned.n_runs or info["seconds"] is None:
@@ -53,6 +54,7 @@ def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
         "n_timesteps": planned.spec.hyperparams.n_timesteps,
         "n_episodes": 1,
         "seconds": info["seconds"] / planned.n_runs,
+        "cpu_seconds": None if cpu_seconds is None else cpu_seconds / planned.n_runs,
         "engine": info.get("engine"),
         "path": str(planned.path),
     }

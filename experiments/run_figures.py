@@ -22,6 +22,7 @@ from pipeline.file_digests import DamagedFileError
 from pipeline.run_folder import Run
 
 LARGEST_FIGURE = 1e300
+_OPTIONAL = ("cpu_seconds",)  # older versions did not measure it
 _FINAL_FIGURES = (
     "mean_return",
     "std_return",
@@ -124,7 +125,8 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
     missing = [name for name in required if name not in info]
     if missing:
         raise DamagedFileError(run.info_path, f"is damaged: it lacks {missing[0]}")
-    given = {name: info[name] for name in required if name != "final"}
+    given = {name: info[name] for name in (*required, *_OPTIONAL) if name in info}
+    given.pop("final", None)
     figures = {name: final[name] for name in _FINAL_FIGURES if name in final}
     for name, value in (given | figures).items():
         if not (value is None or _is_figure(value)):

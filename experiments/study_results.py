@@ -116,6 +116,7 @@ RUN_COLUMNS = (
     "n_timesteps",
     "n_episodes",
     "seconds",
+    "cpu_seconds",  # of the run's own process; missing in runs of older versions
     "engine",
     "path",
 )
@@ -287,6 +288,7 @@ def _summary_row(
         "n_timesteps": info["n_timesteps"],
         "n_episodes": len(episodes.returns),
         "seconds": info["seconds"],
+        "cpu_seconds": info.get("cpu_seconds"),
         "engine": info.get("engine"),
         "path": str(planned.path),
     }

@@ -18,6 +18,7 @@ import numba
 from numba.core import event
 
 from mdp.code_cache import PACKAGES, ROOT, CheckedCache, folder, numba_cache_dir
+from mdp.work_time import WorkTime
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -51,16 +52,34 @@ def internal(function: Function) -> Function:
     return _decorated(function, {**BARE_OPTIONS, "forceinline": True, "no_cpython_wrapper": True})
 
 
+class _CompileTimer(event.Listener):
+    """Adds up what compiling takes; functions that are compiled for others count once."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.began = self.spent = WorkTime()
+
+    def on_start(self, event: object) -> None:
+        if self.depth == 0:
+            self.began = WorkTime.now()
+        self.depth += 1
+
+    def on_end(self, event: object) -> None:
+        self.depth -= 1
+        if self.depth == 0:
+            self.spent += WorkTime.now() - self.began
+
+
 @contextmanager
-def compile_timer() -> Iterator[Callable[[], float]]:
+def compile_timer() -> Iterator[Callable[[], WorkTime]]:
     """Let a caller leave the time of compiling, which is spent once, out of what it measures.
 
     Yields:
-        A function that tells how many seconds have gone into compiling in the ``with`` statement.
+        A function that tells how much time has gone into compiling in the ``with`` statement.
     """
-    timer: Any = event.TimingListener()  # type: ignore[no-untyped-call]
+    timer = _CompileTimer()
     with event.install_listener("numba:compile", timer):
-        yield lambda: float(timer.duration) if timer.done else 0.0
+        yield lambda: timer.spent
 
 
 def _decorated(function: Function, options: dict[str, Any]) -> Function:

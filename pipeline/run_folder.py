@@ -48,6 +48,7 @@ OUTCOME = (
     "stopped_by",
     "n_timesteps",
     "seconds",
+    "cpu_seconds",
     "final",
     "best_mean_return",
     "best_timesteps",

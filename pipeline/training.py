@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ import torch as th
 from rich.console import Console
 
 from mdp.machine_code import compile_timer
+from mdp.work_time import WorkTime
 from pipeline.broken_runs import blame_weights, close, give_up, has_begun
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation
@@ -52,7 +52,7 @@ class Outcome:
         run: its folder.
         state: ``"finished"`` or ``"interrupted"``.
         n_steps: environment steps that were run.
-        seconds: time that they took, evaluations included, and compiling, which is done once, not.
+        taken: time that they took, evaluations included, and compiling, which is done once, not.
         final: evaluation of the agent at the end, by episodes used for nothing else; None where
             evaluation was turned off.
         best_return: mean return of the best evaluation during training, if there was one.
@@ -64,7 +64,7 @@ class Outcome:
     run: Run
     state: str
     n_steps: int
-    seconds: float
+    taken: WorkTime
     final: Evaluation | None
     best_return: float | None
     best_timesteps: int
@@ -185,9 +185,9 @@ def carry_out(training: Training) -> Outcome:
 
 
 def _train_and_finish(training: Training) -> Outcome:
-    started = time.monotonic()
+    started = WorkTime.now()
     state = FINISHED
-    with compile_timer() as seconds_compiling:
+    with compile_timer() as time_compiling:
         try:
             with current().waiting(SECONDS_TO_A_SAFE_MOMENT):
                 _learn(training)
@@ -197,10 +197,10 @@ def _train_and_finish(training: Training) -> Outcome:
             state = INTERRUPTED
         finally:
             training.display.close()
-        seconds = time.monotonic() - started - seconds_compiling()
-    seconds += training.saver.seconds_before
+        taken = WorkTime.now() - started - time_compiling()
+    taken += training.saver.time_before
     with doing(training.display.console, "saving what was learnt") as activity:
-        return _finish(training, state, seconds, activity)
+        return _finish(training, state, taken, activity)
 
 
 @exits_as_mistakes()
@@ -231,7 +231,7 @@ def _learn(training: Training) -> None:
         raise
 
 
-def _finish(training: Training, state: str, seconds: float, activity: Activity) -> Outcome:
+def _finish(training: Training, state: str, taken: WorkTime, activity: Activity) -> Outcome:
     """Save what was learnt, judge it, draw it; ``run.json`` says so when all else is there."""
     run, model, evaluation = training.run, training.model, training.evaluation
     pulls = save(training, state)
@@ -249,7 +249,7 @@ def _finish(training: Training, state: str, seconds: float, activity: Activity) 
         run,
         state,
         n_steps=model.num_timesteps,
-        seconds=seconds,
+        taken=taken,
         final=final,
         best_return=evaluation.best_mean_reward if evaluation.best_timesteps else None,
         best_timesteps=evaluation.best_timesteps,
@@ -268,11 +268,11 @@ def _record(outcome: Outcome) -> None:
     outcome.run.end(
         state=outcome.state,
         n_timesteps=outcome.n_steps,
-        seconds=round(outcome.seconds, 3),
         final=None if outcome.final is None else outcome.final.summary(),
         best_mean_return=outcome.best_return,
         best_timesteps=outcome.best_timesteps,
         engine=outcome.engine,
+        **outcome.taken.as_data(),
         **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),
         **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
     )

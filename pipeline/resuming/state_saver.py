@@ -13,6 +13,7 @@ from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from agents.common.callback_horizons import Horizon
+from mdp.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.progress import ProgressDisplay
@@ -70,15 +71,18 @@ class StateSaver(StopAtSafeMoment):
         note = {} if state is None else state.note
         self.n_saved = int(note.get("number", 0))
         self.n_rollouts = int(note.get("rollouts", 0))
-        self.seconds_before = float(note.get("seconds", 0.0))
+        self.time_before = WorkTime(
+            float(note.get("seconds", 0.0)), float(note.get("cpu_seconds", 0.0))
+        )
+        self.started = WorkTime.now()
         self.steps_at_save = 0
-        self.saved_at = self.started = time.monotonic()
+        self.saved_at = time.monotonic()
         self.pause = interval.seconds or SHORTEST_INTERVAL
 
     @property
-    def seconds(self) -> float:
+    def taken(self) -> WorkTime:
         """What the training has taken, in all processes that worked on it."""
-        return self.seconds_before + time.monotonic() - self.started
+        return self.time_before + (WorkTime.now() - self.started)
 
     def horizon(self) -> Horizon:
         if self.is_off or self.interval.steps < 1:
@@ -102,7 +106,7 @@ class StateSaver(StopAtSafeMoment):
         if (folder := _log_folder(self.model)) is not None:
             self.run.update_info(**{TENSORBOARD: folder})
         self.steps_at_save = self.model.num_timesteps
-        self.saved_at = self.started = time.monotonic()
+        self.saved_at, self.started = time.monotonic(), WorkTime.now()
 
     def _on_rollout_start(self) -> None:
         if not getattr(self.model, "tells_safe_moments", False):
@@ -162,7 +166,7 @@ class StateSaver(StopAtSafeMoment):
             "files": log_positions(self.run.path, _log_folder(self.model)),
             "steps": self.model.num_timesteps,
             "rollouts": self.n_rollouts,
-            "seconds": self.seconds,
+            **self.taken.as_data(),
             "spec": settings_digest(self.run.recorded_spec()),
         }
         save_state(self.run.state_path, self.n_saved + 1, snapshot, note)

@@ -20,6 +20,7 @@ from commands.run_output import (
     print_outcome,
     watch_command,
 )
+from mdp.work_time import WorkTime
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparams import split
@@ -60,7 +61,7 @@ def outcome_of(**changes):
         "run": Run(Path("logs/qlearning/Lake-v1_3"), "Lake-v1"),
         "state": "finished",
         "n_steps": 12_345,
-        "seconds": 2.0,
+        "taken": WorkTime(2.0, 1.5),
         "final": None,
         "best_return": None,
         "best_timesteps": 0,
@@ -132,7 +133,7 @@ def test_a_run_with_everything():
         final=SAMPLED,
         best_return=3.25,
         best_timesteps=10_000,
-        seconds=0.0,
+        taken=WorkTime(),
         n_steps=0,
     )
     assert printed(outcome, spec_of("else where")) == [

@@ -132,6 +132,7 @@ def test_a_record_that_says_nothing_is_damage_and_no_other_run(copied, record):
         {"final": {"mean_return": 1.0, "optimum": 2.0}},
         {"final": {"optimum": None, "best_blind": 1.0}},
         {"seconds": "long"},
+        {"cpu_seconds": "long"},
         {"n_timesteps": [1]},
         {"best_mean_return": 10**400},
         {"engine": 3},
@@ -219,7 +220,9 @@ def test_without_repair_a_damaged_run_stays_as_it_is(copied, compare_again):
 
 def test_repair_moves_aside_what_is_done_again(copied, compare_again, capsys):
     study, planned, root = copied("grid")
-    whole = read_results(study, planned, root).summary.drop(columns=["seconds", "engine"])
+    whole = read_results(study, planned, root).summary.drop(
+        columns=["seconds", "cpu_seconds", "engine"]
+    )
     bit(planned[1].run.evaluations_path)
     before = planned[1].run.evaluations_path.read_bytes()
     repair(Console(width=400), study, planned)
@@ -230,7 +233,9 @@ def test_repair_moves_aside_what_is_done_again(copied, compare_again, capsys):
     do_run(planned[1], draft_path(root, planned[1]), "c")
     code, out = compare_again(study, planned, root)
     assert (code, "damaged" in out) == (0, False)
-    again = read_results(study, planned, root).summary.drop(columns=["seconds", "engine"])
+    again = read_results(study, planned, root).summary.drop(
+        columns=["seconds", "cpu_seconds", "engine"]
+    )
     assert again.equals(whole)
     # And once more: nothing is written over.
     bit(planned[1].run.evaluations_path)

@@ -133,6 +133,7 @@ def test_the_columns_of_the_files_that_others_read():
         "n_timesteps",
         "n_episodes",
         "seconds",
+        "cpu_seconds",
         "engine",
         "path",
     )

@@ -130,7 +130,9 @@ def content(path):
         return [line.split(",")[:2] for line in path.read_text().splitlines()[1:]]
     if path.name == "run.json":
         info = json.loads(path.read_text())
-        return {key: info[key] for key in info if key not in ("seconds", "files", "spec")}
+        return {
+            key: info[key] for key in info if key not in ("seconds", "cpu_seconds", "files", "spec")
+        }
     if path.suffix in (".png", ".pkl"):
         return None
     return path.read_bytes()
