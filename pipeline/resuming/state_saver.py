@@ -136,6 +136,8 @@ class StateSaver(StopAtSafeMoment):
         except OSError as error:
             reason = error.strerror or one_line(error)
             self._tell_once(f"no state was saved: {self.run.state_path}: {reason}")
+        except MemoryError:
+            self._tell_once("no state was saved: there is no memory left for it")
         self.saved_at = time.monotonic()
         self.steps_at_save = self.model.num_timesteps
         if self.interval.seconds == 0:
@@ -156,6 +158,8 @@ class StateSaver(StopAtSafeMoment):
         if isinstance(environment, SubprocVecEnv):
             raise NotRecordableError("--vec-env subproc", "environments are in other processes")
         snapshot = record(self._roots(), _CONSTANTS)
+        for lost in snapshot.lost:
+            self._tell_once(f"{lost} is not kept: a run that goes by it may differ after --resume")
         note = {
             "folder": self._folder_names(),
             "log_folder": _log_folder(self.model),
