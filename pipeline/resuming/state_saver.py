@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +36,7 @@ from snapshots.restoring import restore
 # Saving may take this share of the time, where the user has not said how often.
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
+FIRST_COST = 0.05  # seconds; of states of which nothing is known
 
 
 class StateSaver(StopAtSafeMoment):
@@ -73,7 +76,7 @@ class StateSaver(StopAtSafeMoment):
         self.seconds_before = float(note.get("seconds", 0.0))
         self.steps_at_save = 0
         self.saved_at = self.started = time.monotonic()
-        self.pause = interval.seconds or SHORTEST_INTERVAL
+        self.pause = interval.seconds or float(note.get("pause", FIRST_COST / SHARE_OF_TIME))
 
     @property
     def seconds(self) -> float:
@@ -128,7 +131,8 @@ class StateSaver(StopAtSafeMoment):
         """Save the state as it is, which must be a moment between two updates."""
         begun = time.monotonic()
         try:
-            self._write()
+            with _garbage_left():
+                self._write()
         except NotRecordableError as error:
             self._give_up(f"no state can be kept: {one_line(error)}")
         except UserError as error:
@@ -167,6 +171,7 @@ class StateSaver(StopAtSafeMoment):
             "steps": self.model.num_timesteps,
             "rollouts": self.n_rollouts,
             "seconds": self.seconds,
+            "pause": self.pause,
             "spec": settings_digest(self.run.recorded_spec()),
         }
         save_state(self.run.state_path, self.n_saved + 1, snapshot, note)
@@ -201,6 +206,21 @@ class StateSaver(StopAtSafeMoment):
     def _folder_names(self) -> list[str]:
         """The run folder as it was given, and from the root."""
         return [str(self.run.path), str(self.run.path.absolute())]
+
+
+@contextmanager
+def _garbage_left() -> Iterator[None]:
+    """Do without the garbage collector: a state has no cycles, and may set off a search for them.
+
+    That goes through all that the libraries hold, and takes several times as long as the state.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def _log_folder(model: BaseAlgorithm) -> str | None:
