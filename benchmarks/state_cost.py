@@ -31,11 +31,11 @@ CASES: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
 )
 
 
-def main() -> None:
-    """Train each case once and print the table."""
-    table = Table("case", "states", "ms, the first", "ms, each", "MB", "share at first", "in all")
-    saved: list[tuple[float, float, int]] = []
-    started = [0.0]
+Saved = list[tuple[float, float, int]]
+
+
+def watched(saved: Saved, started: list[float]) -> None:
+    """Let the saver note when it began, and of each state what it took and when it was over."""
     save, start = StateSaver.save, StateSaver._on_training_start
 
     def timed(self: StateSaver) -> None:
@@ -52,6 +52,14 @@ def main() -> None:
 
     StateSaver.save = timed  # type: ignore[method-assign]
     StateSaver._on_training_start = noted  # type: ignore[method-assign]
+
+
+def main() -> None:
+    """Train each case once and print the table."""
+    table = Table("case", "states", "ms, the first", "ms, each", "MB", "share at first", "in all")
+    saved: Saved = []
+    started = [0.0]
+    watched(saved, started)
     for env_id, algo, steps, settings in CASES:
         saved.clear()
         raw = override({**read_hyperparams(algo, env_id, None), "n_timesteps": steps}, settings)
@@ -73,8 +81,8 @@ def main() -> None:
     Console().print(table)
 
 
-def _row(saved: list[tuple[float, float, int]], seconds: float) -> list[str]:
-    """The figures of a training: of each state what it took, when it was over, and its bytes."""
+def _row(saved: Saved, seconds: float) -> list[str]:
+    """The figures of a training that took so long."""
     if not saved:
         return ["0"]
     total, (first, since, _) = sum(taken for taken, _, _ in saved), saved[0]

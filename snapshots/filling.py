@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 _BIT_GENERATORS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
+_PIECE = 1 << 20  # bytes
+
 
 class NotRestorableError(Exception):
     """A snapshot does not fit what was built anew."""
@@ -22,12 +24,27 @@ def fill_array(held: NDArray[Any], existing: Any) -> NDArray[Any]:
     if not is_same or existing.shape != held.shape or _lie_otherwise(held, existing):
         return held.copy(order="K")
     if existing.flags.writeable:
-        existing[...] = held
+        _copy(held, existing)
     elif existing.tobytes() != held.tobytes():
         return held.copy(order="K")
     # Others may hold it too.
     found: NDArray[Any] = existing
     return found
+
+
+def _copy(held: NDArray[Any], existing: NDArray[Any]) -> None:
+    """Write values into an array, but for zeros where there are zeros.
+
+    What a replay buffer has not used so far takes no memory, and is not to take any now.
+    """
+    if not (held.flags.c_contiguous and existing.flags.c_contiguous):
+        existing[...] = held
+        return
+    new, old = (array.reshape(-1).view(np.uint8) for array in (held, existing))
+    for begin in range(0, len(new), _PIECE):
+        piece = slice(begin, begin + _PIECE)
+        if new[piece].any() or old[piece].any():
+            old[piece] = new[piece]
 
 
 def tensor_of(held: NDArray[np.uint8], dtype: str, shape: list[int], axes: list[int]) -> th.Tensor:

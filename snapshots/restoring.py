@@ -28,7 +28,7 @@ def restore(
     """Fill objects with what was recorded of others of the same build.
 
     Args:
-        snapshot: the record.
+        snapshot: the record. It loses its arrays on the way, so that no buffer is there twice.
         roots: the objects to fill, by the names that they were recorded under.
         moved: folders that have another name by now; texts that begin with one are changed.
 
@@ -100,7 +100,8 @@ class _Restorer(LeafFiller):
         return [self.value(cell, old) for cell, old in zip(cells, known, strict=False)]
 
     def held(self, node: dict[str, Any]) -> NDArray[Any]:
-        array: NDArray[Any] = self._snapshot.arrays[node["array"]]
+        arrays, number = self._snapshot.arrays, node["array"]
+        array, arrays[number] = arrays[number], np.empty(0)
         return array
 
     def class_of(self, node: dict[str, Any], existing: Any) -> Any:

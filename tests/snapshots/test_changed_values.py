@@ -185,3 +185,18 @@ def test_caches_and_orders_that_are_lost_are_named():
     numbers -= {*range(50)}
     lost = record({"it": Holder(cache=double, numbers=numbers, texts={"a", "b"})}).lost
     assert lost == ["the cache of it.cache", "the order of it.numbers"]
+
+
+def test_of_a_buffer_that_is_not_full_the_rest_takes_no_memory(tmp_path):
+    """Told by a file in the place of memory, whose zeros take no room until they are written."""
+    path = tmp_path / "memory"
+    values, existing = np.zeros(10**6), np.memmap(path, np.float64, "w+", shape=10**6)
+    values[:1000], values[5000] = 1.0, -0.0
+    existing[2000:3000] = 2.0
+    snapshot = record({"it": Holder(held=values)})
+    restore(snapshot, {"it": Holder(held=existing)})
+    existing.flush()
+    assert existing.tobytes() == values.tobytes()
+    if sys.platform == "linux":
+        assert path.stat().st_blocks * 512 < values.nbytes / 2
+    assert sum(array.nbytes for array in snapshot.arrays) == 0
