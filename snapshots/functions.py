@@ -7,16 +7,32 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from types import FunctionType, MethodType
+from types import (
+    BuiltinFunctionType,
+    FunctionType,
+    MethodDescriptorType,
+    MethodType,
+    MethodWrapperType,
+    ModuleType,
+    WrapperDescriptorType,
+)
 from typing import Any
 
+import numpy as np
+
 from snapshots.kinds import find, name_of
+
+# Functions of classes that are written in C, whose methods keep their objects as others do.
+_COMPILED = (MethodDescriptorType, WrapperDescriptorType, type(np.random.Generator.random))
+METHODS = (MethodType, BuiltinFunctionType, MethodWrapperType)
 
 
 def is_callable_of_ours(value: Any) -> bool:
     """Whether a value is a method of an object, or a function that could be taken for another."""
-    if isinstance(value, MethodType):
-        return _method_of(value.__self__, value.__func__.__name__) is value.__func__
+    if isinstance(value, METHODS):
+        owner = value.__self__
+        is_bound = owner is not None and not isinstance(owner, type | ModuleType)
+        return is_bound and _method_of(owner, name_in_class(value)) == value
     if not isinstance(value, FunctionType):
         return False
     try:
@@ -47,16 +63,27 @@ def fill_function(node: dict[str, Any], existing: Any) -> FunctionType:
     raise LookupError(f"the function {node['class']}")
 
 
+def name_in_class(method: Any) -> str:
+    """The name of a method's function."""
+    name: str = getattr(method, "__func__", method).__name__
+    return name
+
+
 def fill_method(name: str, owner: Any, existing: Any) -> Any:
-    """The method of that name of an object; the existing one, where it is that."""
-    function = _method_of(owner, name)
-    is_method = isinstance(existing, MethodType) and existing.__self__ is owner
-    if is_method and existing.__func__ is function:
-        return existing
-    return MethodType(function, owner) if isinstance(function, FunctionType) else existing
+    """The method of that name of an object; the existing one, where it is that.
+
+    Raises:
+        LookupError: if its class has none.
+    """
+    method = _method_of(owner, name)
+    if method is None:
+        raise LookupError(f"the method {name}")
+    return existing if existing == method else method
 
 
 def _method_of(owner: Any, name: str) -> Any:
-    """The function of a method, without calling anything of the object's."""
+    """A method of an object, without calling anything of the user's; None if there is none."""
     found = inspect.getattr_static(type(owner), name, None)
-    return found if isinstance(found, FunctionType) else None
+    if isinstance(found, FunctionType):
+        return MethodType(found, owner)
+    return found.__get__(owner) if isinstance(found, _COMPILED) else None

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
+import functools
 import io
-import logging
-import pathlib
-import re
 import sys
 import threading
 import types
@@ -29,6 +27,7 @@ _CONSTANT_TYPES = (
     type,
     types.FunctionType,
     types.BuiltinFunctionType,
+    functools._lru_cache_wrapper,
     types.MethodType,
     types.MethodWrapperType,
     types.MethodDescriptorType,
@@ -39,22 +38,15 @@ _CONSTANT_TYPES = (
     property,
     staticmethod,
     classmethod,
-    pathlib.PurePath,
-    re.Pattern,
-    logging.Logger,
     threading.Thread,
-    threading.Event,
     weakref.ref,
-    types.EllipsisType,
     types.NotImplementedType,
-    np.dtype,
     np.ufunc,
-    th.dtype,
-    th.device,
+    type(np.mean),
     th.layout,
     *_LOCKS,
 )
-# Compiled functions, windows and their clocks, writers of rows: made anew when they are needed.
+# Compiled functions, windows and their clocks, bars, writers of rows: made anew when needed.
 _CONSTANT_MODULES = (
     "numba",
     "llvmlite",
@@ -63,10 +55,18 @@ _CONSTANT_MODULES = (
     "moviepy",
     "tensorboard",
     "rich",
+    "tqdm",
     "typing",
 )
 # Among these is what holds data: it cannot be copied, and must not be taken for code.
-_HOLDING_MODULES = ("numba.typed", "numba.experimental")
+_HOLDING = ("numba.typed", "numba.experimental", "_csv.reader")
+# What stands for something outside of this process, of which nothing can be copied.
+_OUTSIDE = (
+    "subprocess.Popen",
+    "multiprocessing.process.BaseProcess",
+    "multiprocessing.connection._ConnectionBase",
+    "tempfile.TemporaryDirectory",
+)
 _GAME_DATA = ("Rect", "FRect", "Vector2", "Vector3", "Color", "Mask", "PixelArray", "BufferProxy")
 
 # What a network said last: made anew before it is looked at again.
@@ -96,7 +96,7 @@ def is_constant(value: Any, more: tuple[type, ...] = ()) -> bool:
         more: further types of which that is so.
     """
     kind = type(value)
-    if kind.__module__.startswith(_HOLDING_MODULES):
+    if f"{kind.__module__}.{kind.__name__}".startswith(_HOLDING):
         return False
     if isinstance(value, io.IOBase):
         return value.closed or value in (sys.stdin, sys.__stdin__) or not value.readable()
@@ -104,6 +104,34 @@ def is_constant(value: Any, more: tuple[type, ...] = ()) -> bool:
     if top == "pygame" and (kind.__name__ in _GAME_DATA or not hides_state(kind)):
         return False
     return isinstance(value, (*_CONSTANT_TYPES, *more)) or top in _CONSTANT_MODULES
+
+
+def likeness(value: Any) -> str:
+    """What has to be in the place of a constant that is found there; empty for anything.
+
+    Windows and what is compiled are made anew when they are needed, and may not be there yet.
+    """
+    if not isinstance(value, (io.IOBase, *_CONSTANT_TYPES)) or getattr(value, "closed", False):
+        return ""
+    return f"{name_of(type(value))} {getattr(value, '__name__', '')}"
+
+
+def has_cached(value: Any) -> bool:
+    """Whether a value is a function of `functools.lru_cache` that remembers something."""
+    return isinstance(value, functools._lru_cache_wrapper) and value.cache_info().currsize > 0
+
+
+def keeps_order(values: set[Any] | frozenset[Any]) -> bool:
+    """Whether a set that is made of the same values runs through them in the same order.
+
+    What was taken away leaves gaps, by which the rest is ordered. Of texts each process has an
+    order of its own, so that no run goes by it.
+    """
+    order = list(values)
+    if not all(isinstance(value, int | float | tuple) for value in order):
+        return True
+    again = set(order)
+    return list(again) == order and sys.getsizeof(again) == sys.getsizeof(values)
 
 
 def is_transient(value: Any) -> bool:
@@ -136,6 +164,8 @@ def slots(kind: type) -> Iterator[str]:
 
 def hides_state(kind: type) -> bool:
     """Whether objects of a class hold more than attributes, as those written in C do."""
+    if any(f"{base.__module__}.{base.__qualname__}" in _OUTSIDE for base in kind.__mro__):
+        return True
     declares_slots = any("__slots__" in vars(base) for base in kind.__mro__)
     if kind is not object and not kind.__dictoffset__ and not declares_slots:
         return True  # no class of Python's has nowhere to put its attributes

@@ -19,7 +19,9 @@ from snapshots.filling import (
     fill_random_state,
     fill_tensor,
     fill_torch_generator,
+    tensor_of,
 )
+from snapshots.plain_values import PLAIN_KINDS
 
 # Of a snapshot that fits, every value was there when it was taken.
 MISSING: Any = object()
@@ -73,6 +75,12 @@ class LeafFiller(ABC):
         function, arguments, keywords = self.values(node["items"], before)
         return functools.partial(function, *arguments, **keywords)
 
+    def _plain(self, number: int, node: dict[str, Any], existing: Any) -> Any:
+        kind = PLAIN_KINDS[node["name"]]
+        words = self.values(node["items"])
+        is_same = isinstance(existing, kind.types) and kind.words(existing) == words
+        return existing if is_same else kind.make(*words)
+
     def _enum(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         kind = self.class_of(node, existing)
         if not issubclass(kind, enum.Enum):
@@ -80,9 +88,10 @@ class LeafFiller(ABC):
         return kind(self.value(node["value"]))
 
     def _tensor(self, number: int, node: dict[str, Any], existing: Any) -> Any:
-        return fill_tensor(
-            self.held(node), node["type"], node["shape"], node["is_trained"], existing
-        )
+        plain = tensor_of(self.held(node), node["type"], node["shape"], node["axes"])
+        if node["is_parameter"] and not isinstance(existing, th.nn.Parameter):
+            return th.nn.Parameter(plain, node["is_trained"])
+        return fill_tensor(plain, node["is_trained"], existing)
 
     def _optimizer(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         if not isinstance(existing, th.optim.Optimizer):

@@ -15,6 +15,8 @@ import torch as th
 from numpy.typing import NDArray
 
 from snapshots.kinds import NotRecordableError, name_of
+from snapshots.plain_values import plain_words
+from snapshots.shared_memory import axes_in_memory
 
 
 class LeafRecorder(ABC):
@@ -56,20 +58,31 @@ class LeafRecorder(ABC):
     def _partial(self, value: functools.partial[Any]) -> dict[str, Any]:
         return {"kind": "partial", "items": self.cells([value.func, value.args, value.keywords])}
 
+    def _plain(self, value: Any) -> dict[str, Any]:
+        words = plain_words(value)
+        if words is None:
+            kind = name_of(type(value)).replace(":", ".")
+            raise NotRecordableError(self.place, f"what a {kind} holds cannot be copied")
+        return {"kind": "plain", "name": words[0], "items": self.cells(words[1])}
+
     def _enum(self, value: enum.Enum) -> dict[str, Any]:
         return {"kind": "enum", "class": name_of(type(value)), "value": self.cell(value.value)}
 
     def _tensor(self, value: th.Tensor) -> dict[str, Any]:
         if value.is_sparse or value.is_quantized:
             raise NotRecordableError(self.place, "only dense tensors can be copied")
-        plain = value.detach().cpu().contiguous()
+        plain = value.detach().resolve_conj().resolve_neg().cpu()
+        axes = axes_in_memory(plain.stride())
+        plain = plain.permute(axes).contiguous()
         # NumPy has no bfloat16 and its like: their bytes are kept.
         held = plain.reshape(-1).view(th.uint8).numpy() if plain.numel() else np.zeros(0, np.uint8)
         return {
             "kind": "tensor",
             "type": str(plain.dtype).removeprefix("torch."),
             "shape": list(plain.shape),
+            "axes": axes,
             "array": self.keep(held),
+            "is_parameter": isinstance(value, th.nn.Parameter),
             "is_trained": bool(value.requires_grad and value.is_leaf),
         }
 

@@ -12,25 +12,29 @@ from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
 import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from snapshots.functions import code_of, is_callable_of_ours
+from snapshots.functions import METHODS, code_of, is_callable_of_ours, name_in_class
 from snapshots.kinds import (
     NotRecordableError,
+    find,
+    has_cached,
     hides_state,
     is_constant,
     is_transient,
+    keeps_order,
     left_out,
+    likeness,
     name_of,
     slots,
 )
 from snapshots.leaves import LeafRecorder
-from snapshots.shared_memory import bases, place_in
+from snapshots.plain_values import PLAIN_TYPES
+from snapshots.shared_memory import axes_in_memory, bases, place_in
 
 # Stands for an object that has a number: `["@", 3]`. Plain scalars stand for themselves.
 REFERENCE = "@"
@@ -51,11 +55,13 @@ class Snapshot:
         roots: what was recorded, by name, as cells: scalars, or references to nodes.
         nodes: the objects, each a dictionary with its ``kind`` and what that needs, as JSON.
         arrays: what nodes call by number.
+        lost: what was left out that may make a difference, each named with its place.
     """
 
     roots: dict[str, Any] = field(default_factory=dict)
     nodes: list[dict[str, Any]] = field(default_factory=list)
     arrays: list[NDArray[Any]] = field(default_factory=list)
+    lost: list[str] = field(default_factory=list)
 
 
 def record(roots: dict[str, Any], constants: tuple[type, ...] = ()) -> Snapshot:
@@ -78,6 +84,10 @@ def record(roots: dict[str, Any], constants: tuple[type, ...] = ()) -> Snapshot:
         recorder.tell_views()
     except RecursionError:
         raise NotRecordableError(recorder.place, "objects lie too deep inside each other") from None
+    except (NotRecordableError, MemoryError):
+        raise
+    except Exception as error:  # objects may raise anything where they are looked into
+        raise NotRecordableError(recorder.place, f"{type(error).__name__}: {error}") from error
     return recorder.snapshot
 
 
@@ -125,8 +135,11 @@ class _Recorder(LeafRecorder):
         if is_callable_of_ours(value):
             return self._function(value)
         if is_constant(value, self._constants):
-            is_found_by_name = isinstance(value, type | FunctionType | BuiltinFunctionType)
-            return {"kind": "constant", "class": name_of(value) if is_found_by_name else ""}
+            name = name_of(value)
+            is_there = name and find(name) is value
+            if has_cached(value):
+                self.snapshot.lost.append(f"the cache of {self.place}")
+            return {"kind": "constant", "class": is_there and name, "like": likeness(value)}
         return self._object(value)
 
     def keep(self, values: NDArray[Any]) -> int:
@@ -178,12 +191,12 @@ class _Recorder(LeafRecorder):
             return {}
         return {"class": name_of(kind), "attributes": self._named(attributes.items())}
 
-    def _function(self, value: FunctionType | MethodType) -> dict[str, Any]:
+    def _function(self, value: Any) -> dict[str, Any]:
         """A function with what it has closed over, or a method with its object."""
-        if isinstance(value, MethodType):
+        if isinstance(value, METHODS):
             with self.at(".__self__"):
                 held = [self.cell(value.__self__)]
-            return {"kind": "method", "name": value.__func__.__name__, "items": held}
+            return {"kind": "method", "name": name_in_class(value), "items": held}
         with self.at("()"):
             cells = [cell.cell_contents for cell in value.__closure__ or ()]
             held = self.cells(cells)
@@ -226,6 +239,8 @@ class _Recorder(LeafRecorder):
 
     def _set(self, value: set[Any] | frozenset[Any]) -> dict[str, Any]:
         kind = "set" if isinstance(value, set) else "frozenset"
+        if not keeps_order(value):
+            self.snapshot.lost.append(f"the order of {self.place}")
         return {"kind": kind, "items": self.cells(value)}
 
     def _deque(self, value: deque[Any]) -> dict[str, Any]:
@@ -239,7 +254,15 @@ class _Recorder(LeafRecorder):
         if type(value) is np.ndarray and isinstance(value.base, np.ndarray):
             self._views[self._numbers[id(value)]] = value
         is_owner = not isinstance(value.base, np.ndarray)
-        return {"kind": "ndarray", "array": self.keep(value), "is_owner": is_owner}
+        axes = axes_in_memory(value.strides)
+        array = self.keep(np.asarray(value).transpose(axes))
+        return {
+            "kind": "ndarray",
+            "array": array,
+            "axes": axes,
+            "is_owner": is_owner,
+            "writeable": value.flags.writeable,
+        }
 
 
 # The first that fits counts.
@@ -256,6 +279,7 @@ _DESCRIPTIONS: tuple[tuple[Any, Any], ...] = (
     (random.Random, _Recorder._random),
     (dict, _Recorder._dict),
     (list, _Recorder._list),
+    (th.Size, _Recorder._plain),
     (tuple, _Recorder._tuple),
     ((set, frozenset), _Recorder._set),
     (deque, _Recorder._deque),
@@ -264,4 +288,5 @@ _DESCRIPTIONS: tuple[tuple[Any, Any], ...] = (
     (functools.partial, _Recorder._partial),
     (complex, _Recorder._complex),
     (range, _Recorder._range),
+    (PLAIN_TYPES, _Recorder._plain),
 )

@@ -16,7 +16,7 @@ from snapshots.filling import (
     fill_array,
 )
 from snapshots.functions import fill_function, fill_method
-from snapshots.kinds import find, hides_state, is_transient, left_out, name_of, slots
+from snapshots.kinds import find, hides_state, is_transient, left_out, likeness, name_of, slots
 from snapshots.leaf_filling import MISSING, LeafFiller
 from snapshots.recording import REFERENCE, Snapshot
 from snapshots.shared_memory import is_view, view_at
@@ -28,7 +28,7 @@ def restore(
     """Fill objects with what was recorded of others of the same build.
 
     Args:
-        snapshot: the record.
+        snapshot: the record. It loses its arrays on the way, so that no buffer is there twice.
         roots: the objects to fill, by the names that they were recorded under.
         moved: folders that have another name by now; texts that begin with one are changed.
 
@@ -37,7 +37,13 @@ def restore(
     """
     restorer = _Restorer(snapshot, moved or {})
     for name, existing in roots.items():
-        if restorer.value(snapshot.roots[name], existing) is not existing:
+        try:
+            found = restorer.value(snapshot.roots[name], existing)
+        except (NotRestorableError, MemoryError):
+            raise
+        except Exception as error:  # objects may raise anything where they are filled
+            raise restorer.missing(f"what fits ({type(error).__name__}: {error})") from error
+        if found is not existing:
             raise NotRestorableError(f"{name} is not what was recorded")
 
 
@@ -94,7 +100,8 @@ class _Restorer(LeafFiller):
         return [self.value(cell, old) for cell, old in zip(cells, known, strict=False)]
 
     def held(self, node: dict[str, Any]) -> NDArray[Any]:
-        array: NDArray[Any] = self._snapshot.arrays[node["array"]]
+        arrays, number = self._snapshot.arrays, node["array"]
+        array, arrays[number] = arrays[number], np.empty(0)
         return array
 
     def class_of(self, node: dict[str, Any], existing: Any) -> Any:
@@ -111,8 +118,8 @@ class _Restorer(LeafFiller):
             found = find(node["class"])
             if found is not None:
                 return found
-        if existing is MISSING:
-            raise self.missing(node["class"] or "a part")
+        if existing is MISSING or node["like"] not in ("", likeness(existing)):
+            raise self.missing(node["class"] or node["like"].strip() or "a part")
         return existing
 
     def _object(self, number: int, node: dict[str, Any], existing: Any) -> Any:
@@ -206,7 +213,11 @@ class _Restorer(LeafFiller):
     def _ndarray(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         # What has a memory of its own must not write into what another looks at.
         is_others = node["is_owner"] and is_view(existing)
-        return fill_array(self.held(node), MISSING if is_others else existing)
+        if node["writeable"] and isinstance(existing, np.ndarray):
+            is_others = is_others or not existing.flags.writeable
+        axes = node["axes"]
+        held = self.held(node).transpose([axes.index(axis) for axis in range(len(axes))])
+        return fill_array(held, MISSING if is_others else existing)
 
     def _view(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         base = self.value(node["base"], existing.base if is_view(existing) else MISSING)
@@ -227,7 +238,10 @@ class _Restorer(LeafFiller):
 
     def _method(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         owner = self.value(node["items"][0], getattr(existing, "__self__", MISSING))
-        return fill_method(node["name"], owner, existing)
+        try:
+            return fill_method(node["name"], owner, existing)
+        except LookupError as error:
+            raise self.missing(str(error)) from error
 
     def _objects(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         shape = tuple(node["shape"])
@@ -263,6 +277,7 @@ _FILLERS: dict[str, _Filler] = {
     "partial": _Restorer._partial,
     "complex": _Restorer._complex,
     "range": _Restorer._range,
+    "plain": _Restorer._plain,
     "enum": _Restorer._enum,
     "tensor": _Restorer._tensor,
     "optimizer": _Restorer._optimizer,

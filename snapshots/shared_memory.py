@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,14 @@ def bases(view: NDArray[Any]) -> Iterator[NDArray[Any]]:
         if base.flags.forc and not base.dtype.hasobject:
             yield base
         base = base.base
+
+
+def axes_in_memory(strides: Sequence[int]) -> list[int]:
+    """The axes of an array from the one with the longest strides to that with the shortest.
+
+    In that order its elements lie in memory, by which sums and products differ in their last bits.
+    """
+    return sorted(range(len(strides)), key=lambda axis: -abs(strides[axis]))
 
 
 def place_in(base: NDArray[Any], view: NDArray[Any]) -> dict[str, Any]:

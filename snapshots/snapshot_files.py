@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from snapshots.recording import Snapshot
 
-MAGIC = b"snapshot 2\n".ljust(16, b"\0")
+MAGIC = b"snapshot 3\n".ljust(16, b"\0")
 LONGEST_TREE = 1 << 30  # bytes
 _PIECE = 1 << 20  # bytes
 _CODE_AT = len(MAGIC)

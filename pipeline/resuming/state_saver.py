@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,7 @@ from snapshots.restoring import restore
 # Saving may take this share of the time, where the user has not said how often.
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
+FIRST_COST = 0.05  # seconds; of states of which nothing is known
 
 
 class StateSaver(StopAtSafeMoment):
@@ -77,7 +80,7 @@ class StateSaver(StopAtSafeMoment):
         self.started = WorkTime.now()
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
-        self.pause = interval.seconds or SHORTEST_INTERVAL
+        self.pause = interval.seconds or float(note.get("pause", FIRST_COST / SHARE_OF_TIME))
 
     @property
     def taken(self) -> WorkTime:
@@ -132,7 +135,8 @@ class StateSaver(StopAtSafeMoment):
         """Save the state as it is, which must be a moment between two updates."""
         begun = time.monotonic()
         try:
-            self._write()
+            with _garbage_left():
+                self._write()
         except NotRecordableError as error:
             self._give_up(f"no state can be kept: {one_line(error)}")
         except UserError as error:
@@ -140,6 +144,8 @@ class StateSaver(StopAtSafeMoment):
         except OSError as error:
             reason = error.strerror or one_line(error)
             self._tell_once(f"no state was saved: {self.run.state_path}: {reason}")
+        except MemoryError:
+            self._tell_once("no state was saved: there is no memory left for it")
         self.saved_at = time.monotonic()
         self.steps_at_save = self.model.num_timesteps
         if self.interval.seconds == 0:
@@ -160,6 +166,8 @@ class StateSaver(StopAtSafeMoment):
         if isinstance(environment, SubprocVecEnv):
             raise NotRecordableError("--vec-env subproc", "environments are in other processes")
         snapshot = record(self._roots(), _CONSTANTS)
+        for lost in snapshot.lost:
+            self._tell_once(f"{lost} is not kept: a run that goes by it may differ after --resume")
         note = {
             "folder": self._folder_names(),
             "log_folder": _log_folder(self.model),
@@ -167,6 +175,7 @@ class StateSaver(StopAtSafeMoment):
             "steps": self.model.num_timesteps,
             "rollouts": self.n_rollouts,
             **self.taken.as_data(),
+            "pause": self.pause,
             "spec": settings_digest(self.run.recorded_spec()),
         }
         save_state(self.run.state_path, self.n_saved + 1, snapshot, note)
@@ -201,6 +210,21 @@ class StateSaver(StopAtSafeMoment):
     def _folder_names(self) -> list[str]:
         """The run folder as it was given, and from the root."""
         return [str(self.run.path), str(self.run.path.absolute())]
+
+
+@contextmanager
+def _garbage_left() -> Iterator[None]:
+    """Do without the garbage collector: a state has no cycles, and may set off a search for them.
+
+    That goes through all that the libraries hold, and takes several times as long as the state.
+    """
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def _log_folder(model: BaseAlgorithm) -> str | None:

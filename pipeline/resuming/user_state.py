@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import enum
+import functools
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from types import BuiltinFunctionType, FunctionType, ModuleType
+from types import FunctionType, ModuleType
 from typing import Any
 
 from pipeline.user_modules import UserModule
 
-_CODE = (ModuleType, type, FunctionType, BuiltinFunctionType)
+_CODE = (ModuleType, type, FunctionType)
 
 
 def user_state(modules: Iterable[UserModule]) -> dict[str, dict[str, Any]]:
@@ -57,6 +58,11 @@ def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
     return bool(file) and Path(str(file)).parent == folder and folder != ours
 
 
+def _is_method(value: Any) -> bool:
+    """Whether a class's attribute is a method or the like, but for those that remember."""
+    return hasattr(type(value), "__get__") and not isinstance(value, functools._lru_cache_wrapper)
+
+
 def _values(holder: ModuleType | type) -> dict[str, Any]:
     """What is data of it: no code, and nothing that Python keeps there itself."""
     return {
@@ -64,5 +70,5 @@ def _values(holder: ModuleType | type) -> dict[str, Any]:
         for name, value in vars(holder).items()
         if not name.startswith(("__", "_abc_"))
         and not isinstance(value, _CODE)
-        and not (isinstance(holder, type) and hasattr(type(value), "__get__"))
+        and not (isinstance(holder, type) and _is_method(value))
     }

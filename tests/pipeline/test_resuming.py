@@ -1,5 +1,6 @@
 """A training that is cut off and gone on with ends in the bits of one that nobody disturbed."""
 
+import gc
 import io
 import json
 import zipfile
@@ -14,6 +15,7 @@ from agents import ALGORITHMS
 from pipeline.errors import UserError
 from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
+from pipeline.resuming.saved_states import SavedState
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.resuming.unfinished_runs import go_on, newest_unfinished, recorded_training
@@ -23,6 +25,7 @@ from pipeline.settings.hyperparam_entries import override, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
+from snapshots.recording import Snapshot
 
 GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
 ARMS, LINEAR = "BernoulliBandit-v0", "LinearBandit-v0"
@@ -325,6 +328,10 @@ def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     clock = [0.0]
     monkeypatch.setattr("pipeline.resuming.state_saver.time.monotonic", lambda: clock[0])
     saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    clock[0] = 2.4
+    assert not saver.wants_position()
+    clock[0] = 2.6
+    assert saver.wants_position()
 
     def write(self):
         clock[0] += 0.5
@@ -338,6 +345,21 @@ def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     assert not saver.wants_position()
     clock[0] += 0.2
     assert saver.wants_position()
+    known = SavedState(Snapshot(), {"pause": saver.pause})
+    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail, known)
+    assert saver.pause == 25.0
+    assert StateSaver(Run(tmp_path, ""), SaveInterval(30.0), pytest.fail, known).pause == 30.0
+
+
+def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
+    """To look for it among all that the libraries hold takes longer than a state."""
+    seen = []
+    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    monkeypatch.setattr(StateSaver, "_write", lambda _: seen.append(gc.isenabled()))
+    saver.model = type("Model", (), {"num_timesteps": 0})()
+    saver.save()
+    assert seen == [False]
+    assert gc.isenabled()
 
 
 def test_the_newest_unfinished_run(tmp_path, monkeypatch):

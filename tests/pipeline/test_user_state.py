@@ -63,6 +63,41 @@ def test_globals_and_attributes_of_classes_go_back(things):
     assert module.Thing is type(thing)
 
 
+def test_what_imports_and_remembers_is_no_obstacle(tmp_path, monkeypatch):
+    source = """
+import random
+from functools import lru_cache
+from numpy import mean
+from torch import tanh
+
+draw = random.Random(1).random
+
+@lru_cache
+def double(x):
+    return 2 * x
+
+class Thing:
+    @lru_cache
+    def triple(self, x):
+        return 3 * x
+"""
+    path = tmp_path / "things_that_remember.py"
+    path.write_text(source)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    modules = import_typed([str(path)])
+    module = sys.modules["things_that_remember"]
+    assert record({"it": user_state(modules)}).lost == []
+    module.double(1)
+    module.Thing.triple(None, 1)
+    module.draw()
+    snapshot = record({"it": user_state(modules)})
+    assert [line.partition("]")[2] for line in snapshot.lost] == ["['double']", "['triple']"]
+    after = module.draw()
+    restore(snapshot, {"it": user_state(modules)})
+    assert module.draw() == after
+    del sys.modules["things_that_remember"]
+
+
 def test_what_is_installed_is_left_alone():
     assert user_state(import_typed(["json"])) == {}
 
@@ -86,6 +121,18 @@ def test_a_disk_that_stays_full_is_told_once(tmp_path, monkeypatch):
     assert len(told) == 1
     assert told[0].endswith("No space left on device")
     assert not saver.is_off
+
+
+def test_without_memory_for_a_state_training_goes_on(tmp_path, monkeypatch):
+    saver, told = saver_of(tmp_path, monkeypatch)
+
+    def write(self):
+        raise MemoryError
+
+    monkeypatch.setattr(StateSaver, "_write", write)
+    saver.save()
+    saver.save()
+    assert told == ["no state was saved: there is no memory left for it"]
 
 
 def test_a_user_without_a_home_keeps_no_states(tmp_path, monkeypatch):
