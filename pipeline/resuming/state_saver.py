@@ -34,6 +34,8 @@ from snapshots.restoring import restore
 # Saving may take this share of the time, where the user has not said how often.
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
+# What was cut off may be so again soon, and has to get ahead each time.
+SECONDS_AFTER_GOING_ON = 0.1
 
 
 class StateSaver(StopAtSafeMoment):
@@ -73,7 +75,8 @@ class StateSaver(StopAtSafeMoment):
         self.seconds_before = float(note.get("seconds", 0.0))
         self.steps_at_save = 0
         self.saved_at = self.started = time.monotonic()
-        self.pause = interval.seconds or SHORTEST_INTERVAL
+        first_pause = SHORTEST_INTERVAL if state is None else SECONDS_AFTER_GOING_ON
+        self.pause = interval.seconds or first_pause
 
     @property
     def seconds(self) -> float:

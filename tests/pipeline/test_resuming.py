@@ -14,6 +14,7 @@ from agents import ALGORITHMS
 from pipeline.errors import UserError
 from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
+from pipeline.resuming.saved_states import SavedState
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.resuming.unfinished_runs import go_on, newest_unfinished, recorded_training
@@ -336,6 +337,15 @@ def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     assert not saver.wants_position()
     clock[0] += 0.2
     assert saver.wants_position()
+
+
+def test_what_goes_on_is_saved_sooner(tmp_path):
+    """Where it is cut off every few seconds, it gets ahead all the same."""
+    begun = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    state = SavedState(None, {"number": 3})
+    gone_on = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail, state)
+    asked = StateSaver(Run(tmp_path, ""), SaveInterval(seconds=30.0), pytest.fail, state)
+    assert [saver.pause for saver in (begun, gone_on, asked)] == [1.0, 0.1, 30.0]
 
 
 def test_the_newest_unfinished_run(tmp_path, monkeypatch):
