@@ -16,9 +16,9 @@ from pathlib import Path
 from signal import SIGINT, Signals
 from typing import Any, NoReturn
 
-from commands.exhaustion import exhaustion
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
+from pipeline.exhaustion import exhaustion
 from pipeline.stopping import default_for_signals, n_stops
 
 MISTAKE = 2

@@ -83,10 +83,12 @@ def _check_given(args: argparse.Namespace) -> None:
         UserError: naming the flag.
     """
     parser = build_parser()
+    for action in parser._actions:
+        action.default = argparse.SUPPRESS  # so that what is typed is there, also where it is that
+    typed = vars(parser.parse_args())
     allowed = {*_MAY_BE_GIVEN, *(() if args.resume else ("algo", "env"))}
     for action in parser._actions:
-        given = getattr(args, action.dest, action.default)
-        if action.dest not in allowed and given != action.default:
+        if action.dest in typed and action.dest not in allowed:
             flag = action.option_strings[-1]
             raise UserError(f"{flag} cannot be given with --resume: it is as the run has it")
 

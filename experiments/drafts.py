@@ -139,17 +139,18 @@ def _remove_empty(folder: Path) -> None:
         folder.parent.rmdir()
 
 
-def leave_drafts(root: Path, name: str, *, with_states: bool = False) -> None:
+def leave_drafts(root: Path, name: str) -> None:
     """Remove what this process, or one that is gone, has not finished of a run.
+
+    What can be gone on from stays.
 
     Args:
         root: the study's folder.
         name: of the run, see `run_name`.
-        with_states: also what could be gone on from.
     """
     for draft in _drafts(root):
         is_left = _run_of(draft) == name and (_is_own(draft) or _is_dead(draft))
-        if is_left and (with_states or not holds_state(draft)):
+        if is_left and not holds_state(draft):
             remove_draft(draft)
     _remove_empty(root / FOLDER)
 

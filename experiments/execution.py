@@ -13,7 +13,6 @@ from pathlib import Path
 from experiments.child_processes import (
     NO_LIMITS,
     StoppedError,
-    TaskDiedError,
     TaskFailedError,
     local_executor,
     supervise,
@@ -124,8 +123,6 @@ def _supervised_run(
     except StoppedError:
         return None
     except TaskFailedError as error:
-        if not isinstance(error, TaskDiedError):
-            leave_drafts(root, name, with_states=True)  # the next try begins anew
         return RunFailure(planned, str(error), _kept(log, error.details))
     except (OSError, EOFError, RuntimeError) as error:  # no room, process, thread or file left
         reason = f"its process could not be started: {one_line(error)}"

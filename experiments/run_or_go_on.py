@@ -10,7 +10,9 @@ from rich.console import Console
 from experiments.bandit_batches import do_batch
 from experiments.drafts import claim_draft, holds_state
 from experiments.planned_runs import PlannedRun
+from pipeline.broken_runs import is_of_the_machine
 from pipeline.errors import UserError
+from pipeline.resuming.state_folder import remove_states
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.unfinished_runs import go_on
 from pipeline.run_folder import Run
@@ -34,7 +36,12 @@ def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
         do_batch(planned.spec, planned.n_runs, run, command)
         return
     args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
-    train(planned.spec, Console(quiet=True), args, command, run, keeping)
+    try:
+        train(planned.spec, Console(quiet=True), args, command, run, keeping)
+    except Exception as error:
+        if not is_of_the_machine(error):
+            remove_states(run.state_path)  # the next try begins anew, maybe with other code
+        raise
 
 
 def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
-from typing import Any
 
 from pipeline.errors import UserError, one_line
+from pipeline.exhaustion import exhaustion
 from pipeline.files import DISK_ERRORS
-from pipeline.finite_numbers import NotFiniteError, check_model
 from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.library_errors import LibraryError
 from pipeline.preparation import Training
 from pipeline.run_folder import INTERRUPTED
 from pipeline.worker_processes import close_environments
@@ -40,10 +40,10 @@ def give_up(training: Training, error: BaseException) -> None:
             no more.
     """
     run, is_new = training.run, not training.keeping.goes_on
-    is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt)
+    is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt | LibraryError)
     if is_new and is_expected and not has_begun(training):
         run.discard()
-        if not isinstance(error, ValueError):  # an OSError says for itself which file it was
+        if not isinstance(error, ValueError):  # the others say for themselves what it was
             return
         message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
         raise UserError(message) from error
@@ -56,15 +56,11 @@ def give_up(training: Training, error: BaseException) -> None:
         raise UserError(f"{error.filename}: {error.strerror}: {when}") from error
 
 
-def blame_weights(model: Any, error: Exception) -> None:
-    """Say that an agent's weights are at fault, where they are.
-
-    PyTorch refuses distributions of nan, and does not say where they come from.
-
-    Raises:
-        NotFiniteError: naming them.
-    """
-    try:
-        check_model(model)
-    except NotFiniteError as cause:
-        raise cause from error
+def is_of_the_machine(error: BaseException | None) -> bool:
+    """Whether a run has failed by a full disk or memory, and by no fault of its own."""
+    while error is not None:
+        is_of_disk = isinstance(error, OSError) and error.errno in DISK_ERRORS
+        if is_of_disk or exhaustion(error) is not None:
+            return True
+        error = error.__cause__
+    return False

@@ -15,13 +15,14 @@ from rich.console import Console
 
 from mdp.machine_code import compile_timer
 from mdp.work_time import WorkTime
-from pipeline.broken_runs import blame_weights, close, give_up, has_begun
+from pipeline.broken_runs import close, give_up, has_begun
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.files import naming
 from pipeline.finishing import draw, judge, save
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.leftovers import remove_leftovers
+from pipeline.library_errors import blame_settings, blame_weights
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
 from pipeline.pull_recording import PullSummary
 from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
@@ -226,8 +227,9 @@ def _learn(training: Training) -> None:
                 reset_num_timesteps=spec.trained_agent is None,
                 **kwargs,
             )
-    except (ValueError, RuntimeError) as error:
-        blame_weights(training.model, error)
+    except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as e:
+        blame_weights(training.model, e)
+        blame_settings(spec.algo, training.model, e)
         raise
 
 

@@ -138,7 +138,12 @@ class TabularAlgorithm(MaskKeeper):
     def _make_policy(self) -> QTablePolicy:
         policy = super()._make_policy()
         noise = self.rng.standard_normal(policy.q_tables.shape)
-        policy.q_tables.copy_(th.from_numpy(self.initial_q + self.initial_q_std * noise))
+        with np.errstate(over="ignore"):
+            tables = self.initial_q + self.initial_q_std * noise
+        if not np.isfinite(tables).all():
+            given = f"{self.initial_q:g} and {self.initial_q_std:g}"
+            raise ValueError(f"initial_q and initial_q_std must give finite values, not {given}")
+        policy.q_tables.copy_(th.from_numpy(tables))
         return policy
 
     def _make_exploration_schedule(self) -> Schedule:

@@ -1,19 +1,23 @@
-"""How long the files are that a training only appends to, and back to that length."""
+"""What the files hold that a training only appends to, and back to that."""
 
 from __future__ import annotations
 
 import contextlib
 import os
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.errors import UserError
 
 EVENT_FILES = "events.out.tfevents.*"
+_PIECE = 1 << 20  # bytes
+
+Position = tuple[int, int]  # a file's length in bytes, and the checksum of them
 
 
-def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, int]:
-    """The lengths in bytes of Monitor's and TensorBoard's files.
+def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Position]:
+    """How far Monitor's and TensorBoard's files have come.
 
     Args:
         run_folder: where Monitor writes.
@@ -22,26 +26,25 @@ def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, int]:
     Returns:
         By path: of Monitor's files relative to the run folder, of the others from the root.
     """
-    lengths = {path.name: path.stat().st_size for path in _monitor_files(run_folder)}
-    for path in _event_files(log_folder):
-        lengths[str(path)] = path.stat().st_size
-    return lengths
+    paths = {path.name: path for path in _monitor_files(run_folder)}
+    paths |= {str(path): path for path in _event_files(log_folder)}
+    return {name: _position(path, path.stat().st_size) for name, path in paths.items()}
 
 
-def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, int]) -> None:
+def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, Position]) -> None:
     """Remove what was appended since, and the files that were begun since.
 
     Raises:
-        UserError: if a file is missing, or shorter than it was.
+        UserError: if a file is missing, or does not begin with what it held.
     """
-    for name, length in positions.items():
+    for name, position in positions.items():
         path = run_folder / name  # or the name itself, where that begins at the root
-        if not path.is_file() or path.stat().st_size < length:
+        if not path.is_file() or _position(path, position[0]) != tuple(position):
             raise UserError(f"{path} is not as the run left it: it cannot go on from its state")
     for path in [*_monitor_files(run_folder), *_event_files(log_folder)]:
         name = path.name if path.parent == run_folder else str(path)
         if name in positions:
-            os.truncate(path, positions[name])
+            os.truncate(path, positions[name][0])
         else:
             path.unlink()
 
@@ -52,6 +55,15 @@ def remove_events(log_folder: str) -> None:
         path.unlink()
     with contextlib.suppress(OSError):
         Path(log_folder).rmdir()
+
+
+def _position(path: Path, length: int) -> Position:
+    """Where a file is after so many bytes, or at its end if that comes before."""
+    n_read = checksum = 0
+    with path.open("rb") as file:
+        while piece := file.read(min(_PIECE, length - n_read)):
+            n_read, checksum = n_read + len(piece), zlib.crc32(piece, checksum)
+    return n_read, checksum
 
 
 def _monitor_files(run_folder: Path) -> list[Path]:

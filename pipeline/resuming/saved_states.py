@@ -69,7 +69,7 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
         UserError: if there are some, and none is whole or this user's.
     """
     key, found, reasons = state_key(), [], []
-    for path in state_files(folder):
+    for path in filter(Path.is_file, state_files(folder)):  # a pipe would be waited for
         try:
             found.append(SavedState(*read_snapshot(path, key)))
         except FileNotFoundError:

@@ -38,6 +38,8 @@ from snapshots.restoring import restore
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
 FIRST_COST = 0.05  # seconds; of states of which nothing is known
+# What was cut off may be so again soon, and has to get ahead each time.
+SECONDS_AFTER_GOING_ON = 0.1
 
 
 class StateSaver(StopAtSafeMoment):
@@ -80,7 +82,7 @@ class StateSaver(StopAtSafeMoment):
         self.started = WorkTime.now()
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
-        self.pause = interval.seconds or float(note.get("pause", FIRST_COST / SHARE_OF_TIME))
+        self.pause = interval.seconds or _first_pause(state)
 
     @property
     def taken(self) -> WorkTime:
@@ -225,6 +227,17 @@ def _garbage_left() -> Iterator[None]:
     finally:
         if was_on:
             gc.enable()
+
+
+def _first_pause(state: SavedState | None) -> float:
+    """Seconds until the first state, where the user has not said how often.
+
+    A training that begins waits until a state is likely to be `SHARE_OF_TIME` of it; one that goes
+    on no longer than saving took before, since it may be cut off again as soon.
+    """
+    if state is None:
+        return FIRST_COST / SHARE_OF_TIME
+    return max(float(state.note.get("pause", 0.0)) * SHARE_OF_TIME, SECONDS_AFTER_GOING_ON)
 
 
 def _log_folder(model: BaseAlgorithm) -> str | None:

@@ -88,6 +88,10 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
     paths = ("tensorboard_log", "trained_agent")
     given = {name: None if data[name] is None else Path(data[name]) for name in paths}
     raw = data.pop("hyperparams")
+    if not isinstance(raw, dict) or environment_name(str(data["env_id"])) != run.env_name:
+        raise UserError(
+            f"{run.info_path} is damaged: its hyperparameters or its names are not ours"
+        )
     spec = TrainSpec(
         **{
             **data,
@@ -139,7 +143,8 @@ def _settings(spec: Mapping[str, Any], any_seed: bool) -> Any:
 
 
 def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
-    before, now = run.read_info().get("versions") or {}, recorded_versions()
+    versions, now = run.read_info().get("versions"), recorded_versions()
+    before = versions if isinstance(versions, dict) else {}
     changed = [
         f"{name} {before[name]} -> {now[name]}"
         for name in now

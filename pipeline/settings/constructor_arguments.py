@@ -12,6 +12,7 @@ from pipeline.errors import UserError, shown, unknown
 from pipeline.settings.coercion import ScheduleSpec, coerce
 
 _FINITE = sys.float_info.max
+_LARGEST_WHOLE = 2**63 - 1
 _STARRED = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
 
 # Bounds, both included, of hyperparameters that mean the same in every algorithm.
@@ -21,7 +22,8 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "n_envs": (1, _FINITE),
     "frame_stack": (1, _FINITE),
     "noise_std": (0, _FINITE),
-    "learning_rate": (0, _FINITE),
+    # Above that a network's first step has no single precision any more.
+    "learning_rate": (0, 1e37),
     "gamma": (0, 1),
     "gae_lambda": (0, 1),
     "tau": (0, 1),
@@ -120,7 +122,7 @@ def check_arguments(
 
 
 def check_range(name: str, value: object, where: str) -> None:
-    """Refuse a number, or an end of a schedule, outside of `RANGES`.
+    """Refuse a number, or an end of a schedule, outside of `RANGES`, or that no array can hold.
 
     Raises:
         UserError: saying what the bounds are.
@@ -130,6 +132,8 @@ def check_range(name: str, value: object, where: str) -> None:
         check_range(name, value.end, where)
     if isinstance(value, tuple) and value:
         check_range(name, value[0], where)
+    if isinstance(value, int) and abs(value) > _LARGEST_WHOLE:
+        raise UserError(f"{where}: {name} must be at most {_LARGEST_WHOLE:,}, not {shown(value)}")
     if name in RANGES and isinstance(value, int | float):
         low, high = RANGES[name]
         if not low <= value <= high:

@@ -206,6 +206,10 @@ def test_every_combination_trains(algorithm, exploration, learning_rate):
     ("arguments", "complaint"),
     [
         ({"gamma": 1.5}, "gamma must lie between 0 and 1"),
+        (
+            {"initial_q_std": 1e308},
+            "initial_q and initial_q_std must give finite values, not 0 and 1",
+        ),
         ({"exploration": "greedy"}, "exploration must be one of epsilon_greedy"),
         ({"tie_breaking": "last"}, "tie_breaking must be one of random, first"),
         ({"exploration_decay": "cosine"}, "exploration_decay must be one of"),

@@ -69,6 +69,21 @@ class Killed(Walk):
             os.kill(os.getpid(), signal.SIGKILL)
 
 
+class KilledLater(Walk):
+    """Kills its process once, when there is a state; says what its first step is after that."""
+
+    def act(self):
+        mark = Path(os.environ["FRAGILE_MARK"])
+        if mark.exists():
+            if not mark.read_text():
+                mark.write_text(str(self.steps))
+        elif self.steps == 30:
+            time.sleep(1.1)
+        elif self.steps == 60:
+            mark.touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
 class Slow(Walk):
     """Takes its time while there is no file that says it may hurry."""
 
@@ -100,7 +115,7 @@ class Late(Walk):
             time.sleep(0.05)
 
 
-for kind in (Fragile, Killed, Slow, Leaves, Refuses, Late):
+for kind in (Fragile, Killed, KilledLater, Slow, Leaves, Refuses, Late):
     gym.register(f"{kind.__name__}-v0", entry_point=kind, max_episode_steps=20)
 '''
 
@@ -276,6 +291,13 @@ def test_a_killed_worker_costs_nothing(folder):
     assert sorted(rows(study)["seed"]) == [0, 1, 2]
     assert not (study / ".drafts").exists()
     assert not (study / "failures").exists()
+
+
+def test_what_a_killed_worker_has_saved_is_gone_on_with(folder):
+    words = ["--env", "KilledLater-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+    code, _, err = finish(*words, "--seeds", 1, "-n", 500, "--no-report", "-f", "studies")
+    assert (code, err) == (0, "")
+    assert int((folder / "mark").read_text()) > 1
 
 
 def is_alive(pid):

@@ -120,14 +120,6 @@ def test_a_state_is_kept_for_a_run_that_is_still_to_do(tmp_path, dead_pid):
     assert not tmp_path.exists()
 
 
-def test_a_run_that_is_over_leaves_no_state(tmp_path, dead_pid, live_pid):
-    draft_of(tmp_path, dead_pid, state=True)
-    others = draft_of(tmp_path, live_pid, state=True)
-    another = draft_of(tmp_path, dead_pid, state=True, run="qlearning@lake_2")
-    leave_drafts(tmp_path, RUN, with_states=True)
-    assert sorted((tmp_path / ".drafts").iterdir()) == sorted([others, another])
-
-
 def test_what_this_process_has_left_without_a_state_is_removed(tmp_path):
     draft = draft_of(tmp_path, os.getpid())
     leave_drafts(tmp_path, "another run")

@@ -8,14 +8,15 @@ from concurrent.futures import Future
 import pytest
 import yaml
 
-from experiments import execution
+from experiments import execution, run_or_go_on
 from experiments.child_processes import StoppedError, TaskFailedError
-from experiments.drafts import draft_path
+from experiments.drafts import draft_path, leave_drafts, run_name
 from experiments.execution import available_cores, execute, execute_on, failure_log
 from experiments.run_in_child import do_planned_run, do_run
 from experiments.run_limits import RunLimits
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
 
 LAKE = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_timesteps": 20})
 
@@ -70,6 +71,38 @@ def test_tensorboard_logs_of_an_earlier_try_are_removed(tmp_path):
     do_run(planned, draft_path(tmp_path, planned), "compare.py s.yml")
     assert not old.exists()
     assert list(planned.spec.tensorboard_log.rglob("events.out.tfevents.*"))
+
+
+FULL = OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("error", "cause", "is_kept"),
+    [
+        (UserError("the disk takes no more"), FULL, True),
+        (MemoryError(), None, True),
+        (RuntimeError("DefaultCPUAllocator: can't allocate memory"), None, True),
+        (UserError("reward at step 3 is nan"), None, False),
+        (RuntimeError("thin ice"), None, False),
+        (FileNotFoundError(errno.ENOENT, "the environment's own file"), None, False),
+    ],
+)
+def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(
+    tmp_path, monkeypatch, error, cause, is_kept
+):
+    planned, _ = runs_of(tmp_path)
+    draft = draft_path(tmp_path, planned)
+
+    def fail(*_):
+        (draft / "state").mkdir()
+        (draft / "state" / "odd.state").touch()
+        raise error from cause
+
+    monkeypatch.setattr(run_or_go_on, "train", fail)
+    with pytest.raises(type(error)):
+        do_run(planned, draft, "compare.py s.yml")
+    leave_drafts(tmp_path, run_name(planned))
+    assert draft.exists() == is_kept
 
 
 class InPlace:

@@ -3,6 +3,7 @@
 import gc
 import io
 import json
+import os
 import zipfile
 from dataclasses import replace
 
@@ -362,6 +363,15 @@ def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
     assert gc.isenabled()
 
 
+def test_what_goes_on_is_saved_sooner(tmp_path):
+    """Where it is cut off every few seconds, it gets ahead all the same."""
+    begun = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    state = SavedState(None, {"number": 3})
+    gone_on = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail, state)
+    asked = StateSaver(Run(tmp_path, ""), SaveInterval(seconds=30.0), pytest.fail, state)
+    assert [saver.pause for saver in (begun, gone_on, asked)] == [1.0, 0.1, 30.0]
+
+
 def test_the_newest_unfinished_run(tmp_path, monkeypatch):
     spec = spec_of(tmp_path, GRID, "qlearning", 300, {})
     first = cut_off(spec, monkeypatch)
@@ -372,3 +382,30 @@ def test_the_newest_unfinished_run(tmp_path, monkeypatch):
         newest_unfinished(tmp_path, "qlearning", GRID)
     with pytest.raises(UserError, match="none at all"):
         newest_unfinished(tmp_path, "sarsa", GRID)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"spec": {}}, "does not say what it was asked for"),
+        ({"spec": {"env_id": GRID, "hyperparams": [1]}}, "run.json is damaged"),
+        ({"spec": {"env_id": "Other-v0", "hyperparams": {}}}, "run.json is damaged"),
+        ({"spec": {"env_id": 3, "hyperparams": {}}}, "run.json is damaged"),
+    ],
+)
+def test_a_record_that_was_edited_is_refused(tmp_path, changes, said):
+    run = Run.claim(tmp_path, "qlearning", GRID)
+    run.update_info(**changes)
+    with pytest.raises(UserError, match=said):
+        recorded_training(run, ())
+
+
+def test_of_versions_that_are_none_nothing_is_said(tmp_path):
+    run = Run.claim(tmp_path, "qlearning", GRID)
+    run.update_info(versions=["torch"])
+    assert go_on(run, StateKeeping(), pytest.fail).goes_on
+
+
+def test_a_pipe_in_the_place_of_a_state_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "odd.state")
+    assert saved_states.newest_state(tmp_path, pytest.fail) is None
