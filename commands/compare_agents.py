@@ -8,7 +8,7 @@ import signal
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from commands.flag_values import (
     COUNT,
@@ -43,6 +43,7 @@ examples:
   python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --n-episodes 500
   python compare.py studies/warehouse-learning-rate.yml
   python compare.py studies/warehouse-learning-rate.yml --quick
+  python compare.py studies/warehouse-learning-rate.yml --until-decided
   python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
 
 The same command again does the runs that are missing, and no other.
@@ -68,6 +69,12 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="the first of them (default: the study's, or 0)",
     )
+    add(
+        "--until-decided",
+        action="store_true",
+        help="more seeds for agents in undecided pairs, at looks that are settled beforehand",
+    )
+    add("--max-seeds", type=SEEDS, metavar="N", help="how many seeds that may take (default: 50)")
     add("-n", "--n-timesteps", type=COUNT, metavar="N", help="environment steps of each run")
     add("--n-episodes", type=COUNT, metavar="N", help="episodes instead of steps")
     add(
@@ -185,7 +192,9 @@ def _compare(args: argparse.Namespace) -> int:
 
     with folder_lock(root, stop, say):
         try:
-            return _do_study(args, study, planned, console, limits)
+            if args.until_decided:
+                return _grow_study(args, study, root, console, limits)
+            return _do_study(args, study, planned, root, console, limits)
         except KeyboardInterrupt:
             end_server()
             raise
@@ -195,10 +204,53 @@ def _do_study(
     args: argparse.Namespace,
     study: StudySpec,
     planned: Sequence[PlannedRun],
+    root: Path,
     console: Console,
     limits: RunLimits,
 ) -> int:
-    root = Path(args.log_folder) / study.name
+    """Do a study with the seeds that it has, once it is known how often it was looked at."""
+    from experiments.looks_file import read_looks
+
+    read_looks(root)
+    _prepare(args, study, planned, root, console)
+    from commands.study_output import run_study
+
+    return run_study(console, study, planned, root, command_line(), limits=limits, **_how(args))
+
+
+def _grow_study(
+    args: argparse.Namespace,
+    study: StudySpec,
+    root: Path,
+    console: Console,
+    limits: RunLimits,
+) -> int:
+    """Do a study with more and more seeds, as was settled before the first look."""
+    from experiments.growing import counts_of, grown, settle, settled_looks
+    from experiments.study_plan import plan
+
+    looks = settled_looks(study, root, args.max_seeds)
+    counts = counts_of(study, looks)
+    planned = plan(grown(study, counts), root, counts)
+    _prepare(args, grown(study, counts), planned, root, console)
+    settle(root, looks)
+    from commands.growing_output import grow_study
+
+    return grow_study(console, study, counts, root, command_line(), limits=limits, **_how(args))
+
+
+def _how(args: argparse.Namespace) -> dict[str, Any]:
+    return {"n_workers": max(args.jobs, 0), "with_page": not args.no_report}
+
+
+def _prepare(
+    args: argparse.Namespace,
+    study: StudySpec,
+    planned: Sequence[PlannedRun],
+    root: Path,
+    console: Console,
+) -> None:
+    """Make sure that the runs can be done, before any is; and load the libraries for them."""
     if args.repair:
         from commands.study_output import repair
 
@@ -214,16 +266,6 @@ def _do_study(
         if any(run.is_to_do for run in planned):
             start_server(warm_ups(planned))  # it imports the libraries while this process does
         activity.now("loading the libraries")
-        from commands.study_output import run_study
+        import commands.study_output  # noqa: F401  # what it imports takes long
 
         check_settings(study, planned)
-    return run_study(
-        console,
-        study,
-        planned,
-        root,
-        command_line(),
-        n_workers=max(args.jobs, 0),
-        with_page=not args.no_report,
-        limits=limits,
-    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from rich.console import Console
 from commands.study_progress import StudyProgress
 from experiments.child_processes import NO_LIMITS
 from experiments.execution import RunFailure, available_cores, execute
+from experiments.looks import Standing
 from experiments.planned_runs import PlannedRun
 from experiments.repair import move_damaged_aside
 from experiments.replaced_runs import move_replaced_aside
@@ -51,14 +52,45 @@ def run_study(
     Returns:
         The exit code: 0 if all runs are there and sound, else 1.
     """
-    _make_way(console, planned, root)
-    n_workers = n_workers or available_cores()
-    failures = _do_missing(console, planned, root, command, n_workers, limits)
+    failures = do_missing(console, planned, root, command, n_workers, limits)
+    results = read(console, study, planned, root)
+    return conclude(console, results, failures, command, with_page=with_page)
+
+
+def read(
+    console: Console, study: StudySpec, planned: Sequence[PlannedRun], root: Path
+) -> StudyResults:
+    """Read the runs that there are."""
     with doing(console, "reading the results") as activity:
-        results = read_results(study, planned, root, activity.at)
+        return read_results(study, planned, root, activity.at)
+
+
+def conclude(
+    console: Console,
+    results: StudyResults,
+    failures: Sequence[RunFailure],
+    command: str,
+    *,
+    with_page: bool,
+    looks: Mapping[str, Standing] | None = None,
+) -> int:
+    """Print the judgement, write tables, figures and page, and say which runs are missing and why.
+
+    Args:
+        console: where to.
+        results: the runs that there are.
+        failures: those that failed.
+        command: the command that asked for it.
+        with_page: draw the figures and write the page, beside the tables.
+        looks: by environment, the look that has been taken; None for one that is taken now.
+
+    Returns:
+        The exit code, as of `run_study`.
+    """
+    planned = results.planned
     try:
         if len(results.summary):
-            _judge(console, results, command, with_page=with_page)
+            _judge(console, results, command, looks, with_page=with_page)
             _print_mixed_versions(console, results)
     finally:
         for failure in failures:
@@ -66,10 +98,10 @@ def run_study(
         _print_left_out(console, results.left_out)
     if results.n_unchecked:
         runs = "1 run" if results.n_unchecked == 1 else f"{results.n_unchecked} runs"
-        _say(console, f"{runs} of an earlier version recorded no digests: damage may go unseen")
+        say(console, f"{runs} of an earlier version recorded no digests: damage may go unseen")
     n_missing = len(planned) - len(results.finished)
     if n_missing > len(failures) + len(results.left_out):
-        _say(console, f"{n_missing} of {len(planned)} runs are missing; the same command goes on")
+        say(console, f"{n_missing} of {len(planned)} runs are missing; the same command goes on")
     return 1 if n_missing else 0
 
 
@@ -77,7 +109,7 @@ def _make_way(console: Console, planned: Sequence[PlannedRun], root: Path) -> No
     moved, place = move_replaced_aside(planned, root)
     if place is not None:
         runs = "1 run that is" if len(moved) == 1 else f"{len(moved)} runs that are"
-        _say(console, f"{runs} done again: what was there is in {place} now")
+        say(console, f"{runs} done again: what was there is in {place} now")
 
 
 def _print_mixed_versions(console: Console, results: StudyResults) -> None:
@@ -85,7 +117,7 @@ def _print_mixed_versions(console: Console, results: StudyResults) -> None:
 
     note = mixed_versions(run.run.read_info() for run in results.finished)
     if note:
-        _say(console, note)
+        say(console, note)
 
 
 def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) -> None:
@@ -93,13 +125,13 @@ def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) ->
     with doing(console, "looking for damaged runs") as activity:
         moved = move_damaged_aside(study, planned, activity.at)
     for damaged, place in moved:
-        _say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
+        say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
 
 
 def _print_failure(console: Console, failure: RunFailure) -> None:
     run = failure.planned
     details = "the details could not be written" if failure.log is None else f"see {failure.log}"
-    _say(
+    say(
         console,
         f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}; {details}",
     )
@@ -107,11 +139,11 @@ def _print_failure(console: Console, failure: RunFailure) -> None:
 
 def _print_left_out(console: Console, left_out: Sequence[LeftOut]) -> None:
     for damaged in left_out:
-        _say(console, f"left out: {_whose(damaged)}")
+        say(console, f"left out: {_whose(damaged)}")
     if left_out:
         n_runs = sum(damaged.planned.n_runs for damaged in left_out)
         runs = "1 run is" if n_runs == 1 else f"{n_runs} runs are"
-        _say(console, f"{runs} damaged and in no figure; --repair does such runs again")
+        say(console, f"{runs} damaged and in no figure; --repair does such runs again")
 
 
 def _whose(damaged: LeftOut) -> str:
@@ -122,19 +154,24 @@ def _whose(damaged: LeftOut) -> str:
     return f"{run.agent} on {run.environment}, {seeds}: {damaged.reason}"
 
 
-def _say(console: Console, line: str) -> None:
+def say(console: Console, line: str) -> None:
+    """Print a line as it is."""
     console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
-def _do_missing(
+def do_missing(
     console: Console,
     planned: Sequence[PlannedRun],
     root: Path,
     command: str,
     n_workers: int,
     limits: RunLimits,
+    given_up: Collection[Path] = (),
 ) -> list[RunFailure]:
-    missing = [run for run in planned if run.is_to_do]
+    """Do the runs that are missing, but for those whose folders are given up; which failed."""
+    _make_way(console, planned, root)
+    n_workers = n_workers or available_cores()
+    missing = [run for run in planned if run.is_to_do and run.path not in given_up]
     done = [run for run in planned if run.is_finished]
     console.print(
         f"{len(planned)} runs, {len(done)} of them there already; {n_workers} at once, in {root}",
@@ -147,12 +184,20 @@ def _do_missing(
         return execute(missing, root, command, n_workers, progress.note, limits)
 
 
-def _judge(console: Console, results: StudyResults, command: str, *, with_page: bool) -> None:
+def _judge(
+    console: Console,
+    results: StudyResults,
+    command: str,
+    looks: Mapping[str, Standing] | None,
+    *,
+    with_page: bool,
+) -> None:
     with doing(console, "judging the agents") as activity:
         from experiments.analysis import analyse
+        from experiments.looking import take_looks
         from report.terminal_tables import print_analysis, print_episodes_table
 
-        analysis = analyse(results, activity.at)
+        analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
     print_analysis(console, analysis)
     width = results.study.episodes_table
     with doing(console, "writing the tables") as activity:

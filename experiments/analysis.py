@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-import pandas as pd
 
-from experiments.reliability import agents_without_chance, failures, speeds
-from experiments.seed_values import RESAMPLING_SEED, values_over_seeds
+from experiments.evidence import Evidence, evidence_on
+from experiments.looks import Standing
+from experiments.overall_analysis import OverallAnalysis, analyse_overall
+from experiments.reliability import failures, speeds
+from experiments.seed_values import RESAMPLING_SEED
 from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
 from mdp.array_types import Floats
@@ -17,27 +19,20 @@ from pipeline.environments import trains_on_variant
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import (
     FEWEST_SEEDS,
-    Band,
     Estimate,
     FailureCount,
     PairComparison,
     SpeedComparison,
     Summary,
     ThresholdSummary,
-    compare_pairs,
+    describe_pairs,
     estimate,
     fail_more_often,
-    fewest_seeds,
-    level_of_look,
-    performance_profile,
-    probability_of_improvement,
+    grow,
+    judge_pairs,
     summarise,
     summarise_steps,
 )
-
-LOOK = 1  # how often a study has been looked at
-ALPHA = 0.05  # of the studies, at most, say anything wrong on an environment
-MARGIN = 0.02  # of the way from the best blind policy to the optimum
 
 
 @dataclass(frozen=True)
@@ -102,6 +97,8 @@ class EnvironmentAnalysis:
         failures: by agent, the runs that failed; empty where nothing says what that is.
         unreliable: the pairs of agents of which the first is shown to fail more often.
         speeds: every two agents, as to which of them stays above the threshold sooner.
+        seeds: by agent, how many seeds it was to have.
+        look: which look at these runs it is.
     """
 
     environment: str
@@ -118,23 +115,8 @@ class EnvironmentAnalysis:
     failures: Mapping[str, FailureCount] = field(default_factory=dict)
     unreliable: tuple[tuple[str, str], ...] = ()
     speeds: tuple[SpeedComparison, ...] = ()
-
-
-@dataclass(frozen=True)
-class OverallAnalysis:
-    """How the agents compare over all environments, by their scores.
-
-    Attributes:
-        scores: estimates by agent, the best first.
-        improvement: by two agents' labels, the probability that the first scores higher.
-        thresholds: scores at which the profiles are given, shape (n,).
-        profiles: by agent, the share of runs that score higher than each of them.
-    """
-
-    scores: Mapping[str, Summary]
-    improvement: Mapping[tuple[str, str], Estimate]
-    thresholds: Floats
-    profiles: Mapping[str, Band]
+    seeds: Mapping[str, int] = field(default_factory=dict)
+    look: Standing = field(default_factory=Standing)
 
 
 @dataclass(frozen=True)
@@ -157,59 +139,84 @@ class StudyAnalysis:
         return self.results.study
 
 
-def analyse(results: StudyResults, tell: Tell = tell_nobody) -> StudyAnalysis:
-    """Judge the runs of a study."""
+def analyse(
+    results: StudyResults, tell: Tell = tell_nobody, looks: Mapping[str, Standing] | None = None
+) -> StudyAnalysis:
+    """Judge the runs of a study.
+
+    Args:
+        results: the runs.
+        tell: told how far it is.
+        looks: by environment, which look at its runs this is; the first, where it is not said.
+    """
     environments = []
     for environment in results.study.environments:
         tell(environment.label)
-        if (results.summary["environment"] == environment.label).any():
-            environments.append(_analyse_environment(results, environment.label))
+        evidence = evidence_on(results, environment.label)
+        if evidence is not None:
+            look = (looks or {}).get(environment.label, Standing())
+            environments.append(_analyse_environment(results, evidence, look))
     tell("all environments")
-    return StudyAnalysis(results, tuple(environments), _analyse_overall(results))
+    return StudyAnalysis(results, tuple(environments), analyse_overall(results))
 
 
-def _first(table: pd.DataFrame, column: str) -> float | None:
-    known = table[column].dropna()
-    return None if known.empty else float(known.iloc[0])
-
-
-def _analyse_environment(results: StudyResults, environment: str) -> EnvironmentAnalysis:
-    study, table = results.study, results.summary
+def _analyse_environment(
+    results: StudyResults, evidence: Evidence, look: Standing
+) -> EnvironmentAnalysis:
+    study, table, environment = results.study, results.summary, evidence.environment
     table = table[table["environment"] == environment]
-    metric = values_over_seeds(results, environment, study.metric)
     sign = -1.0 if study.metric in COSTS else 1.0
     agents = [_analyse_agent(results, environment, agent.label) for agent in study.agents]
     missing = {agent.agent: agent.n_missing for agent in agents}
     agents = [agent for agent in agents if agent.n_runs]
     agents.sort(key=lambda agent: _rank(sign * agent.metric.mean.point), reverse=True)
-    optimum, blind = _first(table, "optimum"), _first(table, "best_blind")
-    margin = study.margin
-    if margin is None:
-        span = 0.0 if optimum is None or blind is None else optimum - blind
-        margin = MARGIN * span
     names = [agent.agent for agent in agents]
-    scores = {name: sign * metric[name] for name in names}
-    certain = agents_without_chance(results, table)
-    level = level_of_look(ALPHA, LOOK)
-    pairs = compare_pairs(scores, margin, seed=RESAMPLING_SEED, look=LOOK, certain=certain)
-    failed = failures(study.metric, scores, blind, level, certain)
-    n_tested = sum(not pair.certain for pair in pairs)
+    scores = {name: evidence.scores[name] for name in names}
+    failed = failures(study.metric, scores, evidence.best_blind, look.level, evidence.certain)
+    fewest = evidence.fewest(look.level)
     return EnvironmentAnalysis(
         environment=environment,
         env_id=str(table["env_id"].iloc[0]),
-        optimum=optimum,
-        best_blind=blind,
-        threshold=_first(table, "threshold"),
-        margin=margin,
+        optimum=evidence.optimum,
+        best_blind=evidence.best_blind,
+        threshold=evidence.threshold,
+        margin=evidence.margin,
         exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is no False here
         agents=tuple(agents),
-        pairs=tuple(pairs),
+        pairs=tuple(_pairs(evidence, names, look)),
         missing=missing,
-        fewest=max(fewest_seeds(level / max(n_tested, 1)), FEWEST_SEEDS),
+        fewest=fewest,
         failures=failed,
-        unreliable=tuple(fail_more_often(failed, level)),
-        speeds=speeds(results, environment, names, level),
+        unreliable=tuple(fail_more_often(_enough(failed, fewest), look.level)),
+        speeds=speeds(results, environment, names, look.level),
+        seeds=evidence.seeds,
+        look=look,
     )
+
+
+def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[PairComparison]:
+    """Every two agents, as judged at this look, or at that of a design which decided them."""
+    scores = {name: evidence.scores[name] for name in names}
+    margin, certain = evidence.margin, evidence.certain
+    if look.design is None:
+        judged = {
+            pair: (judgement, len(scores[pair[0]]))
+            for pair, judgement in judge_pairs(scores, margin, look.level, certain).items()
+        }
+    else:
+        given = {name: evidence.given[name] for name in names}
+        growth = grow(given, look.design.sizes, margin, look.design.level, certain)
+        judged = {
+            pair: (judgement, look.design.sizes[growth.looks[pair] - 1])
+            for pair, judgement in growth.judged.items()
+        }
+    levels = (look.level, look.next_level)
+    return describe_pairs(judged, scores, margin, levels, seed=RESAMPLING_SEED)
+
+
+def _enough(counts: Mapping[str, FailureCount], fewest: int) -> dict[str, FailureCount]:
+    """Those of agents with so many runs; with fewer, nothing is claimed of anybody."""
+    return {name: count for name, count in counts.items() if count.n >= fewest}
 
 
 def _rank(value: float) -> float:
@@ -233,7 +240,7 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
         n_runs=len(table),
-        n_missing=study.n_seeds - len(table),
+        n_missing=results.n_planned[agent, environment] - len(table),
         metric=metric,
         score=summarise(values("score"), seed=RESAMPLING_SEED)
         if table["score"].notna().any()
@@ -254,35 +261,4 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
             for run in results.planned
             if (run.agent, run.environment, run.seed) == (agent, environment, 0)
         ),
-    )
-
-
-def _analyse_overall(results: StudyResults) -> OverallAnalysis | None:
-    study = results.study
-    labels = [environment.label for environment in study.environments]
-    if len(labels) < 2:
-        return None
-    columns = [values_over_seeds(results, label, "score") for label in labels]
-    scores = {
-        agent.label: np.column_stack([column[agent.label] for column in columns])
-        for agent in study.agents
-    }
-    if any(np.isnan(matrix).all(axis=0).any() for matrix in scores.values()):
-        return None
-    summaries = {agent: summarise(matrix, seed=RESAMPLING_SEED) for agent, matrix in scores.items()}
-    order = sorted(summaries, key=lambda agent: summaries[agent].iqm.point, reverse=True)
-    thresholds = np.linspace(0, 1, 101)
-    return OverallAnalysis(
-        scores={agent: summaries[agent] for agent in order},
-        improvement={
-            (one, two): probability_of_improvement(scores[one], scores[two], seed=RESAMPLING_SEED)
-            for one in order
-            for two in order
-            if one != two
-        },
-        thresholds=thresholds,
-        profiles={
-            agent: performance_profile(scores[agent], thresholds, seed=RESAMPLING_SEED)
-            for agent in order
-        },
     )

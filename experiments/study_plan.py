@@ -30,12 +30,16 @@ MOST_RUNS = 1_000_000
 _BATCH_SETTINGS = ("n_timesteps", "env_kwargs", "algorithm")
 
 
-def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
+def plan(
+    study: StudySpec, root: Path, counts: Mapping[tuple[str, str], int] | None = None
+) -> list[PlannedRun]:
     """All runs of a study, those of one seed together, so that agents can be compared early.
 
     Args:
         study: the study.
         root: its folder.
+        counts: by labels of agent and environment, with how many of the seeds; with all of them,
+            where it is not said.
 
     Raises:
         UserError: if an agent cannot be trained so, or does not fit an environment.
@@ -55,13 +59,17 @@ def plan(study: StudySpec, root: Path) -> list[PlannedRun]:
                 check_fit(spec)
             specs[agent.label, environment.label] = spec
     batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
+    n_seeds = {labels: (counts or {}).get(labels, study.n_seeds) for labels in specs}
     for labels in batches:
-        check_pulls(study.n_seeds, specs[labels].hyperparams.n_timesteps or 0, " on ".join(labels))
+        check_pulls(
+            n_seeds[labels], specs[labels].hyperparams.n_timesteps or 0, " on ".join(labels)
+        )
     return [
-        _planned_run(study, root, agent, environment, seed, spec, (agent, environment) in batches)
+        _planned_run(study, root, *labels, seed, spec, n_seeds[labels] if labels in batches else 0)
         for seed in study.seeds
-        for (agent, environment), spec in specs.items()
-        if seed == study.first_seed or (agent, environment) not in batches
+        for labels, spec in specs.items()
+        if seed == study.first_seed
+        or (labels not in batches and seed - study.first_seed < n_seeds[labels])
     ]
 
 
@@ -82,7 +90,7 @@ def _planned_run(
     environment: str,
     seed: int,
     spec: TrainSpec,
-    is_batch: bool,
+    n_in_batch: int,
 ) -> PlannedRun:
     # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
     folder = _environment_folder(environment, spec.env_id)
@@ -93,8 +101,8 @@ def _planned_run(
         tensorboard_log=root / "tensorboard" / place if study.tensorboard else None,
         save_every_n_episodes=study.render_every if seed == study.first_seed else -1,
     )
-    path, n_runs = root / "runs" / place, study.n_seeds if is_batch else 1
-    return PlannedRun(agent, environment, seed, spec, path, is_batch, n_runs)
+    path, is_batch = root / "runs" / place, n_in_batch > 0
+    return PlannedRun(agent, environment, seed, spec, path, is_batch, max(n_in_batch, 1))
 
 
 def _environment_folder(label: str, env_id: str) -> str:

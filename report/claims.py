@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
 from experiments.study_spec import StudySpec
-from report.wording import enumeration, interval, number, seeds
+from report.wording import enumeration, interval, number, ordinal, seeds
 from verdicts import PairComparison
 
 
@@ -32,7 +32,26 @@ def pair_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[s
     texts += [f"{place}, {_on_unreliable(environment, pair)}." for pair in _unreliable(environment)]
     if too_few and any(pair.verdict == "undecided" for pair in environment.pairs):
         texts.append(_on_too_few(study, environment))
-    return texts
+    return [*texts, *_on_looks(environment)]
+
+
+def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    """How many seeds the agents were to have."""
+    return seeds(*(environment.seeds.values() or [study.n_seeds]))
+
+
+def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """How often the runs have been looked at, where that is more than once, and at what level."""
+    look, place = environment.look, f"On {environment.environment}"
+    level = f"{100 * look.level:.2g} %"
+    if look.design is not None:
+        n = len(look.design.sizes)
+        yield (
+            f"{place}, agents got more seeds until they were decided, at up to {n} looks that were "
+            f"settled beforehand: claims at {level} each."
+        )
+    elif look.number > 1:
+        yield f"{place}, this is the {ordinal(look.number)} look at this study: claims at {level}."
 
 
 def _on_too_few(study: StudySpec, environment: EnvironmentAnalysis) -> str:
@@ -40,8 +59,8 @@ def _on_too_few(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     said = any(pair.verdict != "undecided" for pair in environment.pairs)
     which = "all other pairs of agents" if said else "the agents"
     return (
-        f"On {environment.environment}, {which} are undecided: {seeds(study.n_seeds)} cannot tell "
-        f"{n} agents apart, whatever they score; it takes {environment.fewest} or more."
+        f"On {environment.environment}, {which} are undecided: {seeds_of(study, environment)} "
+        f"cannot tell {n} agents apart, whatever they score; it takes {environment.fewest} or more."
     )
 
 
@@ -52,6 +71,7 @@ def _on_equivalent(environment: EnvironmentAnalysis, group: Sequence[str]) -> st
     if all(pair.certain for pair in pairs):
         return f"{enumeration(group)} are equivalent{within}"
     text = f"{enumeration(group)} are equivalent in the typical run{within}"
+    text += _shown_with(environment, pairs)
     counts = {name: environment.failures[name] for name in group if name in environment.failures}
     if not counts:
         n = min(pair.difference.n for pair in pairs)
@@ -91,10 +111,18 @@ def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
 def _by_how_much(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
     return enumeration(
         [
-            f"{pair.second} (by {interval(pair.difference)}{_failed_more(environment, pair)})"
+            f"{pair.second} (by {interval(pair.difference)}{_shown_with(environment, [pair])}"
+            f"{_failed_more(environment, pair)})"
             for pair in pairs
         ]
     )
+
+
+def _shown_with(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
+    """With how many seeds pairs were decided, where a study has grown until they were."""
+    if environment.look.design is None:
+        return ""
+    return f", with {seeds(*(pair.n_seeds for pair in pairs))}"
 
 
 def _failed_more(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
@@ -126,7 +154,7 @@ def _on_unreliable(environment: EnvironmentAnalysis, pair: tuple[str, str]) -> s
 def _on_undecided(study: StudySpec, place: str, pair: PairComparison) -> str:
     text = (
         f"{place}, {pair.first} against {pair.second} is undecided with "
-        f"{seeds(study.n_seeds)} (difference {interval(pair.difference)})"
+        f"{seeds(pair.n_seeds or study.n_seeds)} (difference {interval(pair.difference)})"
     )
     if pair.seeds_needed is not None:
         text += f"; {pair.seeds_needed:,} seeds would probably tell"

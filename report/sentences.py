@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.reliability import ON_THE_SCALE
 from experiments.study_spec import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
-from report.claims import pair_sentences, speed_sentences
-from report.wording import enumeration, interval, number, seeds
+from report.claims import pair_sentences, seeds_of, speed_sentences
+from report.wording import enumeration, interval, number
 
 
 def sentences(analysis: StudyAnalysis) -> list[str]:
@@ -29,7 +29,7 @@ def environment_sentences(study: StudySpec, environment: EnvironmentAnalysis) ->
         *pair_sentences(study, environment),
         *speed_sentences(environment),
         *_on_variants(study, environment),
-        *_on_failures(study.n_seeds, environment),
+        *_on_failures(study, environment),
     ]
 
 
@@ -44,15 +44,15 @@ def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     if _none_has_learnt(study, environment):
         return (
             f"On {environment.environment}, none of the agents has learnt: over "
-            f"{seeds(study.n_seeds)}, no typical run is better than the best blind policy's "
-            f"{number(environment.best_blind)}; the highest {METRIC_WORDS[study.metric]} is "
-            f"{interval(top.metric.mean)}, of {names}."
+            f"{seeds_of(study, environment)}, no typical run is better than the best blind "
+            f"policy's {number(environment.best_blind)}; the highest {METRIC_WORDS[study.metric]} "
+            f"is {interval(top.metric.mean)}, of {names}."
         )
     verb = "has" if len(best) == 1 else "have"
     extreme = "lowest" if study.metric in COSTS else "highest"
     text = (
-        f"On {environment.environment}, over {seeds(study.n_seeds)}, {names} {verb} the {extreme} "
-        f"{METRIC_WORDS[study.metric]}: {interval(top.metric.mean)}"
+        f"On {environment.environment}, over {seeds_of(study, environment)}, {names} {verb} the "
+        f"{extreme} {METRIC_WORDS[study.metric]}: {interval(top.metric.mean)}"
     )
     if environment.optimum is None or study.metric not in ON_THE_SCALE:
         return f"{text}."
@@ -82,8 +82,9 @@ def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> list[str
     return [f"{place} {verb} trained on a variant of the environment, with returns of its own."]
 
 
-def _on_failures(n_seeds: int, environment: EnvironmentAnalysis) -> Iterable[str]:
+def _on_failures(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
     for agent, n_missing in environment.missing.items():
+        n_seeds = environment.seeds.get(agent, study.n_seeds)
         if n_missing == n_seeds:
             yield f"On {environment.environment}, no run of {agent} has finished."
         elif n_missing:

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.study_spec import METRIC_WORDS, StudySpec
+from report.claims import seeds_of
 from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, BanditRow, Column, Row, filled
 from report.sentences import environment_sentences
 from report.wording import number
@@ -72,7 +73,8 @@ def _title(environment: EnvironmentAnalysis) -> str:
 
 
 def _caption(study: StudySpec, environment: EnvironmentAnalysis) -> str:
-    metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals over {study.n_seeds} seeds"
+    n_seeds = seeds_of(study, environment)
+    metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals over {n_seeds}"
     rows = [Row(agent, environment) for agent in environment.agents]
     explained = [column for column in COLUMNS if column.terminal and column.caption]
     on_variant = any(agent.on_variant for agent in environment.agents)

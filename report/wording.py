@@ -9,6 +9,8 @@ from verdicts import Estimate
 
 SIGNIFICANT = 4  # digits
 
+_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
+
 
 def number(value: float | None) -> str:
     """A figure with four significant digits, or a dash where there is none."""
@@ -42,6 +44,15 @@ def enumeration(words: Sequence[str]) -> str:
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)
 
 
-def seeds(n: int) -> str:
-    """So many seeds."""
-    return f"{n:,} seed{'s' if n != 1 else ''}"
+def seeds(*counts: int) -> str:
+    """So many seeds, or from so many to so many."""
+    least, most = min(counts), max(counts)
+    return f"{'' if least == most else f'{least:,} to '}{most:,} seed{'s' if most != 1 else ''}"
+
+
+def ordinal(n: int) -> str:
+    """Which of several, in a word where there is a short one."""
+    if n <= len(_ORDINALS):
+        return _ORDINALS[n - 1]
+    ending = "th" if 10 < n % 100 < 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
+    return f"{n:,}{ending}"

@@ -14,10 +14,11 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from verdicts.comparisons import PairComparison, compare_pairs
+    from verdicts.comparisons import PairComparison, compare_pairs, describe_pairs
     from verdicts.error_levels import level_of_look
     from verdicts.estimates import Estimate, Statistic, Summary, estimate, summarise
     from verdicts.failures import FailureCount, count_failures, fail_more_often, failure_threshold
+    from verdicts.growth import Growth, grow, look_sizes
     from verdicts.improvement import probability_of_improvement
     from verdicts.judgement import FEWEST_SEEDS, Verdict, judge_pairs
     from verdicts.learning_curves import (
@@ -46,6 +47,7 @@ __all__ = [
     "Band",
     "Estimate",
     "FailureCount",
+    "Growth",
     "PairComparison",
     "SpeedComparison",
     "Statistic",
@@ -60,6 +62,7 @@ __all__ = [
     "compare_speed",
     "count_failures",
     "curve_band",
+    "describe_pairs",
     "equivalent_p_value",
     "estimate",
     "fail_more_often",
@@ -67,9 +70,11 @@ __all__ = [
     "fewest_seeds",
     "final_score",
     "gap_to_optimum",
+    "grow",
     "holm",
     "judge_pairs",
     "level_of_look",
+    "look_sizes",
     "on_grid",
     "optimum_score",
     "paired_difference",
@@ -87,6 +92,7 @@ __all__ = [
 _HOMES = {
     "PairComparison": "verdicts.comparisons",
     "compare_pairs": "verdicts.comparisons",
+    "describe_pairs": "verdicts.comparisons",
     "level_of_look": "verdicts.error_levels",
     "Estimate": "verdicts.estimates",
     "Statistic": "verdicts.estimates",
@@ -97,6 +103,9 @@ _HOMES = {
     "count_failures": "verdicts.failures",
     "fail_more_often": "verdicts.failures",
     "failure_threshold": "verdicts.failures",
+    "Growth": "verdicts.growth",
+    "grow": "verdicts.growth",
+    "look_sizes": "verdicts.growth",
     "probability_of_improvement": "verdicts.improvement",
     "FEWEST_SEEDS": "verdicts.judgement",
     "Verdict": "verdicts.judgement",

@@ -44,6 +44,7 @@ class PairComparison:
             with 80 % power if all is as observed. None where that is more than 10,000, or there
             are too few seeds to say.
         certain: whether neither agent depends on chance, so that their scores say all there is.
+        n_seeds: how many seeds each of the two had then, those of runs that failed among them.
     """
 
     first: str
@@ -55,6 +56,7 @@ class PairComparison:
     verdict: Verdict
     seeds_needed: int | None
     certain: bool = False
+    n_seeds: int = 0
 
     def swapped(self) -> PairComparison:
         """The same comparison seen from the second agent."""
@@ -102,14 +104,47 @@ def compare_pairs(
     """
     _check(scores, margin, confidence)
     arrays = {name: np.asarray(values, dtype=np.float64) for name, values in scores.items()}
-    levels = [level_of_look(1 - confidence, look, n_looks)]
+    level = level_of_look(1 - confidence, look, n_looks)
     last = n_looks is not None and look >= n_looks
-    levels.append(levels[0] if last else level_of_look(1 - confidence, look + 1, n_looks))
-    judged = judge_pairs(arrays, margin, levels[0], certain)
-    n_pairs = max(1, sum(not each.certain for each in judged.values()))
+    later = level if last else level_of_look(1 - confidence, look + 1, n_looks)
+    judged = judge_pairs(arrays, margin, level, certain)
+    return describe_pairs(
+        {pair: (judgement, len(arrays[pair[0]])) for pair, judgement in judged.items()},
+        arrays,
+        margin,
+        (level, later),
+        seed=seed,
+        confidence=confidence,
+        n_resamples=n_resamples,
+    )
+
+
+def describe_pairs(
+    judged: Mapping[tuple[str, str], tuple[Judgement, int]],
+    scores: Mapping[str, Floats],
+    margin: float,
+    levels: tuple[float, float],
+    *,
+    seed: int,
+    confidence: float = 0.95,
+    n_resamples: int = N_RESAMPLES,
+) -> list[PairComparison]:
+    """Say by how much, and of what, pairs of agents were judged to be better, worse or equivalent.
+
+    Args:
+        judged: by pair, the judgement, and with how many of the seeds it was made.
+        scores: by agent, shape (n_seeds,).
+        margin: the largest difference that does not matter.
+        levels: the error rates of the look that judged, and of the next.
+        seed: of the resampling.
+        confidence: of the probabilities of improvement.
+        n_resamples: how many resamples their intervals come from.
+    """
+    n_pairs = max(1, sum(not each.certain for each, _ in judged.values()))
+    level, later = (each / n_pairs for each in levels)
     comparisons = []
-    for (one, two), judgement in judged.items():
-        x, y = arrays[one], arrays[two]
+    for (one, two), (judgement, n_seeds) in judged.items():
+        x, y = scores[one][:n_seeds], scores[two][:n_seeds]
         improvement = probability_of_improvement(
             *_paired(x, y), seed=seed, confidence=confidence, n_resamples=n_resamples
         )
@@ -117,15 +152,14 @@ def compare_pairs(
         comparison = PairComparison(
             first=one,
             second=two,
-            difference=_difference(x, y, margin, levels[0] / n_pairs, judgement),
+            difference=_difference(x, y, margin, level, judgement),
             p_value=judgement.p_value,
             adjusted_p_value=judgement.adjusted_p_value,
             probability_of_improvement=improvement,
             verdict=judgement.verdict,
-            seeds_needed=_seeds(x, y, margin, levels[1] / n_pairs)
-            if judgement.verdict == "undecided"
-            else None,
+            seeds_needed=_seeds(x, y, margin, later) if judgement.verdict == "undecided" else None,
             certain=judgement.certain,
+            n_seeds=n_seeds,
         )
         comparisons.append(comparison)
     return comparisons

@@ -40,7 +40,11 @@ class Judgement:
 
 
 def judge_pairs(
-    scores: Mapping[str, Floats], margin: float, level: float, certain: Collection[str] = ()
+    scores: Mapping[str, Floats],
+    margin: float,
+    level: float,
+    certain: Collection[str] = (),
+    decided: Mapping[tuple[str, str], Judgement] | None = None,
 ) -> dict[tuple[str, str], Judgement]:
     """Judge every two agents, in the order of the mapping.
 
@@ -51,25 +55,45 @@ def judge_pairs(
             ``equivalent``.
         certain: the agents that do not depend on chance. Two of these are compared by what they
             score, and no other pair pays for it.
+        decided: the pairs that were at an earlier look, in the same order; see ``grow``. They stay
+            as they are and leave their part of the error rate to the others: a pair that was found
+            apart its part for ``better`` or ``worse``, an equivalent one that for ``equivalent``.
     """
+    earlier = dict(decided or {})
     finite = {name: values[np.isfinite(values)] for name, values in scores.items()}
     pairs = list(combinations(finite, 2))
     known = {(a, b) for a, b in pairs if a in certain and b in certain}
+    known -= earlier.keys()
     tested = [
         pair
         for pair in pairs
-        if pair not in known and min(len(finite[name]) for name in pair) >= FEWEST_SEEDS
+        if pair not in known
+        and pair not in earlier
+        and min(len(finite[name]) for name in pair) >= FEWEST_SEEDS
     ]
-    apart = np.array([apart_p_value(finite[a], finite[b]) for a, b in tested])
-    close = np.array([equivalent_p_value(finite[a], finite[b], margin) for a, b in tested])
+    apart = [apart_p_value(finite[a], finite[b]) for a, b in tested]
+    close = [equivalent_p_value(finite[a], finite[b], margin) for a, b in tested]
+    settled = [each.verdict == "equivalent" for each in earlier.values() if not each.certain]
+    corrected = zip(
+        tested,
+        apart,
+        _corrected(apart, settled.count(True)),
+        _corrected(close, settled.count(False)),
+        strict=True,
+    )
     nothing = Judgement("undecided", np.nan, np.nan, np.nan)
-    judged = dict.fromkeys(pairs, nothing)
-    for pair, raw, adjusted, equal in zip(tested, apart, holm(apart), holm(close), strict=True):
+    judged = {**dict.fromkeys(pairs, nothing), **earlier}
+    for pair, raw, adjusted, equal in corrected:
         verdict = _verdict(finite[pair[0]], finite[pair[1]], margin, level, adjusted, equal)
         judged[pair] = Judgement(verdict, float(raw), float(adjusted), float(equal))
     for a, b in known:
         judged[a, b] = _known(finite[a], finite[b], margin)
     return judged
+
+
+def _corrected(p_values: list[float], n_others: int) -> Floats:
+    """P-values after Holm's correction, for so many besides that are not rejected."""
+    return holm([*p_values, *[1.0] * n_others])[: len(p_values)]
 
 
 def _verdict(

@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.ticker import EngFormatter, FixedLocator, FuncFormatter, PercentFormatter
 
-from experiments.analysis import EnvironmentAnalysis, OverallAnalysis
+from experiments.analysis import EnvironmentAnalysis
+from experiments.overall_analysis import OverallAnalysis
 from experiments.study_spec import METRIC_WORDS
 from pipeline.pictures.learning_curve import symlog_ticks
 from report.figures.figure_style import REFERENCE, colour_of, line_style, shared_legend

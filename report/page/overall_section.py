@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from experiments.analysis import OverallAnalysis, StudyAnalysis
+from experiments.analysis import StudyAnalysis
+from experiments.overall_analysis import OverallAnalysis
 from report.page.sections import Report, Section, estimate_data
 from verdicts import Estimate
 

@@ -1,0 +1,194 @@
+"""Studies that grow until their pairs are decided: the looks, settled first, and what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from experiments.evidence import Evidence, evidence_on
+from experiments.looking import look_at, remember
+from experiments.looks import Design, LookLog, Looks, Standing, question_of
+from experiments.looks_file import read_looks
+from experiments.study_results import StudyResults
+from experiments.study_spec import StudySpec
+from pipeline.errors import UserError
+from verdicts import Growth, grow, look_sizes
+
+MOST_SEEDS = 50
+
+# How many seeds, by labels of agent and environment.
+Counts = dict[tuple[str, str], int]
+
+
+@dataclass(frozen=True)
+class Step:
+    """What the looks at an environment have come to.
+
+    Attributes:
+        environment: its label.
+        design: the looks that were settled, and how many seeds each agent has or gets next.
+        growth: what is decided.
+        standing: the last look's, among all.
+    """
+
+    environment: str
+    design: Design
+    growth: Growth
+    standing: Standing
+
+    @property
+    def undecided(self) -> list[tuple[str, str]]:
+        """The pairs that are."""
+        return [pair for pair, each in self.growth.judged.items() if each.verdict == "undecided"]
+
+
+def settled_looks(study: StudySpec, root: Path, most: int | None) -> LookLog:
+    """The looks at a study, with when to look at it until it is decided, settled now or before.
+
+    Nothing is written: see `settle`.
+
+    Args:
+        study: the study.
+        root: its folder.
+        most: how many seeds an agent may get; None for what was settled, or else ``MOST_SEEDS``.
+
+    Raises:
+        UserError: if that is not what was settled before, or there is nothing to decide.
+    """
+    if len(study.agents) < 2:
+        raise UserError(f"{study.name}: --until-decided takes two agents or more")
+    if most is not None and most < study.n_seeds:
+        raise UserError(f"--max-seeds is {most}, the study begins with {study.n_seeds} seeds")
+    log = read_looks(root)
+    environments = dict(log.environments)
+    for environment in study.environments:
+        looks = log.on(environment.label)
+        design = _settled(study, looks, most)
+        if looks.design is not None:
+            _check_same(root, looks.design, design)
+            design = looks.design
+        environments[environment.label] = replace(looks, design=design)
+    return LookLog(environments)
+
+
+def settle(root: Path, log: LookLog) -> None:
+    """Write down when to look, before the first run is done for it."""
+    remember(root, read_looks(root), log)
+
+
+def counts_of(study: StudySpec, log: LookLog) -> Counts:
+    """How many seeds the agents of a study are to have, as was settled."""
+    return {
+        (agent, environment.label): n
+        for environment in study.environments
+        if (design := log.on(environment.label).design) is not None
+        for agent, n in design.seeds.items()
+    }
+
+
+def grown(study: StudySpec, counts: Counts) -> StudySpec:
+    """The study with as many seeds as the agent that has most of them."""
+    return replace(study, n_seeds=max(counts.values()))
+
+
+def take_planned_looks(results: StudyResults) -> list[Step]:
+    """Look at every environment as was settled, and write down who gets more seeds.
+
+    Raises:
+        UserError: if runs that have been looked at are others now.
+    """
+    log = read_looks(results.root)
+    environments, steps = dict(log.environments), []
+    for environment in results.study.environments:
+        label, evidence = environment.label, evidence_on(results, environment.label)
+        looks = log.on(label)
+        if evidence is None or looks.design is None:
+            continue
+        _check_runs(results.root, looks, evidence)
+        environments[label], step = _looked(looks, looks.design, evidence)
+        steps.append(step)
+    remember(results.root, log, LookLog(environments))
+    return steps
+
+
+def counts_after(counts: Counts, steps: Sequence[Step]) -> Counts:
+    """How many seeds agents are to have, after looks."""
+    return counts | {
+        (agent, step.environment): n for step in steps for agent, n in step.design.seeds.items()
+    }
+
+
+def _settled(study: StudySpec, looks: Looks, most: int | None) -> Design:
+    """The looks that the study asks for now."""
+    after = sum(not look.planned for look in looks.taken)
+    if looks.design is not None:
+        after, most = looks.design.after, most or looks.design.sizes[-1]
+    design = Design(question_of(study), (), {}, after)
+    most = max(most or MOST_SEEDS, study.n_seeds)
+    sizes = look_sizes(study.n_seeds, most, len(study.agents), design.level)
+    return replace(design, sizes=sizes, seeds={agent.label: sizes[0] for agent in study.agents})
+
+
+def _check_same(root: Path, there: Design, now: Design) -> None:
+    """Refuse to look otherwise than was settled.
+
+    Raises:
+        UserError: naming what differs.
+    """
+    differences = [
+        f"{key} {before}, now {after}"
+        for key, before, after in (
+            ("agents", sorted(there.seeds), sorted(now.seeds)),
+            ("looks at seeds", list(there.sizes), list(now.sizes)),
+            *(
+                (key, value, getattr(now.question, key))
+                for key, value in vars(there.question).items()
+            ),
+        )
+        if before != after
+    ]
+    if differences:
+        raise UserError(
+            f"{root}: when to look was settled before the first look and cannot change "
+            f"({'; '.join(differences)}): --name NAME makes another study, and without "
+            "--until-decided this one grows by hand"
+        )
+
+
+def _check_runs(root: Path, looks: Looks, evidence: Evidence) -> None:
+    """Refuse runs that have been done anew since they were looked at.
+
+    Raises:
+        UserError: naming the environment.
+    """
+    for there in looks.planned:
+        seeds = {name: n for name, n in there.seeds.items() if name in evidence.scores}
+        now = look_at(evidence, seeds, there.question, there.level, planned=True)
+        if not now.shows(there) and not there.shows(now) and now.runs == there.runs:
+            raise UserError(
+                f"{root}: on {evidence.environment}, runs that were looked at are others now: "
+                "--name NAME makes another study"
+            )
+
+
+def _looked(looks: Looks, design: Design, evidence: Evidence) -> tuple[Looks, Step]:
+    growth = grow(evidence.given, design.sizes, evidence.margin, design.level, evidence.certain)
+    seeds = {name: max(n, design.seeds.get(name, 0)) for name, n in growth.seeds.items()}
+    more = tuple(
+        look_at(
+            evidence,
+            {name: min(n, size) for name, n in growth.seeds.items()},
+            design.question,
+            design.share,
+            planned=True,
+        )
+        for size in design.sizes[len(looks.planned) : growth.n_looks]
+    )
+    design = replace(design, seeds=seeds)
+    looks = Looks((*looks.taken, *more), design)
+    number = max((k for k, each in enumerate(looks.taken, start=1) if each.planned), default=1)
+    later = looks.next_level if growth.is_done else design.share
+    return looks, Step(
+        evidence.environment, design, growth, Standing(number, design.share, later, design)
+    )

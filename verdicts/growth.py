@@ -1,0 +1,118 @@
+"""A study that grows until its verdicts are there: who gets more seeds, and what holds by then."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from verdicts.error_levels import level_of_look
+from verdicts.judgement import FEWEST_SEEDS, Judgement, judge_pairs
+from verdicts.power import fewest_seeds
+from verdicts.score_arrays import Floats
+
+# How many times the seeds of a look the next one has, about.
+STEP = 1.5
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How far a study has grown on one environment.
+
+    Attributes:
+        judged: by pair of agents, what is said of the first, at the look that decided it, or else
+            at the last.
+        looks: by pair, which look that was, counted from 1.
+        seeds: by agent, how many seeds it has at the next look; as many as at the last where every
+            pair that it is in is decided.
+        n_looks: how many looks there have been.
+        level: the error rate of each.
+        is_done: whether no agent lacks a seed that another look would take.
+    """
+
+    judged: Mapping[tuple[str, str], Judgement]
+    looks: Mapping[tuple[str, str], int]
+    seeds: Mapping[str, int]
+    n_looks: int
+    level: float
+    is_done: bool
+
+
+def look_sizes(first: int, most: int, n_agents: int, level: float) -> tuple[int, ...]:
+    """How many seeds an agent has at each look: from ``first`` to ``most``, in equal ratios.
+
+    The first look has more seeds where ``first`` could not tell any agents apart whatever they
+    score: such a look would be lost.
+
+    Args:
+        first: how many seeds the study begins with.
+        most: how many it may have.
+        n_agents: how many agents there are.
+        level: the error rate of all looks together.
+    """
+    n_pairs = max(math.comb(n_agents, 2), 1)
+    for start in range(first, most):
+        steps = max(round(math.log(most / start) / math.log(STEP)), 1)
+        if start >= fewest_seeds(level / (steps + 1) / n_pairs):
+            ratio = (most / start) ** (1 / steps)
+            return (*(round(start * ratio**step) for step in range(steps)), most)
+    return (most,)
+
+
+def grow(
+    scores: Mapping[str, Floats],
+    sizes: Sequence[int],
+    margin: float,
+    level: float,
+    certain: Collection[str] = (),
+) -> Growth:
+    """Look at a study as often as was settled and its seeds allow, and say who needs more.
+
+    Only agents in pairs that are undecided get more seeds, so that at each look every pair that is
+    tested has the same, settled number of them. A pair that has been decided stays so. All looks
+    are gone through from the first, so that what comes out depends on the scores alone, and not on
+    how often somebody asked.
+
+    Args:
+        scores: by agent, as many as it has seeds; what is not finite is a run that failed.
+        sizes: how many seeds a growing agent has at each look, settled before the first.
+        margin: the largest difference that does not matter.
+        level: the error rate of all looks together. Each has an equal share.
+        certain: the agents that do not depend on chance; see ``judge_pairs``.
+
+    Source: Holm's procedure with p-values over looks, each multiplied by the number of looks; see
+    Maurer and Bretz (2013), "Multiple testing in group sequential trials using graphical
+    approaches", Statistics in Biopharmaceutical Research 5(4).
+    """
+    share = level_of_look(level, 1, len(sizes))
+    judged: dict[tuple[str, str], Judgement] = {}
+    looks: dict[tuple[str, str], int] = {}
+    seeds = dict.fromkeys(scores, sizes[0])
+    for look, size in enumerate(sizes, start=1):
+        growing = _undecided_agents(scores, judged, seeds) if judged else set(scores)
+        seeds |= dict.fromkeys(growing, size)
+        if not growing or any(len(scores[name]) < size for name in growing):
+            break
+        decided = {pair: each for pair, each in judged.items() if each.verdict != "undecided"}
+        shown = {name: np.asarray(values)[: seeds[name]] for name, values in scores.items()}
+        judged = judge_pairs(shown, margin, share, certain, decided)
+        looks |= {pair: look for pair in judged if pair not in decided}
+    is_done = all(len(values) >= seeds[name] for name, values in scores.items())
+    return Growth(judged, looks, seeds, max(looks.values(), default=0), share, is_done)
+
+
+def _undecided_agents(
+    scores: Mapping[str, Floats],
+    judged: Mapping[tuple[str, str], Judgement],
+    seeds: Mapping[str, int],
+) -> set[str]:
+    """The agents in undecided pairs, but for those whose runs all but fail."""
+    there = {name: np.isfinite(values[: seeds[name]]).sum() for name, values in scores.items()}
+    return {
+        name
+        for pair, judgement in judged.items()
+        if judgement.verdict == "undecided" and min(there[each] for each in pair) >= FEWEST_SEEDS
+        for name in pair
+    }
