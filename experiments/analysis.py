@@ -252,7 +252,7 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         on_variant=any(
             trains_on_variant(run.spec)
             for run in results.planned
-            if (run.agent, run.environment, run.seed) == (agent, environment, 0)
+            if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
         ),
     )
 
