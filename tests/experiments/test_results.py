@@ -96,6 +96,8 @@ def test_a_row_for_each_run(tmp_path):
     # 0.95 of the way from 0 to 100, reached at the second evaluation; 6 episodes were over then.
     assert (row["threshold"], row["steps_to_threshold"]) == (95.0, 60.0)
     assert row["episodes_to_threshold"] == 5
+    # The third falls below it again.
+    assert row["steps_to_stay"] == row["episodes_to_stay"] == math.inf
     # Two trapezoids of width 40, of mean heights 53 and 93.
     assert row["area"] == pytest.approx(73.0)
     assert row["training"] == pytest.approx(11 / 7)
@@ -130,6 +132,7 @@ def test_the_columns_of_the_files_that_others_read():
         "steps_to_threshold",
         "steps_to_stay",
         "episodes_to_threshold",
+        "episodes_to_stay",
         "n_timesteps",
         "n_episodes",
         "seconds",
