@@ -122,7 +122,8 @@ def test_a_title_a_table_a_caption_and_sentences(analysis, width, is_terminal):
     )
     assert lines[:2] == ["", "lake: optimum 100, best blind policy 20"]
     assert cells(lines) == [HEADINGS, *ROWS]
-    assert below(lines) == " ".join([CAPTION, *SENTENCES])
+    origin = "Seeds 0 to 3: nothing was tuned on these."
+    assert below(lines) == " ".join([CAPTION, *SENTENCES, origin])
     assert max(map(len, lines)) <= width
 
 
