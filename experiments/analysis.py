@@ -51,9 +51,9 @@ class AgentAnalysis:
         area: mean return over the learning curve.
         last_episodes: mean return of the last training episodes.
         regret: on bandits, the sum over all pulls; else without a figure.
-        steps_to_threshold: when the learning curve reached the threshold; None without one.
+        steps_to_threshold: when the learning curve first reached the threshold; None without one.
         steps_to_stay: when it reached the threshold for good; likewise.
-        episodes_to_threshold: likewise.
+        episodes_to_stay: likewise.
         success_rate: of the final policy; None where the environment does not say.
         seconds: time that training took.
         on_variant: whether it was trained on a variant of the environment, whose returns are not to
@@ -71,7 +71,7 @@ class AgentAnalysis:
     last_episodes: Estimate
     regret: Estimate
     steps_to_threshold: ThresholdSummary | None
-    episodes_to_threshold: ThresholdSummary | None
+    episodes_to_stay: ThresholdSummary | None
     success_rate: Estimate | None
     seconds: Estimate
     on_variant: bool = False
@@ -251,14 +251,12 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         regret=metric.mean if study.metric == "regret" else mean("regret"),
         steps_to_threshold=summarise_steps(values("steps_to_threshold")) if has_threshold else None,
         steps_to_stay=summarise_steps(values("steps_to_stay")) if has_threshold else None,
-        episodes_to_threshold=summarise_steps(values("episodes_to_threshold"))
-        if has_threshold
-        else None,
+        episodes_to_stay=summarise_steps(values("episodes_to_stay")) if has_threshold else None,
         success_rate=mean("success_rate") if table["success_rate"].notna().any() else None,
         seconds=mean("seconds"),
         on_variant=any(
             trains_on_variant(run.spec)
             for run in results.planned
-            if (run.agent, run.environment, run.seed) == (agent, environment, 0)
+            if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
         ),
     )

@@ -123,6 +123,7 @@ RUN_COLUMNS = (
     "steps_to_threshold",  # infinite where it was never reached
     "steps_to_stay",  # until it was reached for good
     "episodes_to_threshold",
+    "episodes_to_stay",
     "n_timesteps",
     "n_episodes",
     "seconds",
@@ -295,6 +296,7 @@ def _summary_row(
         "steps_to_threshold": reached,
         "steps_to_stay": stayed,
         "episodes_to_threshold": _episodes_by(episodes, reached),
+        "episodes_to_stay": _episodes_by(episodes, stayed),
         "n_timesteps": info["n_timesteps"],
         "n_episodes": len(episodes.returns),
         "seconds": info["seconds"],

@@ -7,12 +7,12 @@ import math
 from rich.console import Console
 from rich.table import Table
 
-from experiments.off_policy.estimators import mean_reward
+from experiments.off_policy.estimators import difference_in_value, mean_reward
 from experiments.off_policy.logged_policies import (
     Comparison,
     Judged,
 )
-from verdicts import Estimate, paired_difference
+from verdicts import Estimate
 
 # Where an estimate rests on fewer pulls, its interval is hardly one.
 FEW_PULLS = 100
@@ -31,7 +31,7 @@ def _table(comparison: Comparison) -> Table:
     table = Table(
         title=f"{data.source}: {len(data):,} pulls, {data.n_arms} arms",
         caption="mean reward a pull, ± half the 95 % interval; effective: pulls of its own that "
-        "the log is worth",
+        "the log is worth; differences below: 95 % intervals that hold together",
         title_justify="left",
         caption_justify="left",
     )
@@ -47,13 +47,18 @@ def _table(comparison: Comparison) -> Table:
 
 
 def sentences(comparison: Comparison) -> list[str]:
-    """Doubly robust: each policy asked about against the best alternative, and among themselves."""
+    """Doubly robust: each policy asked about against the best alternative, and among themselves.
+
+    Which alternative and which policy is best the same log has said. So the intervals are such as
+    hold together for all pairs that could have been picked.
+    """
     given = [row for row in comparison.rows if row.is_given]
-    alternative = max((row for row in comparison.rows if not row.is_given), key=_value)
-    leader = max(given, key=_value)
+    alternatives = [row for row in comparison.rows if not row.is_given]
+    alternative, leader = max(alternatives, key=_value), max(given, key=_value)
+    n_pairs = len(given) * len(alternatives) + math.comb(len(given), 2)
     pairs = [(row, alternative) for row in given]
     pairs += [(leader, row) for row in given if row is not leader]
-    result = [_difference(*pair) for pair in pairs]
+    result = [_difference(*pair, n_pairs) for pair in pairs]
     result += [
         f"{row.name} rests on {row.terms.effective:.0f} effective pulls: too few to rely on its "
         "intervals"
@@ -63,8 +68,8 @@ def sentences(comparison: Comparison) -> list[str]:
     return result
 
 
-def _difference(first: Judged, second: Judged) -> str:
-    difference = paired_difference(first.terms.doubly_robust, second.terms.doubly_robust)
+def _difference(first: Judged, second: Judged, n_pairs: int) -> str:
+    difference = difference_in_value(first.terms, second.terms, n_pairs)
     if difference.low == difference.high == 0:
         return f"{first.name} and {second.name} do the same on this log"
     decimals = _decimals(difference)

@@ -18,6 +18,7 @@ class Cell:
         value: what it is sorted by; None puts it last.
         note: what the page has below it in small print.
         in_line: what the terminal has in place of the text, where it has something else.
+        aside: what the page says where the pointer rests on it.
         bar: low end, point and high end, each between 0 and 1, of a bar to draw; or None.
     """
 
@@ -25,6 +26,7 @@ class Cell:
     value: float | None
     note: str = ""
     in_line: str = ""
+    aside: str = ""
     bar: tuple[float, float, float] | None = None
 
 
@@ -52,13 +54,21 @@ def estimate_cell(estimate: Estimate) -> Cell:
     )
 
 
-def threshold_cell(summary: ThresholdSummary | None) -> Cell | None:
-    """How soon the median run reaches the threshold, and how many runs do."""
-    if summary is None:
+def threshold_cell(stays: ThresholdSummary | None) -> Cell | None:
+    """From when on the median run stays at the threshold, and how many runs do."""
+    if stays is None:
         return None
-    median, share = summary.median.point, summary.share_reached.point
+    median, share = stays.median.point, stays.share_reached.point
     note = "" if math.isnan(share) else f"{share:.0%} of runs"
     return Cell(number(median), _known(median), note)
+
+
+def crossing(first: ThresholdSummary | None) -> str:
+    """When a curve that may have fallen again was at the threshold for the first time."""
+    if first is None or math.isnan(first.median.point):
+        return ""
+    share = f"{first.share_reached.point:.0%} of runs are there at some evaluation"
+    return f"{share}, the median run first at step {number(first.median.point)}"
 
 
 def number_cell(value: float) -> Cell:

@@ -15,7 +15,7 @@ import numpy as np
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
 from experiments.pull_statistics import QUANTILES, PullStatistics
 from experiments.study_spec import COSTS, StudySpec
-from report.ranking_cells import Cell, bar, estimate_cell, number_cell, threshold_cell
+from report.ranking_cells import Cell, bar, crossing, estimate_cell, number_cell, threshold_cell
 from report.wording import interval_alone, number
 
 Order = Literal["ascending", "descending"]
@@ -103,11 +103,16 @@ def _success(row: Row) -> Cell | None:
 
 
 def _solved(row: Row) -> Cell | None:
-    summary = row.agent.steps_to_threshold
+    summary = row.agent.steps_to_stay
     if summary is None:
         return None
     share = summary.share_reached.point
     return Cell("-", None) if math.isnan(share) else Cell(f"{share:.0%}", share)
+
+
+def _stays_from(row: Row) -> Cell | None:
+    cell = threshold_cell(row.agent.steps_to_stay)
+    return None if cell is None else replace(cell, aside=crossing(row.agent.steps_to_threshold))
 
 
 def _seconds(row: Row) -> Cell:
@@ -157,18 +162,18 @@ COLUMNS: tuple[Column[Row], ...] = (
     ),
     Column(page="Success", help="in the end", best_first="descending", cell=_success),
     Column(
-        page="Steps",
-        help="to {threshold}",
-        terminal="steps",
-        caption="until a return of {threshold}, the median run",
+        page="Stays from",
+        help="step, at {threshold}",
+        terminal="stays from",
+        caption="step from which on the median run stays at a return of {threshold}",
         best_first="ascending",
-        cell=lambda row: threshold_cell(row.agent.steps_to_threshold),
+        cell=_stays_from,
     ),
     Column(
         page="Episodes",
-        help="to {threshold}",
+        help="to stay at {threshold}",
         best_first="ascending",
-        cell=lambda row: threshold_cell(row.agent.episodes_to_threshold),
+        cell=lambda row: threshold_cell(row.agent.episodes_to_stay),
     ),
     Column(terminal="solved", best_first="descending", cell=_solved),
     Column(page="Training", help="seconds", terminal="time", best_first="ascending", cell=_seconds),

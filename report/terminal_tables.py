@@ -13,7 +13,9 @@ from rich.table import Table
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.study_spec import METRIC_WORDS, StudySpec
 from report.claims import seeds_of
+from experiments.tuning_seeds import tuning_seeds
 from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, BanditRow, Column, Row, filled
+from report.seed_sentence import seed_sentence
 from report.sentences import environment_sentences
 from report.wording import number
 
@@ -23,12 +25,15 @@ AnyRow = TypeVar("AnyRow", bound=Row)
 
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
-    """Print a table for each environment, and what it says in words."""
+    """Print a table for each environment and what it says in words, then what seeds these are."""
     for environment in analysis.environments:
         console.print()
         console.print(_ranking(analysis, environment))
         for sentence in environment_sentences(analysis.study, environment):
             console.print(f"  {sentence}", highlight=False, markup=False)
+    console.print()
+    origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
+    console.print(origin, highlight=False, markup=False)
 
 
 def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table:

@@ -2,7 +2,7 @@
 
 Each estimator returns a term for each logged pull. The mean of the terms is the estimate, and their
 spread over the square root of their number its standard error. Two policies on the same log are
-therefore compared by the differences of their terms, pull by pull, as `paired_difference` does.
+therefore compared by the differences of their terms, pull by pull: see `difference_in_value`.
 
 With a pull in context x of arm a, which the log chose with probability p and which gave r, a policy
 of probabilities pi(arm | x), and q(x, arm) a guess at the mean reward:
@@ -16,9 +16,10 @@ of probabilities pi(arm | x), and q(x, arm) a guess at the mean reward:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from experiments.off_policy.reward_models import CrossFit
 from mdp.array_types import Bools, Floats, Ints
@@ -42,6 +43,8 @@ class PolicyTerms:
         direct: the direct method.
         doubly_robust: doubly robust.
         effective: how many pulls of the policy's own the log is worth.
+        weights: how much more often the policy makes each pull than the log did.
+        errors: by how much each reward was above what the model expected.
     """
 
     ips: Floats
@@ -49,6 +52,8 @@ class PolicyTerms:
     direct: Floats
     doubly_robust: Floats
     effective: float
+    weights: Floats
+    errors: Floats
 
 
 def evaluate_policy(
@@ -75,7 +80,15 @@ def evaluate_policy(
         direct=direct_method(policy, model),
         doubly_robust=doubly_robust(policy, weights, arms, rewards, model.predicted),
         effective=effective_sample_size(weights),
+        weights=weights,
+        errors=_errors(arms, rewards, model.predicted),
     )
+
+
+def terms_as_logged(arms: Ints, rewards: Floats, model: CrossFit) -> PolicyTerms:
+    """The terms of the policy that made the log, which are the rewards themselves."""
+    n, errors = len(rewards), _errors(arms, rewards, model.predicted)
+    return PolicyTerms(rewards, rewards, rewards, rewards, float(n), np.ones(n), errors)
 
 
 def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
@@ -85,6 +98,30 @@ def mean_reward(terms: Floats, confidence: float = 0.95) -> Estimate:
     sample size. What an estimator is biased by, it does not cover.
     """
     return paired_difference(terms, np.zeros_like(terms), confidence)
+
+
+def difference_in_value(
+    first: PolicyTerms, second: PolicyTerms, n_comparisons: int = 1
+) -> Estimate:
+    """How much more the first policy earns a pull, doubly robust, with a t interval.
+
+    The spread of the terms has a floor: what it would be if rewards erred by the same everywhere.
+    Where few pulls tell of a choice, all of them may have given the same by chance, and the terms
+    then look sure of it.
+
+    Args:
+        first: of the one policy.
+        second: of the other, on the same log.
+        n_comparisons: from among how many this one was picked; intervals of all of them hold
+            together with 95 %.
+    """
+    confidence = 1 - 0.05 / n_comparisons
+    found = paired_difference(first.doubly_robust, second.doubly_robust, confidence)
+    apart = first.weights - second.weights
+    variance = float((apart**2).mean() * (first.errors**2).mean()) / len(apart)
+    half = float(stats.t.isf(0.05 / n_comparisons / 2, len(apart) - 1)) * np.sqrt(variance)
+    half = max(half, found.high - found.point)
+    return replace(found, low=found.point - half, high=found.point + half)
 
 
 def importance_weights(policy: Floats, arms: Ints, propensities: Floats) -> Floats:
@@ -224,8 +261,12 @@ def doubly_robust(
     Source: Dudik, Langford and Li (2011); crossing folds as in Chernozhukov et al. (2018),
     "Double/debiased machine learning", The Econometrics Journal 21.
     """
-    errors = rewards - predicted[np.arange(len(arms)), arms]
+    errors = _errors(arms, rewards, predicted)
     return np.asarray((policy * predicted).sum(axis=1) + weights * errors)
+
+
+def _errors(arms: Ints, rewards: Floats, predicted: Floats) -> Floats:
+    return np.asarray(rewards - predicted[np.arange(len(arms)), arms])
 
 
 def effective_sample_size(weights: Floats) -> float:

@@ -12,7 +12,12 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from envs.bandits import LoggedData
-from experiments.off_policy.estimators import PolicyTerms, check_rewards, evaluate_policy
+from experiments.off_policy.estimators import (
+    PolicyTerms,
+    check_rewards,
+    evaluate_policy,
+    terms_as_logged,
+)
 from experiments.off_policy.policy_files import PolicyFile, find_policy, read_logged
 from experiments.off_policy.reward_models import CrossFit, cross_fit
 from mdp.array_types import Floats
@@ -107,8 +112,7 @@ def compare_policies(data: LoggedData, policies: Sequence[LoggedPolicy]) -> Comp
             rows.append(Judged(f"always arm {arm}", _judge(data, f"arm {arm}", always, model)))
         except UserError as error:
             notes.append(str(error))
-    rewards = data.rewards
-    as_logged = PolicyTerms(rewards, rewards, rewards, rewards, effective=float(len(data)))
+    as_logged = terms_as_logged(data.arms, data.rewards, model)
     if data.categories is not None:
         numbered = ", ".join(f"{i} {name}" for i, name in enumerate(data.categories))
         notes.append(f"{data.context_names[0]} was read as {numbered}")

@@ -1,6 +1,7 @@
 """Entries of hyperparameters in rl_zoo3's format: found in a file, and changed.
 
-One YAML file per algorithm maps environment ids to entries.
+One YAML file per algorithm maps environment ids to entries. It may say which seeds these were tuned
+on, see `pipeline.settings.tuned_seeds`.
 """
 
 from __future__ import annotations
@@ -12,6 +13,8 @@ from typing import Any
 
 from pipeline.errors import UserError, did_you_mean, shown
 from pipeline.settings.strict_yaml import read_settings_text, read_yaml
+from pipeline.settings.tuned_seeds import KEY as TUNED_ON
+from pipeline.settings.tuned_seeds import read_tuned_on
 
 _FOLDER = Path(__file__).resolve().parents[2] / "hyperparams"
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
@@ -43,12 +46,8 @@ def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> 
     if path is None and not _path(algo, None).is_file():
         return {}
     path = _path(algo, path)
-    if path.suffix == ".py":
-        raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
-    entries = read_yaml(path)
-    if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
-        raise UserError(f"{path}: must map environment ids to hyperparameters")
-    key = _find_entry(entries, env_id.partition(":")[2] or env_id)
+    entries, _ = _read(path)
+    key = _find_entry(entries, env_id)
     if key is None:
         hint = did_you_mean(env_id, [name for name in entries if name not in _STAND_INS], n=3)
         raise NoEntryError(
@@ -61,7 +60,44 @@ def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> 
     return entry
 
 
+def seeds_tuned_on(
+    algo: str, env_id: str, path: Path | str | None = None
+) -> tuple[range, ...] | None:
+    """The seeds that the entry of an environment was tuned on, as its file says.
+
+    Args:
+        algo: the algorithm.
+        env_id: the environment.
+        path: another file than the algorithm's own.
+
+    Returns:
+        Ranges of seeds, none for an entry that was chosen without; None where nobody says: in a
+        file without ``tuned_on``, and for an algorithm that has no file here.
+
+    Raises:
+        UserError: as `read_hyperparams` does.
+    """
+    if path is None and not _path(algo, None).is_file():
+        return None
+    entries, tuned_on = _read(_path(algo, path))
+    if tuned_on is None:
+        return () if path is None else None
+    return tuned_on.get(_find_entry(entries, env_id) or "", ())
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, tuple[range, ...]] | None]:
+    """The entries of a file, and the seeds that it says they were tuned on."""
+    if path.suffix == ".py":
+        raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
+    entries = read_yaml(path)
+    if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
+        raise UserError(f"{path}: must map environment ids to hyperparameters")
+    tuned_on = read_tuned_on(entries, str(path))
+    return {key: entry for key, entry in entries.items() if key != TUNED_ON}, tuned_on
+
+
 def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:
+    env_id = env_id.partition(":")[2] or env_id
     if env_id in entries:
         return env_id
     if _ATARI_ID.fullmatch(env_id) and "atari" in entries:
@@ -77,7 +113,7 @@ def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
     path = _path(algo, path)
     # The keys alone, by their place in the line: parsing all files would slow listing them down.
     names = _TOP_LEVEL_KEY.findall(read_settings_text(path)) if path.is_file() else []
-    return [name for name in names if name not in _STAND_INS]
+    return [name for name in names if name not in (*_STAND_INS, TUNED_ON)]
 
 
 def _path(algo: str, path: Path | str | None) -> Path:

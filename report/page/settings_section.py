@@ -10,8 +10,10 @@ from experiments.execution import failure_log
 from experiments.planned_runs import PlannedRun
 from experiments.run_versions import mixed_versions
 from experiments.study_results import StudyResults
+from experiments.tuning_seeds import tuning_seeds
 from report.page.markup import setting
 from report.page.sections import Report, Section
+from report.seed_sentence import seed_sentence
 
 ABSENT = "-"
 
@@ -55,6 +57,7 @@ def section(report: Report) -> Section | None:
     missing = [run for run in results.planned if run.path not in there]
     context = {
         "command": report.command,
+        "seeds": seed_sentence(results.study.seeds, tuning_seeds(results.study)),
         "absent": ABSENT,
         "tables": [
             _settings_table([(r, info) for r, info in done if r.environment == e.environment])

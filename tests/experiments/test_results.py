@@ -70,7 +70,7 @@ def results_of(study, root, finals, **options):
     """A study whose runs end as ``finals`` says by agent and seed; None for one that is missing."""
     planned = plan(study, root)
     for run in planned:
-        final = finals[run.agent][run.seed]
+        final = finals[run.agent][run.seed - study.first_seed]
         if final is not None:
             known = run.spec.env_id == ENVIRONMENT.env_id
             write_run(run, [(50, final / 2), (100, final)], known=known, **options)
@@ -96,6 +96,8 @@ def test_a_row_for_each_run(tmp_path):
     # 0.95 of the way from 0 to 100, reached at the second evaluation; 6 episodes were over then.
     assert (row["threshold"], row["steps_to_threshold"]) == (95.0, 60.0)
     assert row["episodes_to_threshold"] == 5
+    # The third falls below it again.
+    assert row["steps_to_stay"] == row["episodes_to_stay"] == math.inf
     # Two trapezoids of width 40, of mean heights 53 and 93.
     assert row["area"] == pytest.approx(73.0)
     assert row["training"] == pytest.approx(11 / 7)
@@ -130,6 +132,7 @@ def test_the_columns_of_the_files_that_others_read():
         "steps_to_threshold",
         "steps_to_stay",
         "episodes_to_threshold",
+        "episodes_to_stay",
         "n_timesteps",
         "n_episodes",
         "seconds",
@@ -541,10 +544,12 @@ def test_enumerations_and_intervals():
     assert interval(Estimate(1.0, math.nan, math.nan, 1)) == "1"
 
 
-def test_agents_that_were_trained_on_a_variant_are_known_and_told_of(tmp_path):
+@pytest.mark.parametrize("first_seed", [0, 1000])
+def test_agents_that_were_trained_on_a_variant_are_known_and_told_of(tmp_path, first_seed):
     shaped = {"n_timesteps": 100, "train_env_kwargs": {"shelf_reward": -10}}
     agents = (AgentSpec("plain", "qlearning"), AgentSpec("shaped", "sarsa", shaped))
     study = StudySpec("study", "A study", agents, (ENVIRONMENT,), 2, metric="last_episodes")
+    study = replace(study, first_seed=first_seed)
     results = results_of(study, tmp_path, {"plain": [90.0, 91.0], "shaped": [80.0, 81.0]})
     told = []
     analysis = analyse(results, told.append)

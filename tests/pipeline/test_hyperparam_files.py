@@ -9,17 +9,23 @@ from agents import ALGORITHMS, load_algorithm
 from pipeline.agent_checks import check_fit
 from pipeline.environments import make_single_env, make_training_env
 from pipeline.preparation import algorithm_kwargs
-from pipeline.settings import hyperparams
+from pipeline.settings import hyperparams, tuned_seeds
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
 from pipeline.settings.components import callbacks, vec_wrapper_factory
-from pipeline.settings.hyperparam_entries import entry_names, override, read_hyperparams
+from pipeline.settings.constructor_arguments import constructor_parameters
+from pipeline.settings.hyperparam_entries import (
+    entry_names,
+    override,
+    read_hyperparams,
+    seeds_tuned_on,
+)
 from pipeline.settings.hyperparams import split
 from pipeline.settings.strict_yaml import read_yaml
 from pipeline.train_spec import TrainSpec
 
 FOLDER = Path(hyperparams.__file__).parents[2] / "hyperparams"
 FILES = sorted(FOLDER.glob("*.yml"))
-ENTRIES = [(path.stem, key) for path in FILES for key in read_yaml(path)]
+ENTRIES = [(path.stem, key) for path in FILES for key in read_yaml(path) if key != tuned_seeds.KEY]
 
 # Agents of one environment alone have no entry that stands in for others.
 SPECIALISTS = {"angle"}
@@ -79,7 +85,7 @@ def test_every_file_is_an_agents_and_every_agent_has_one():
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_file_names_known_environments(path):
-    names = list(read_yaml(path))
+    names = [name for name in read_yaml(path) if name != tuned_seeds.KEY]
     assert set(names) - {"default"} <= set(gym.registry)
     assert entry_names(path.stem) == [name for name in names if name != "default"]
     assert ("default" in names) == (path.stem not in SPECIALISTS)
@@ -119,6 +125,27 @@ def test_every_entry_names_components_that_there_are(algo, key, tmp_path):
     spec = split(read_yaml(FOLDER / f"{algo}.yml")[key])
     vec_wrapper_factory(spec.vec_env_wrapper)
     assert len(callbacks(spec.callback, save_path=tmp_path)) == len(spec.callback)
+
+
+@pytest.mark.parametrize("algo", ALGORITHMS)
+def test_every_entry_that_somebody_chose_says_on_which_seeds(algo):
+    """Those that leave everything but the policy as it is say nothing, and no stand-in does."""
+    parameters = constructor_parameters(load_algorithm(algo))
+    for name, key in ENTRIES:
+        if name == algo and key != "default":
+            settings = split(read_hyperparams(algo, key)).algorithm
+            chosen = [
+                k for k, v in settings.items() if k != "policy" and v != parameters[k].default
+            ]
+            assert bool(seeds_tuned_on(algo, key)) == bool(chosen), (key, chosen)
+    assert seeds_tuned_on(algo, "Other-v0") == ()
+
+
+def test_no_shipped_entry_was_tuned_on_the_seeds_that_are_kept_for_judgement():
+    kept = range(1000, 2000)
+    for algo, key in ENTRIES:
+        for seeds in seeds_tuned_on(algo, key) or ():
+            assert not set(seeds) & set(kept), (algo, key)
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

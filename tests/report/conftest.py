@@ -35,7 +35,7 @@ def agent_analysis(label, mean, **changes):
         regret=estimate(mean + 6),
         steps_to_threshold=ThresholdSummary(estimate(mean + 7), estimate(0.75, 0.5, 0.9)),
         steps_to_stay=ThresholdSummary(estimate(mean + 10), estimate(0.75, 0.5, 0.9)),
-        episodes_to_threshold=ThresholdSummary(estimate(mean + 8), estimate(0.75, 0.5, 0.9)),
+        episodes_to_stay=ThresholdSummary(estimate(mean + 8), estimate(0.75, 0.5, 0.9)),
         success_rate=estimate(0.5, 0.25, 0.625),
         seconds=estimate(mean + 9),
     )

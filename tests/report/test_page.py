@@ -145,6 +145,7 @@ def test_settings_command_versions_and_failures(page, report_study):
     settings = page.all("section")[-1][1]
     assert "python compare.py 'a & b.yml'" in settings
     assert "Seeds: 0 to 1." in settings
+    assert "Seeds 0 to 1: the shipped settings of" in settings
     assert "2,000" in settings  # steps run
     assert "gamma" in settings
     assert report_study.planned[0].run.read_info()["versions"]["numpy"] in settings

@@ -36,8 +36,8 @@ def test_headings_in_their_order(ranking, made_up):
         ("Score", "1 is optimal", "descending"),
         ("Gap", "to the optimum", "ascending"),
         ("Success", "in the end", "descending"),
-        ("Steps", "to 96", "ascending"),
-        ("Episodes", "to 96", "ascending"),
+        ("Stays from", "step, at 96", "ascending"),
+        ("Episodes", "to stay at 96", "ascending"),
         ("Training", "seconds", "ascending"),
         ("Runs", "finished", "descending"),
     ]
@@ -54,7 +54,7 @@ def test_figures_of_each_agent_the_best_first(ranking, made_up):
             ("0.9", "0.8 to 1.1"),
             ("7", "6.8 to 7.1"),
             ("50.0%", "25% to 62%"),
-            ("97", "75% of runs"),
+            ("100", "75% of runs"),
             ("98", "75% of runs"),
             ("99", "98.9 to 99.2"),
             ("4", ""),
@@ -66,7 +66,7 @@ def test_figures_of_each_agent_the_best_first(ranking, made_up):
             ("0.4", "0.3 to 0.6"),
             ("57", "56.8 to 57.1"),
             ("50.0%", "25% to 62%"),
-            ("47", "75% of runs"),
+            ("50", "75% of runs"),
             ("48", "75% of runs"),
             ("49", "48.9 to 49.2"),
             ("4", "1 missing"),
@@ -76,7 +76,8 @@ def test_figures_of_each_agent_the_best_first(ranking, made_up):
 
 def test_cells_are_sorted_by_their_figures(ranking, made_up):
     _, ((_, cells),) = ranking([made_up.agent("first", 90.0)])
-    assert [cell.value for cell in cells] == pytest.approx([90, 92, 91, 0.9, 7, 0.5, 97, 98, 99, 4])
+    values = [90, 92, 91, 0.9, 7, 0.5, 100, 98, 99, 4]
+    assert [cell.value for cell in cells] == pytest.approx(values)
     assert [cell.bar for cell in cells] == [None] * 3 + [(0.8, 0.9, 1.0)] + [None] * 6
 
 
@@ -93,8 +94,8 @@ def test_what_applies_to_no_agent_has_no_column(ranking, made_up):
         1.0,
         score=None,
         success_rate=None,
-        steps_to_threshold=None,
-        episodes_to_threshold=None,
+        steps_to_stay=None,
+        episodes_to_stay=None,
     )
     headings, _ = ranking([agent], optimum=None, best_blind=None, threshold=None)
     titles = [heading["title"] for heading in headings]
@@ -110,20 +111,25 @@ def test_an_agent_without_a_figure_comes_last_and_has_a_dash(ranking, made_up):
         final=nothing,
         success_rate=nothing,
         steps_to_threshold=ThresholdSummary(nothing, nothing),
+        steps_to_stay=ThresholdSummary(nothing, nothing),
         seconds=nothing,
     )
     headings, (_, (_, cells)) = ranking([made_up.agent("with", 2.0), without])
     found = {h["title"]: cell for h, cell in zip(headings, cells, strict=True)}
-    for title in ("Mean", "Score", "Gap", "Success", "Steps", "Training"):
+    for title in ("Mean", "Score", "Gap", "Success", "Stays from", "Training"):
         assert (found[title].text, found[title].value, found[title].note) == ("-", None, ""), title
+    assert found["Stays from"].aside == ""
 
 
-def test_a_run_that_never_gets_there_says_so(ranking, made_up):
+def test_a_run_that_does_not_stay_says_so_and_its_crossing_only_aside(ranking, made_up):
     never = ThresholdSummary(Estimate(math.inf, 10, math.inf, 4), Estimate(0.25, 0, 0.5, 4))
-    headings, ((_, cells),) = ranking([made_up.agent("slow", 1.0, steps_to_threshold=never)])
-    (place,) = [i for i, heading in enumerate(headings) if heading["title"] == "Steps"]
+    headings, ((_, cells),) = ranking([made_up.agent("slow", 1.0, steps_to_stay=never)])
+    (place,) = [i for i, heading in enumerate(headings) if heading["title"] == "Stays from"]
     assert (cells[place].text, cells[place].value) == ("never", math.inf)
     assert cells[place].note == "25% of runs"
+    assert cells[place].aside == (
+        "75% of runs are there at some evaluation, the median run first at step 8"
+    )
 
 
 def test_no_two_columns_have_one_name(made_up):

@@ -57,7 +57,7 @@ def analysis(made_up):
     return made_up.analysis([place], ["first", "second", "third"])
 
 
-HEADINGS = ["agent", "mean", "IQM", "score", "training", "steps", "solved", "time"]
+HEADINGS = ["agent", "mean", "IQM", "score", "training", "stays from", "solved", "time"]
 ROWS = [
     [
         "first",
@@ -65,7 +65,7 @@ ROWS = [
         "92 [91.9, 92.2]",
         "0.9 [0.8, 1.1]",
         "95 [94.9, 95.2]",
-        "97",
+        "100",
         "75%",
         "99 s",
     ],
@@ -75,22 +75,23 @@ ROWS = [
         "42 [41.9, 42.2]",
         "0.4 [0.3, 0.6]",
         "45 [44.9, 45.2]",
-        "47",
+        "50",
         "75%",
         "49 s",
     ],
 ]
 TABLE = """\
-┏━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━┳━━━━━━━━┳━━━━━━┓
-┃ agent  ┃            mean ┃             IQM ┃          score ┃        training ┃ steps ┃ solved ┃ time ┃
-┡━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━╇━━━━━━━━╇━━━━━━┩
-│ first  │ 90 [89.9, 90.2] │ 92 [91.9, 92.2] │ 0.9 [0.8, 1.1] │ 95 [94.9, 95.2] │    97 │    75% │ 99 s │
-│ second │ 40 [39.9, 40.2] │ 42 [41.9, 42.2] │ 0.4 [0.3, 0.6] │ 45 [44.9, 45.2] │    47 │    75% │ 49 s │
-└────────┴─────────────────┴─────────────────┴────────────────┴─────────────────┴───────┴────────┴──────┘
+┏━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━┳━━━━━━━━┳━━━━━━┓
+┃ agent  ┃            mean ┃             IQM ┃          score ┃        training ┃ stays from ┃ solved ┃ time ┃
+┡━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━╇━━━━━━━━╇━━━━━━┩
+│ first  │ 90 [89.9, 90.2] │ 92 [91.9, 92.2] │ 0.9 [0.8, 1.1] │ 95 [94.9, 95.2] │        100 │    75% │ 99 s │
+│ second │ 40 [39.9, 40.2] │ 42 [41.9, 42.2] │ 0.4 [0.3, 0.6] │ 45 [44.9, 45.2] │         50 │    75% │ 49 s │
+└────────┴─────────────────┴─────────────────┴────────────────┴─────────────────┴────────────┴────────┴──────┘
 """  # noqa: E501  # as wide as it is printed
 CAPTION = (
     "mean, IQM: return of the final policy, with 95 % intervals over 4 seeds; training: return of "
-    "the last 100 training episodes; steps: until a return of 96, the median run"
+    "the last 100 training episodes; stays from: step from which on the median run stays at a "
+    "return of 96"
 )
 SENTENCES = [
     (
@@ -121,7 +122,8 @@ def test_a_title_a_table_a_caption_and_sentences(analysis, width, is_terminal):
     )
     assert lines[:2] == ["", "lake: optimum 100, best blind policy 20"]
     assert cells(lines) == [HEADINGS, *ROWS]
-    assert below(lines) == " ".join([CAPTION, *SENTENCES])
+    origin = "Seeds 0 to 3: nothing was tuned on these."
+    assert below(lines) == " ".join([CAPTION, *SENTENCES, origin])
     assert max(map(len, lines)) <= width
 
 
@@ -189,7 +191,7 @@ def test_an_agent_without_a_figure_has_a_dash(made_up):
         1.0,
         score=None,
         last_episodes=made_up.nothing,
-        steps_to_threshold=nothing,
+        steps_to_stay=nothing,
     )
     place = made_up.environment([made_up.agent("with", 2.0), without])
     analysis = made_up.analysis([place], ["with", "without"])
@@ -198,16 +200,14 @@ def test_an_agent_without_a_figure_has_a_dash(made_up):
 
 
 def test_what_applies_to_no_agent_has_no_column_and_no_explanation(made_up):
-    agent = made_up.agent(
-        "alone", 1.0, score=None, steps_to_threshold=None, episodes_to_threshold=None
-    )
+    agent = made_up.agent("alone", 1.0, score=None, steps_to_stay=None, episodes_to_stay=None)
     place = made_up.environment([agent], optimum=None, best_blind=None, threshold=None)
     _, lines = lines_of(
         lambda console: print_analysis(console, made_up.analysis([place], ["alone"]))
     )
     assert lines[1] == "lake"
     assert cells(lines)[0] == ["agent", "mean", "IQM", "training", "time"]
-    assert "steps" not in below(lines)
+    assert "stays from" not in below(lines)
 
 
 @pytest.mark.parametrize("name", ["[red]", "a name that is longer than twenty letters"])

@@ -1,0 +1,102 @@
+"""Which seeds of a study its settings were tuned on, and how that is said."""
+
+from dataclasses import replace
+
+import pytest
+
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.tuning_seeds import TuningSeeds, tuning_seeds
+from report.seed_sentence import seed_sentence, spans
+
+LAKE, PENDULUM = (EnvironmentSpec(name, name) for name in ("FrozenLake-v1", "Pendulum-v1"))
+NONE = frozenset()
+
+
+def study(*agents, places=(LAKE,), first=0, count=10):
+    return StudySpec("s", "S", agents, places, n_seeds=count, first_seed=first)
+
+
+def said(*agents, **fields):
+    asked = study(*agents, **fields)
+    return seed_sentence(asked.seeds, tuning_seeds(asked))
+
+
+DQN, PPO, RANDOM = (AgentSpec(name, name) for name in ("dqn", "ppo", "random"))
+
+
+def test_the_shipped_settings_and_the_seeds_that_they_were_tuned_on():
+    agents = DQN, PPO, RANDOM
+    assert said(*agents) == "Seeds 0 to 9: the shipped settings of dqn and ppo were tuned on these."
+    assert said(*agents, first=1000) == "Seeds 1000 to 1009: nothing was tuned on these."
+    assert said(*agents, first=8) == (
+        "Seeds 8 to 17: the shipped settings of dqn and ppo were tuned on 8 to 9 of these."
+    )
+    assert said(PPO, first=3, count=1) == "Seed 3: the shipped settings of ppo were tuned on it."
+    assert said(PPO, first=33, count=1) == "Seed 33: nothing was tuned on it."
+
+
+def test_each_environment_has_its_own():
+    found = tuning_seeds(study(PPO, places=(PENDULUM,), first=99, count=3))
+    assert found == TuningSeeds({"ppo": frozenset({100})}, {}, ())
+    both = tuning_seeds(study(PPO, places=(LAKE, PENDULUM), count=101))
+    assert both.shipped == {"ppo": frozenset([*range(10), 100])}
+
+
+def test_defaults_of_a_constructor_were_tuned_on_nothing_and_budgets_are_no_tuning():
+    plain = replace(DQN, tuned=False, settings={"policy": "MlpPolicy", "n_timesteps": 100})
+    assert said(plain) == "Seeds 0 to 9: nothing was tuned on these."
+    assert "the shipped settings of dqn" in said(replace(DQN, settings={"n_timesteps": 100}))
+
+
+def test_settings_of_the_studys_own_are_not_known_of():
+    changed = AgentSpec("mine", "dqn", {"gamma": 0.9})
+    assert said(changed, first=1000) == (
+        "Seeds 1000 to 1009: nothing is known to have been tuned on these; what the study's own "
+        "settings of mine were tuned on is not known."
+    )
+    assert said(changed) == (
+        "Seeds 0 to 9: the shipped settings of dqn were tuned on these; what the study's own "
+        "settings of mine were tuned on is not known."
+    )
+    place = replace(LAKE, settings={"gamma": 0.9})
+    assert tuning_seeds(study(DQN, RANDOM, places=(place,))).unknown == ("dqn", "random")
+    sweep = [AgentSpec(f"g={g}", "dqn", {"gamma": g}, group="g") for g in (0.1, 0.2)]
+    assert tuning_seeds(study(*sweep)).unknown == ("g",)
+
+
+def test_files_of_ones_own_say_it_or_it_is_not_known(tmp_path):
+    path = tmp_path / "mine.yml"
+    agent = replace(DQN, conf_file=path)
+    path.write_text("FrozenLake-v1: {gamma: 0.5}\n")
+    assert said(agent) == (
+        "Seeds 0 to 9: what the study's own settings of dqn were tuned on is not known."
+    )
+    path.write_text(
+        "tuned_on: {FrozenLake-v1: {first: 5, count: 2}}\nFrozenLake-v1: {gamma: 0.5}\n"
+    )
+    assert said(agent) == "Seeds 0 to 9: the settings in mine.yml were tuned on 5 to 6 of these."
+    assert tuning_seeds(study(agent)) == TuningSeeds({}, {"mine.yml": frozenset({5, 6})}, ())
+    path.unlink()
+    assert tuning_seeds(study(agent)) == TuningSeeds({}, {}, ("dqn",))
+
+
+def test_an_agent_of_ones_own_is_not_known_of():
+    assert tuning_seeds(study(AgentSpec("own", "own", tuned=False))) == TuningSeeds(
+        {}, {}, ("own",)
+    )
+
+
+def test_many_names_are_cut_short():
+    tuning = TuningSeeds({}, {}, tuple("abcdefgh"))
+    assert "of a, b, c, d, e, f and 2 more were" in seed_sentence(range(10), tuning)
+    assert seed_sentence(range(3), TuningSeeds({"a": NONE}, {}, ())).endswith(
+        "nothing was tuned on these."
+    )
+
+
+@pytest.mark.parametrize(
+    ("numbers", "text"),
+    [([3], "3"), ([0, 1, 2], "0 to 2"), ([9, 0, 1, 4, 7, 8], "0 to 1, 4, 7 to 9")],
+)
+def test_spans(numbers, text):
+    assert spans(numbers) == text
