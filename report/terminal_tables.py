@@ -12,11 +12,12 @@ from rich.table import Table
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.study_spec import METRIC_WORDS, StudySpec
-from report.claims import seeds_of
 from experiments.tuning_seeds import tuning_seeds
+from report.conclusions import conclusion
+from report.pair_sentences import seeds_of
 from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, BanditRow, Column, Row, filled
 from report.seed_sentence import seed_sentence
-from report.sentences import environment_sentences
+from report.verdict_matrix import LEGEND, SIGNS, says_more, verdict_matrix
 from report.wording import number
 
 MOST_AGENT_WIDTH = 20
@@ -29,11 +30,42 @@ def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
     for environment in analysis.environments:
         console.print()
         console.print(_ranking(analysis, environment))
-        for sentence in environment_sentences(analysis.study, environment):
-            console.print(f"  {sentence}", highlight=False, markup=False)
+        _print_conclusion(console, analysis.study, environment)
     console.print()
     origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
     console.print(origin, highlight=False, markup=False)
+
+
+def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
+    """The verdict in a line, the pairs as a matrix where they are many, and what else there is."""
+    said = conclusion(study, environment)
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False, markup=False)
+
+    say(said.lead)
+    if says_more(environment):
+        console.print(_matrix(environment))
+        say(LEGEND)
+    elif len(environment.agents) == 2:
+        for sentence in said.pairs:
+            say(sentence)
+    for sentence in said.notes:
+        say(sentence)
+
+
+def _matrix(environment: EnvironmentAnalysis) -> Table:
+    names = [agent.agent for agent in environment.agents]
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("")
+    table.add_column("", overflow="fold", max_width=MOST_AGENT_WIDTH)
+    numbers = [str(place) for place in range(1, len(names) + 1)]
+    for place in numbers:
+        table.add_column(place, justify="right", no_wrap=True)
+    for place, name, row in zip(numbers, names, verdict_matrix(environment), strict=True):
+        signs = ["·" if verdict is None else SIGNS[verdict] for verdict in row]
+        table.add_row(place, escape(name), *signs)
+    return table
 
 
 def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table:

@@ -9,15 +9,7 @@ from experiments.study_spec import COSTS, METRIC_WORDS
 from report.page.sections import Report, Section, estimate_data
 from report.series.run_series import AgentRuns
 from report.series.study_series import EnvironmentSeries
-from verdicts import Verdict
-
-PHRASES: dict[Verdict, str] = {
-    "better": "is better than",
-    "worse": "is worse than",
-    "equivalent": "is equivalent to",
-    "undecided": "is undecided against",
-}
-
+from report.verdict_matrix import PHRASES
 
 # A page with more runs than this of each agent shows their means alone.
 MOST_DOTS = 300

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from report.conclusions import conclusion, places_without_a_run
 from report.page.sections import Report, Section
-from report.sentences import environment_sentences, sentences
-
-SHOWN = 5  # sentences on an environment; the others wait behind a button
+from report.verdict_matrix import PHRASES, SIGNS, says_more, verdict_matrix
 
 
 def section(report: Report) -> Section | None:
-    """The sentences, those on one environment together."""
+    """For each environment a line, the pairs as a matrix, and folded the rest."""
     study = report.analysis.study
-    groups = [
-        (environment.environment, environment_sentences(study, environment))
+    cards = [
+        {
+            "environment": environment,
+            "conclusion": conclusion(study, environment),
+            "matrix": verdict_matrix(environment) if says_more(environment) else None,
+        }
         for environment in report.analysis.environments
     ]
-    grouped = {sentence for _, group in groups for sentence in group}
-    general = [s for s in sentences(report.analysis) if s not in grouped]
-    context = {"general": general, "groups": groups, "shown": SHOWN}
+    context = {
+        "general": places_without_a_run(report.analysis),
+        "cards": cards,
+        "signs": SIGNS,
+        "phrases": PHRASES,
+    }
     return Section("verdict", "Verdict", context)

@@ -20,7 +20,7 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.pull_recording import PULLS_FILE
 from pipeline.run_folder import Run
 from pipeline.training import train
-from report.sentences import sentences
+from report.conclusions import conclusion
 from report.terminal_tables import print_analysis
 
 STUDIES = sorted((Path(__file__).parents[2] / "studies").glob("bandit-*.yml"))
@@ -256,9 +256,9 @@ def test_less_regret_is_better(tmp_path, do_study):
     gaps = np.subtract.outer(scores["random"].to_numpy(), scores["Thompson"].to_numpy())
     assert pair.difference.point == pytest.approx(np.median(gaps))
     assert pair.probability_of_improvement.point == 1
-    first, second = sentences(analysis)
-    assert first.startswith("On coins, over 10 seeds, Thompson has the lowest regret of a run: ")
-    assert second.startswith("On coins, Thompson is better than random (by 1")
+    said = conclusion(analysis.study, environment)
+    assert said.lead.startswith("Thompson is best: regret of a run ")
+    assert said.pairs[0].startswith("Thompson is better than random (by 1")
 
     console = Console(width=120, record=True, file=io.StringIO())
     print_analysis(console, analysis)

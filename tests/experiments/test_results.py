@@ -18,9 +18,9 @@ from experiments.study_plan import plan
 from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, read_results
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
+from report.conclusions import conclusion, places_without_a_run
 from report.figures.figure_files import write_figures
 from report.result_files import write_tables
-from report.sentences import sentences
 from report.series.episode_blocks import episodes_table
 from report.series.study_series import study_series
 from report.terminal_tables import print_analysis, print_episodes_table
@@ -78,7 +78,13 @@ def results_of(study, root, finals, **options):
 
 
 def said(results):
-    return " ".join(sentences(analyse(results)))
+    return everything_said(analyse(results))
+
+
+def everything_said(analysis):
+    """All sentences in one text."""
+    found = [conclusion(analysis.study, place).everything for place in analysis.environments]
+    return " ".join([*(text for texts in found for text in texts), *places_without_a_run(analysis)])
 
 
 def test_a_row_for_each_run(tmp_path):
@@ -216,11 +222,11 @@ def test_ranks_estimates_and_pairs(tmp_path):
 VERDICTS = {
     "better": (
         {"qlearning": [10, 11, 12, 13, 14], "sarsa": [90, 91, 92, 91, 91]},
-        "On Warehouse-v0, sarsa is better than qlearning (by 79 [",
+        "sarsa is better than qlearning (by 79 [",
     ),
     "better but for a failure": (
         {"qlearning": [80, 80, 80, 80, 80, 80, 80], "sarsa": [90, 90, 90, 90, 90, 90, 10]},
-        "On Warehouse-v0, qlearning against sarsa is undecided with 7 seeds (difference -10 [",
+        "qlearning is undecided against sarsa (difference -10 [",
     ),
     "better with a failure": (
         {"qlearning": [80] * 12, "sarsa": [90] * 11 + [10]},
@@ -244,46 +250,45 @@ VERDICTS = {
     "failures alone": (
         # The typical run is 0.1 worse, and one in three fails.
         {"qlearning": [90.0] * 12 + [0] * 6, "sarsa": [90.1, 89.9] * 9},
-        "On Warehouse-v0, qlearning fails more often than sarsa (6 of 18 runs against 0 of 18).",
+        "qlearning fails more often than sarsa (6 of 18 runs against 0 of 18).",
     ),
     "too few": (
         {"qlearning": [10, 11, 12, 13], "sarsa": [90, 91, 92, 91]},
         (
-            "On Warehouse-v0, the agents are undecided: 4 seeds cannot tell 2 agents apart, "
-            "whatever they score; it takes 5 or more."
+            "Undecided: 4 seeds cannot tell 2 agents apart, whatever they score; it takes 5 or "
+            "more. sarsa has the highest mean so far: return of the final policy 91 [90"
         ),
     ),
     "none has learnt": (
         {"qlearning": [0, 0, 0, 1], "sarsa": [0, -5, 0, 90]},
         (
-            "On Warehouse-v0, none of the agents has learnt: over 4 seeds, no typical run is "
-            "better than the best blind policy's 0; the "
-            "highest return of the final policy is 21.25 ["
+            "None of the agents has learnt: no typical run is better than the best blind policy's "
+            "0; the highest mean return of the final policy is 21.25 ["
         ),
     ),
     "undecided": (
         {"qlearning": [10, 80, 40, 60, 50], "sarsa": [70, 30, 90, 40, 60]},
-        "sarsa against qlearning is undecided with 5 seeds (difference 10 [",
+        "sarsa is undecided against qlearning (difference 10 [",
     ),
     "the optimum": (
         {"qlearning": [100] * 4, "sarsa": [50, 51, 52, 53]},
-        "qlearning has the highest return of the final policy: 100, the optimum.",
+        "qlearning has the highest mean so far: return of the final policy 100, the optimum.",
     ),
     "all the best": (
         {"qlearning": [90] * 4, "sarsa": [90] * 4},
-        "qlearning and sarsa have the highest return of the final policy: 90, a score of 0.9;",
+        "qlearning and sarsa have the highest mean so far: return of the final policy 90, score",
     ),
     "a missing run": (
         {"qlearning": [90, None, 90, 91], "sarsa": [50, 51, 52, 53]},
-        "On Warehouse-v0, 1 of 4 runs of qlearning is missing.",
+        "1 of 4 runs of qlearning is missing.",
     ),
     "two missing runs": (
         {"qlearning": [90, None, None, 91], "sarsa": [50, 51, 52, 53]},
-        "On Warehouse-v0, 2 of 4 runs of qlearning are missing.",
+        "2 of 4 runs of qlearning are missing.",
     ),
     "no run": (
         {"qlearning": [None] * 4, "sarsa": [50, 51, 52, 53]},
-        "On Warehouse-v0, no run of qlearning has finished.",
+        "No run of qlearning has finished.",
     ),
     "speed": (
         {"qlearning": [100] * 4, "sarsa": [195] * 4},
@@ -308,7 +313,7 @@ def test_sentences(tmp_path, case):
 
 def test_more_seeds_are_asked_for_where_they_would_help(tmp_path):
     results = results_of(study_of(n_seeds=5), tmp_path, VERDICTS["undecided"][0])
-    assert re.search(r"; [\d,]+ seeds would probably tell\.", said(results))
+    assert re.search(r"; about [\d,]+ seeds are needed to decide\)\.", said(results))
 
 
 def test_agents_of_which_every_two_are_equivalent_make_one_sentence(tmp_path):
@@ -319,7 +324,8 @@ def test_agents_of_which_every_two_are_equivalent_make_one_sentence(tmp_path):
     same = "are equivalent in the typical run within 2; 0 of 8 runs each failed"
     assert f"double_qlearning, sarsa and expected_sarsa {same}" in text
     assert f"sarsa, expected_sarsa and qlearning {same}" in text
-    assert text.count("equivalent") == 2
+    assert "and expected_sarsa are best, and equivalent: return of the final policy 93" in text
+    assert text.count("equivalent in") == 2
     assert "double_qlearning is better than qlearning (by 3)" in text
 
 
@@ -327,7 +333,7 @@ def test_an_environment_without_a_known_optimum(tmp_path):
     study = study_of(environments=[UNKNOWN])
     results = results_of(study, tmp_path, {"qlearning": [480] * 4, "sarsa": [100, 120, 99, 98]})
     text = said(results)
-    assert "qlearning has the highest return of the final policy: 480." in text
+    assert "qlearning has the highest mean so far: return of the final policy 480." in text
     assert "optimum" not in text
     assert "qlearning reaches a return of 475 and keeps it to the end in 4 of 4 runs, the" in text
     assert "failed" not in text
@@ -374,7 +380,7 @@ def test_failures_do_not_stop_the_analysis(tmp_path, case):
     study = study_of(n_seeds=2, environments=[environment])
     text = everything(results_of(study, tmp_path, finals), tmp_path)
     assert environment.label in text
-    assert "no run of qlearning" in text or "is missing" in text
+    assert "No run of qlearning" in text or "is missing" in text
 
 
 def test_an_environment_without_a_run_is_named(tmp_path):
@@ -399,9 +405,9 @@ def test_a_study_without_a_run(tmp_path):
 def test_one_seed_decides_nothing(tmp_path):
     study = study_of(n_seeds=1)
     text = everything(results_of(study, tmp_path, {"qlearning": [9], "sarsa": [80]}), tmp_path)
-    assert "over 1 seed, sarsa has the highest" in text
+    assert "sarsa has the highest mean so far" in text
     assert "better" not in text
-    assert "the agents are undecided: 1 seed cannot tell 2 agents apart" in " ".join(text.split())
+    assert "Undecided: 1 seed cannot tell 2 agents apart" in " ".join(text.split())
 
 
 def test_runs_without_evaluations(tmp_path):
@@ -411,9 +417,9 @@ def test_runs_without_evaluations(tmp_path):
         write_run(run, [])
     results = read_results(study, planned, tmp_path)
     text = everything(results, tmp_path)
-    assert "no run has a figure for the return of the final policy" in text
+    assert "No run has a figure for the return of the final policy" in text
     trained = replace(results, study=replace(study, metric="training"))
-    assert "have the highest mean return of all training episodes: 1." in said(trained)
+    assert "have the highest mean so far: mean return of all training episodes 1." in said(trained)
 
 
 def test_runs_without_an_episode(tmp_path):
@@ -557,8 +563,8 @@ def test_agents_that_were_trained_on_a_variant_are_known_and_told_of(tmp_path, f
         "plain": False,
         "shaped": True,
     }
-    told_of = "On Warehouse-v0, shaped was trained on a variant of the environment"
-    assert told_of in " ".join(sentences(analysis))
+    told_of = "shaped was trained on a variant of the environment"
+    assert told_of in everything_said(analysis)
     curves = study_series(analysis, told.append).environments[0].curves
     assert curves["training"].on_variant == ("shaped",)
     assert curves["evaluation"].on_variant == ()
@@ -571,7 +577,7 @@ def test_agents_that_do_not_learn_are_told_apart_by_what_they_are(tmp_path):
     results = results_of(study_of(agents=agents, n_seeds=2), tmp_path, finals)
     text = said(results)
     assert "optimal is better than value_iteration (by 10)." in text
-    assert "all other pairs of agents are undecided: 2 seeds cannot tell 3 agents apart" in text
+    assert "All other pairs are undecided: 2 seeds cannot tell 3 agents apart" in text
     assert set(analyse(results).environments[0].failures) == {"qlearning"}
     # Returns of sampled episodes depend on chance, whoever plays.
     sampled = results.summary.assign(exact=False)

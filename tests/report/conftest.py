@@ -10,7 +10,7 @@ import pytest
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from verdicts import Estimate, Summary, ThresholdSummary
+from verdicts import Estimate, PairComparison, Summary, ThresholdSummary
 
 
 def estimate(point, low=None, high=None, n=4):
@@ -40,6 +40,13 @@ def agent_analysis(label, mean, **changes):
         seconds=estimate(mean + 9),
     )
     return replace(figures, **changes)
+
+
+def pair_of(first, second, verdict, difference=10.0, seeds_needed=None):
+    """A verdict on two agents."""
+    gap = estimate(difference, difference - 5, difference + 5)
+    chance = estimate(0.5, 0.25, 0.75)
+    return PairComparison(first, second, gap, 0.01, 0.02, chance, verdict, seeds_needed)
 
 
 def environment_analysis(agents=(), label="lake", **changes):
@@ -74,6 +81,7 @@ def made_up():
         agent = staticmethod(agent_analysis)
         environment = staticmethod(environment_analysis)
         study = staticmethod(study_of)
+        pair = staticmethod(pair_of)
         analysis = staticmethod(study_analysis)
         nothing = Estimate(math.nan, math.nan, math.nan, 0)
 

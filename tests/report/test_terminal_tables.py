@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from experiments.pull_statistics import pull_statistics
-from report.sentences import environment_sentences
+from report.conclusions import conclusion
 from report.terminal_tables import print_analysis, print_episodes_table
 from verdicts import PairComparison, ThresholdSummary
 
@@ -94,17 +94,14 @@ CAPTION = (
     "return of 96"
 )
 SENTENCES = [
+    ("first is best: return of the final policy 90 [89.9, 90.2], score 0.9; the optimum is 100."),
+    "first is better than second (by 50 [45, 55]).",
     (
-        "On lake, over 4 seeds, first has the highest return of the final policy: 90 [89.9, 90.2], "
-        "a score of 0.9; the optimum is 100."
-    ),
-    "On lake, first is better than second (by 50 [45, 55]).",
-    (
-        "On lake, second reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the "
+        "second reaches a score of 0.95 and keeps it to the end in 3 of 4 runs, the "
         "median one from step 50 on; first in 3 of 4 runs, the median one from step 100 on."
     ),
-    "On lake, 1 of 4 runs of second is missing.",
-    "On lake, no run of third has finished.",
+    "1 of 4 runs of second is missing.",
+    "No run of third has finished.",
 ]
 
 
@@ -144,12 +141,31 @@ def test_figures_stand_on_the_right_and_names_on_the_left(analysis):
 
 def test_a_sentence_for_each_verdict_begins_a_line(analysis):
     _, lines = lines_of(lambda console: print_analysis(console, analysis))
-    starts = [line.strip() for line in lines if line.startswith("  On ")]
-    said = environment_sentences(analysis.study, analysis.environments[0])
-    assert said == SENTENCES
-    assert len(starts) == len(said)
-    for start, sentence in zip(starts, said, strict=True):
-        assert sentence.startswith(start)
+    said = conclusion(analysis.study, analysis.environments[0])
+    assert list(said.everything) == SENTENCES
+    for sentence in SENTENCES:
+        assert any(sentence.startswith(line.strip()) for line in lines if line.strip())
+
+
+def test_three_agents_have_their_verdicts_in_a_matrix(made_up):
+    agents = [made_up.agent(name, mean) for name, mean in (("a", 90.0), ("[b]", 80.0), ("c", 70.0))]
+    pairs = [
+        made_up.pair("a", "[b]", "worse"),
+        made_up.pair("a", "c", "undecided"),
+        made_up.pair("[b]", "c", "equivalent"),
+    ]
+    found = made_up.analysis([made_up.environment(agents, pairs=tuple(pairs))], ["a", "[b]", "c"])
+    _, lines = lines_of(lambda console: print_analysis(console, found))
+    place = next(i for i, line in enumerate(lines) if line.split() == ["1", "2", "3"])
+    assert [line.split() for line in lines[place + 1 : place + 4]] == [
+        ["1", "a", "·", "<", "?"],
+        ["2", "[b]", ">", "·", "="],
+        ["3", "c", "?", "=", "·"],
+    ]
+    assert lines[place + 4] == (
+        "> better than the agent of the column, < worse, = equivalent, ? undecided"
+    )
+    assert not any("is undecided against" in line for line in lines)
 
 
 def test_returns_of_a_training_variant_are_marked(made_up):
@@ -170,17 +186,15 @@ def test_verdicts_on_training_say_which_agents_had_a_variant(made_up, metric):
     names = ["first", "second", "third"]
     agents = [made_up.agent(name, 90.0, on_variant=name != "first") for name in names]
     place = made_up.environment(agents)
-    said = environment_sentences(made_up.study(names, metric=metric), place)
+    said = conclusion(made_up.study(names, metric=metric), place).notes
     sentence = (
-        "On lake, second and third were trained on a variant of the environment, with returns of "
-        "its own."
+        "second and third were trained on a variant of the environment, with returns of its own."
     )
     assert (sentence in said) is (metric != "final")
     # Once more with all on the environment itself.
     place = made_up.environment([made_up.agent(name, 90.0) for name in names])
     assert not any(
-        "variant" in text
-        for text in environment_sentences(made_up.study(names, metric=metric), place)
+        "variant" in text for text in conclusion(made_up.study(names, metric=metric), place).notes
     )
 
 
@@ -251,8 +265,8 @@ def test_bandits_have_a_table_of_their_own(made_up, width):
     ]
     assert below(lines).startswith(
         "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; simple regret: of "
-        "recommending the arm pulled most; reward, best arm: at the last pulls On coins, over 4 "
-        "seeds, first has the lowest regret of a run: 1 [0.9, 1.2]."
+        "recommending the arm pulled most; reward, best arm: at the last pulls Undecided: 4 "
+        "seeds decide nothing. first has the lowest mean so far: regret of a run 1 [0.9, 1.2]."
     )
 
 

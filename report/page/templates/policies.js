@@ -124,7 +124,7 @@ report.section("policies", (root, data) => {
     const note = document.createElement("p");
     note.className = "note";
     note.textContent =
-      map.colour === undefined ? "all optimal actions" : `${seen.length - wrong.length} of ${seen.length} cells as at best`;
+      map.colour === undefined ? "all optimal actions" : `${seen.length - wrong.length} of ${seen.length} cells optimal`;
     const picture = element("svg", { viewBox: `-.04 -.04 ${width + 0.08} ${height + 0.08}`, role: "img", "aria-label": `${map.title}: ${note.textContent}` });
     picture.append(...cells.map((cell) => drawCell(map, cell, colours)));
     figure.append(title, picture, note);
