@@ -16,6 +16,7 @@ from agents import ALGORITHMS
 from pipeline.errors import UserError
 from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
+from pipeline.resuming.log_positions import cut_back, log_positions
 from pipeline.resuming.saved_states import SavedState
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
@@ -295,6 +296,17 @@ def test_what_has_changed_since_the_run_began_is_told(tmp_path, monkeypatch):
     agent.write_bytes(b"another")
     tell_changes(run, again, told.append)
     assert [line.split()[0] for line in told] == [str(module), str(agent)]
+
+
+def test_files_that_a_wrapper_begins_anew_are_no_obstacle(tmp_path):
+    rows, others = tmp_path / "0.monitor.csv", tmp_path / "all.monitor.csv"
+    rows.write_text("a\nb\n")
+    others.write_text("a\nb\n")
+    positions = log_positions(tmp_path, None)
+    rows.write_text("a\nb\nc\n")
+    others.write_text("a\n")
+    cut_back(tmp_path, None, positions)
+    assert (rows.read_text(), others.read_text()) == ("a\nb\n", "a\n")
 
 
 def test_without_a_state_the_run_begins_anew(tmp_path, monkeypatch):
