@@ -3,8 +3,8 @@
     python benchmarks/state_cost.py    # a few minutes
 
 Processor time inside `StateSaver.save` over that of the process since the training's first step,
-evaluations included: when the first state had been saved, and when the training was over. States are
-due by processor time here, so that what else the machine does changes nothing.
+evaluations included: when the first state had been saved, and when the training was over. States
+are due by processor time here, so that what else the machine does changes nothing.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def watched(saved: Saved, started: list[float]) -> None:
         start(self)
         started[0] = time.process_time()
 
-    state_saver.time = SimpleNamespace(monotonic=time.process_time)  # type: ignore[attr-defined]
+    state_saver.time = SimpleNamespace(monotonic=time.process_time)  # type: ignore[assignment]
     StateSaver.save = timed  # type: ignore[method-assign]
     StateSaver._on_training_start = noted  # type: ignore[method-assign]
 
