@@ -20,6 +20,7 @@ from pipeline.resuming.unfinished_runs import (
     newest_unfinished,
     recorded_training,
     run_of_spec,
+    tell_changes,
 )
 from pipeline.run_folder import Run
 from pipeline.stopping import StopRequest, current
@@ -134,6 +135,7 @@ def _carried_out(args: argparse.Namespace, run: Run, spec: TrainSpec, console: C
             from pipeline.training import carry_out, prepare
 
             activity.now("making the environments and the agent")
+            tell_changes(run, spec, say)
             keeping = go_on(run, StateKeeping(args.save_state_every, stays=args.keep_state), say)
         if keeping.state is None:
             say("no state was saved: the run begins anew")

@@ -109,10 +109,15 @@ def digests_of(folder: Path) -> dict[str, str]:
     paths = [path for path in paths if path.parent != folder / STATE_FOLDER]
     names = {path.relative_to(folder).as_posix(): path for path in paths}
     return {
-        name: _digest(path, sys.maxsize)
+        name: digest_of(path)
         for name, path in names.items()
         if name not in (RECORD, LOCK) and not (path.name.startswith(".") and path.suffix == ".tmp")
     }
+
+
+def digest_of(path: Path) -> str:
+    """The digest of a file."""
+    return _digest(path, sys.maxsize)
 
 
 def sealed(record: Mapping[str, Any]) -> dict[str, Any]:

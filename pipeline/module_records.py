@@ -38,6 +38,17 @@ def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
         (folder / COPIES / path.name).write_bytes(path.read_bytes())
 
 
+def changed_since(modules: Iterable[UserModule], folder: Path) -> list[Path]:
+    """The files of modules that are no more what a run folder has copies of."""
+    files = [Path(module.path) for module in modules if module.path is not None]
+    copies = {path: folder / COPIES / path.name for path in files}
+    return [
+        path
+        for path, copy in copies.items()
+        if path.is_file() and copy.is_file() and path.read_bytes() != copy.read_bytes()
+    ]
+
+
 def check_recorded(recorded: Mapping[str, Any], folder: Path) -> None:
     """Make sure that the modules that a run was trained with have been imported.
 

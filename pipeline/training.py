@@ -29,7 +29,12 @@ from pipeline.resuming.resumed_logging import IterationInterval, iterations_befo
 from pipeline.resuming.state_folder import remove_states
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_folder import FINISHED, INTERRUPTED, RUNNING, Run
-from pipeline.run_record import recorded_versions, write_arguments, write_settings
+from pipeline.run_record import (
+    recorded_versions,
+    trained_agent_record,
+    write_arguments,
+    write_settings,
+)
 from pipeline.signs_of_life import Activity, doing
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
@@ -143,6 +148,7 @@ def _record_beginning(training: Training, args: dict[str, Any], command: str) ->
         env_name=run.env_name,
         spec=spec.as_data(),
         versions=recorded_versions(),
+        **trained_agent_record(spec),
         **({} if training.refusal is None else {"model_refused": training.refusal}),
     )
 

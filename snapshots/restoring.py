@@ -100,7 +100,7 @@ class _Restorer(LeafFiller):
         return [self.value(cell, old) for cell, old in zip(cells, known, strict=False)]
 
     def held(self, node: dict[str, Any]) -> NDArray[Any]:
-        arrays, number = self._snapshot.arrays, node["array"]
+        arrays, number = self._snapshot.arrays, int(node["array"])
         array, arrays[number] = arrays[number], np.empty(0)
         return array
 

@@ -67,7 +67,8 @@ def _position(path: Path, length: int) -> Position:
 
 
 def _monitor_files(run_folder: Path) -> list[Path]:
-    return sorted(run_folder.glob("*monitor.csv"))
+    # By the numbers of the environments: a wrapper that the settings name begins its file anew.
+    return sorted(run_folder.glob("[0-9]*.monitor.csv"))
 
 
 def _event_files(log_folder: str | None) -> list[Path]:

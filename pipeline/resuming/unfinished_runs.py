@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError
+from pipeline.file_digests import DamagedFileError, digest_of
+from pipeline.module_records import changed_since
 from pipeline.resuming.log_positions import cut_back, remove_events
 from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_files import environment_name
 from pipeline.run_folder import FINISHED, TENSORBOARD, Run, numbered_runs
-from pipeline.run_record import recorded_versions
+from pipeline.run_record import TRAINED_AGENT, recorded_versions
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec, completed
 from pipeline.user_modules import UserModule
@@ -128,6 +129,16 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
             raise UserError(f"{run.state_path} holds the state of a run of other settings")
         cut_back(run.path, state.note["log_folder"], state.note["files"])
     return replace(keeping, state=state, goes_on=True)
+
+
+def tell_changes(run: Run, spec: TrainSpec, tell: Callable[[str], object]) -> None:
+    """Tell of files that are no more what a run began with: the user's modules, the agent of -i."""
+    changed = changed_since(spec.user_modules, run.path)
+    agent, before = spec.trained_agent, run.read_info().get(TRAINED_AGENT)
+    if agent is not None and before is not None and agent.is_file() and digest_of(agent) != before:
+        changed.append(agent)
+    for path in changed:
+        tell(f"{path} has changed since the run began, so that its result may differ")
 
 
 def _may_go_on(run: Run) -> bool:

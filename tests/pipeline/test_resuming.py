@@ -4,6 +4,7 @@ import gc
 import io
 import json
 import os
+import sys
 import zipfile
 from dataclasses import replace
 
@@ -16,16 +17,23 @@ from agents import ALGORITHMS
 from pipeline.errors import UserError
 from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
+from pipeline.resuming.log_positions import cut_back, log_positions
 from pipeline.resuming.saved_states import SavedState
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
-from pipeline.resuming.unfinished_runs import go_on, newest_unfinished, recorded_training
+from pipeline.resuming.unfinished_runs import (
+    go_on,
+    newest_unfinished,
+    recorded_training,
+    tell_changes,
+)
 from pipeline.run_folder import Run
 from pipeline.run_lock import at_work_on
 from pipeline.settings.hyperparam_entries import override, read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
+from pipeline.user_modules import import_typed
 from snapshots.recording import Snapshot
 
 GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
@@ -273,6 +281,35 @@ def test_a_state_beside_other_settings_is_refused(tmp_path, monkeypatch):
         (run.state_path / path.name).write_bytes(path.read_bytes())
     with pytest.raises(UserError, match="of other settings"):
         go_on(run, StateKeeping(), pytest.fail)
+
+
+def test_what_has_changed_since_the_run_began_is_told(tmp_path, monkeypatch):
+    begun = undisturbed(spec_of(tmp_path / "first", GRID, "qlearning", 300, {}))
+    agent, module = tmp_path / "agent.zip", tmp_path / "things_of_mine.py"
+    agent.write_bytes(begun.run.model_path.read_bytes())
+    module.write_text("x = 1\n")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    mine = {"user_modules": import_typed([str(module)]), "gym_packages": ("things_of_mine",)}
+    spec = spec_of(tmp_path, GRID, "qlearning", 600, {}, trained_agent=agent, **mine)
+    run, told = cut_off(spec, monkeypatch), []
+    again = recorded_training(run, spec.user_modules)
+    tell_changes(run, again, told.append)
+    assert told == []
+    module.write_text("x = 2\n")
+    agent.write_bytes(b"another")
+    tell_changes(run, again, told.append)
+    assert [line.split()[0] for line in told] == [str(module), str(agent)]
+
+
+def test_files_that_a_wrapper_begins_anew_are_no_obstacle(tmp_path):
+    rows, others = tmp_path / "0.monitor.csv", tmp_path / "all.monitor.csv"
+    rows.write_text("a\nb\n")
+    others.write_text("a\nb\n")
+    positions = log_positions(tmp_path, None)
+    rows.write_text("a\nb\nc\n")
+    others.write_text("a\n")
+    cut_back(tmp_path, None, positions)
+    assert (rows.read_text(), others.read_text()) == ("a\nb\n", "a\n")
 
 
 def test_without_a_state_the_run_begins_anew(tmp_path, monkeypatch):
