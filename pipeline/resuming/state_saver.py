@@ -34,7 +34,8 @@ from snapshots.restoring import restore
 # Saving may take this share of the time, where the user has not said how often.
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
-# What was cut off may be so again soon, and has to get ahead each time.
+# What was cut off may be so again soon, and has to get ahead each time: its pauses begin short, and
+# double, so that half of what was done since is kept.
 SECONDS_AFTER_GOING_ON = 0.1
 
 
@@ -75,7 +76,8 @@ class StateSaver(StopAtSafeMoment):
         self.seconds_before = float(note.get("seconds", 0.0))
         self.steps_at_save = 0
         self.saved_at = self.started = time.monotonic()
-        first_pause = SHORTEST_INTERVAL if state is None else SECONDS_AFTER_GOING_ON
+        self.has_gone_on = state is not None
+        first_pause = SECONDS_AFTER_GOING_ON if self.has_gone_on else SHORTEST_INTERVAL
         self.pause = interval.seconds or first_pause
 
     @property
@@ -142,7 +144,9 @@ class StateSaver(StopAtSafeMoment):
         self.saved_at = time.monotonic()
         self.steps_at_save = self.model.num_timesteps
         if self.interval.seconds == 0:
-            self.pause = max((self.saved_at - begun) / SHARE_OF_TIME, SHORTEST_INTERVAL)
+            seconds = self.saved_at - begun
+            pause = max(seconds / SHARE_OF_TIME, SHORTEST_INTERVAL)
+            self.pause = min(pause, 2 * (self.pause + seconds)) if self.has_gone_on else pause
 
     def _tell_once(self, line: str) -> None:
         """Say a line that would be the same at each state, as long as a disk is full."""
