@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any, TextIO
 
@@ -51,7 +52,8 @@ class Output:
                 self._give_up(error)
         if self.failure is None or self.goes_on:
             return
-        if isinstance(self.failure, BrokenPipeError):
+        is_main = threading.current_thread() is threading.main_thread()
+        if isinstance(self.failure, BrokenPipeError) and is_main:  # else it would end that thread
             raise OwnExit(0)
         raise self.failure
 

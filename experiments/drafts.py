@@ -1,8 +1,8 @@
 """Runs that are being written: whose they are, and what becomes of them when their process is gone.
 
 A draft is called ``<process>@<machine>@<run>``. One that holds a state to go on from is kept when
-its process ends before it; the next process that does this run takes it over, by renaming it. What
-is without a state is removed.
+its process ends before it; the next process that does this run takes it over, by renaming it. So is
+one without a state, of a process that was killed: it says that states have to come sooner.
 """
 
 from __future__ import annotations
@@ -88,18 +88,20 @@ def _run_of(draft: Path) -> str:
 
 
 def take_over(draft: Path) -> bool:
-    """Make ``draft`` of what a process that is gone has left of the same run, if it can go on.
+    """Make ``draft`` of what a process that is gone has left of the same run.
 
     Returns:
-        Whether there was such a one.
+        Whether there was anything.
     """
-    for left in _drafts(draft.parent.parent):
-        if left == draft or _run_of(left) != _run_of(draft):
-            continue
-        if holds_state(left) and _is_dead(left):
-            with contextlib.suppress(OSError):  # another was faster
-                left.replace(draft)
-                return True
+    left = [
+        one
+        for one in _drafts(draft.parent.parent)
+        if one != draft and _run_of(one) == _run_of(draft) and _is_dead(one)
+    ]
+    for one in sorted(left, key=holds_state, reverse=True):
+        with contextlib.suppress(OSError):  # another was faster
+            one.replace(draft)
+            return True
     return False
 
 
@@ -160,10 +162,10 @@ def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
 
     Args:
         root: the study's folder.
-        kept: names of runs that are to be done; what can be gone on from is kept of these.
+        kept: names of runs that are to be done, by whom theirs are taken over.
     """
     for draft in _drafts(root):
-        if _is_dead(draft) and not (_run_of(draft) in kept and holds_state(draft)):
+        if _is_dead(draft) and _run_of(draft) not in kept:
             remove_draft(draft)
     _remove_empty(root / FOLDER)
 

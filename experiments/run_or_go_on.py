@@ -46,12 +46,13 @@ def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
 
 def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:
     """The state that another process has left, where there is one."""
+    anew = StateKeeping(was_cut_off=run.path.is_dir())
     if planned.is_batch or not holds_state(run.path) or not planned.is_of(run):
-        return StateKeeping()
+        return anew
     try:
         return go_on(run, StateKeeping(), _say_to_nobody)
     except UserError:  # it is damaged, or another user's
-        return StateKeeping()
+        return anew
 
 
 def _begin_anew(planned: PlannedRun, run: Run) -> None:

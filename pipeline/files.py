@@ -85,7 +85,13 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Nobody meets a half-written file then, whatever becomes of the process. A power cut may still
     take the file: see `lasting`.
+
+    Raises:
+        FileNotFoundError: if the folder is gone, as one that was renamed meanwhile; some libraries
+            would make it anew.
     """
+    if not path.parent.is_dir():
+        raise FileNotFoundError(errno.ENOENT, "its folder is gone", str(path))
     # A name that could be guessed might be there already, as a link to another's file.
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     with naming(path):

@@ -144,7 +144,9 @@ def set_up(
     exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
-    saver = StateSaver(run, keeping.interval, partial(_say, console), keeping.state)
+    saver = StateSaver(
+        run, keeping.interval, partial(_say, console), keeping.state, keeping.was_cut_off
+    )
     saver.modules = spec.user_modules
     pulls = pull_recorder(model, run, console) if is_bandit else None
     # In this order: of a broken number nothing is kept, and no other callback sees a moment that a

@@ -32,10 +32,13 @@ class StateKeeping:
         interval: how often it is saved.
         state: what the training goes on from; None where it begins.
         goes_on: whether the run folder is an earlier process's, also where that left no state.
+        was_cut_off: whether another process began the run and did not finish it, so that states
+            come sooner.
         stays: whether states are still there when the run is finished.
     """
 
     interval: SaveInterval = SaveInterval()
     state: SavedState | None = None
     goes_on: bool = False
+    was_cut_off: bool = False
     stays: bool = False

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gc
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,9 @@ from snapshots.restoring import restore
 SHARE_OF_TIME = 0.02
 SHORTEST_INTERVAL = 1.0  # seconds
 FIRST_COST = 0.05  # seconds; of states of which nothing is known
-# What was cut off may be so again soon, and has to get ahead each time.
-SECONDS_AFTER_GOING_ON = 0.1
+# What was cut off may be so again soon, and has to get ahead each time: its pauses begin short, and
+# double, so that half of what was done since is kept.
+SHORTEST_PAUSE = 0.1
 
 
 class StateSaver(StopAtSafeMoment):
@@ -63,6 +64,7 @@ class StateSaver(StopAtSafeMoment):
         interval: SaveInterval,
         tell: Callable[[str], object],
         state: SavedState | None = None,
+        was_cut_off: bool = False,
     ) -> None:
         super().__init__()
         self.run = run
@@ -82,7 +84,8 @@ class StateSaver(StopAtSafeMoment):
         self.started = WorkTime.now()
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
-        self.pause = interval.seconds or _first_pause(state)
+        self.was_cut_off = was_cut_off
+        self.pause = interval.seconds or self._first_pause(note)
 
     @property
     def taken(self) -> WorkTime:
@@ -151,7 +154,19 @@ class StateSaver(StopAtSafeMoment):
         self.saved_at = time.monotonic()
         self.steps_at_save = self.model.num_timesteps
         if self.interval.seconds == 0:
-            self.pause = max((self.saved_at - begun) / SHARE_OF_TIME, SHORTEST_INTERVAL)
+            seconds = self.saved_at - begun
+            pause = max(seconds / SHARE_OF_TIME, SHORTEST_INTERVAL)
+            self.pause = min(pause, 2 * (self.pause + seconds)) if self.was_cut_off else pause
+
+    def _first_pause(self, note: Mapping[str, Any]) -> float:
+        """Seconds until the first state, where the user has not said how often.
+
+        A training that begins waits until a state is likely to be `SHARE_OF_TIME` of it; one that
+        was cut off no longer than saving took before.
+        """
+        if not self.was_cut_off:
+            return FIRST_COST / SHARE_OF_TIME
+        return max(float(note.get("pause", 0.0)) * SHARE_OF_TIME, SHORTEST_PAUSE)
 
     def _tell_once(self, line: str) -> None:
         """Say a line that would be the same at each state, as long as a disk is full."""
@@ -227,17 +242,6 @@ def _garbage_left() -> Iterator[None]:
     finally:
         if was_on:
             gc.enable()
-
-
-def _first_pause(state: SavedState | None) -> float:
-    """Seconds until the first state, where the user has not said how often.
-
-    A training that begins waits until a state is likely to be `SHARE_OF_TIME` of it; one that goes
-    on no longer than saving took before, since it may be cut off again as soon.
-    """
-    if state is None:
-        return FIRST_COST / SHARE_OF_TIME
-    return max(float(state.note.get("pause", 0.0)) * SHARE_OF_TIME, SECONDS_AFTER_GOING_ON)
 
 
 def _log_folder(model: BaseAlgorithm) -> str | None:

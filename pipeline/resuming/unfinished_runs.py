@@ -128,7 +128,7 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
         if state.note["spec"] != settings_digest(run.recorded_spec()):
             raise UserError(f"{run.state_path} holds the state of a run of other settings")
         cut_back(run.path, state.note["log_folder"], state.note["files"])
-    return replace(keeping, state=state, goes_on=True)
+    return replace(keeping, state=state, goes_on=True, was_cut_off=True)
 
 
 def tell_changes(run: Run, spec: TrainSpec, tell: Callable[[str], object]) -> None:

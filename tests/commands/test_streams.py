@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from commands import streams
 from commands.parsing import run_command
 from commands.streams import Output, go_on_unread
 from pipeline.errors import UserError
+from pipeline.signs_of_life import Heartbeat
 
 ROOT = Path(train.__file__).parent
 
@@ -71,6 +73,25 @@ def test_a_command_that_is_read_to_its_end_is_left_alone(run):
     main, work = printing(2, ends=1)
     assert run(main, errno.EPIPE) == (1, "0\n1\n", "")
     assert work == ["done"]
+
+
+def test_a_thread_that_says_how_far_it_is_ends_without_a_word(run):
+    """Its traceback stood on stderr, where libraries took five seconds to load."""
+    said = threading.Event()
+
+    def say():
+        said.set()
+        sys.stdout.write("loading\n")
+
+    def main():
+        heart = Heartbeat(say, 0.01)
+        heart.start()
+        assert said.wait(10)
+        heart.stop()
+        sys.stdout.write("loaded\n")
+        return 1
+
+    assert run(main, errno.EPIPE, 0) == (0, "", "")
 
 
 def test_where_the_output_is_the_work_it_ends_with_its_reader(run):

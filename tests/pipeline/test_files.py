@@ -278,3 +278,11 @@ def test_two_names_stay_two(first, second):
     assert a != b
     if (a, b) != (first, second):
         assert a.casefold() != b.casefold()
+
+
+def test_a_folder_that_is_gone_is_not_made_anew(tmp_path):
+    """Some libraries would do that in `write`, and leave a run in two places."""
+    path = tmp_path / "gone" / "a.zip"
+    with pytest.raises(FileNotFoundError, match="its folder is gone"), replacing(path) as draft:
+        draft.parent.mkdir()
+    assert not path.parent.exists()

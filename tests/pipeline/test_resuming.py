@@ -400,13 +400,26 @@ def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
     assert gc.isenabled()
 
 
-def test_what_goes_on_is_saved_sooner(tmp_path):
+def test_what_goes_on_is_saved_sooner(tmp_path, monkeypatch):
     """Where it is cut off every few seconds, it gets ahead all the same."""
+    clock = [0.0]
+    monkeypatch.setattr("pipeline.resuming.state_saver.time.monotonic", lambda: clock[0])
     begun = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
     state = SavedState(None, {"number": 3})
     gone_on = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail, state)
     asked = StateSaver(Run(tmp_path, ""), SaveInterval(seconds=30.0), pytest.fail, state)
     assert [saver.pause for saver in (begun, gone_on, asked)] == [1.0, 0.1, 30.0]
+
+    def write(self):
+        clock[0] += 0.5
+
+    monkeypatch.setattr(StateSaver, "_write", write)
+    gone_on.model = type("Model", (), {"num_timesteps": 0})()
+    pauses = []
+    for _ in range(6):
+        gone_on.save()
+        pauses.append(gone_on.pause)
+    assert pauses == pytest.approx([1.2, 3.4, 7.8, 16.6, 25.0, 25.0])
 
 
 def test_the_newest_unfinished_run(tmp_path, monkeypatch):
