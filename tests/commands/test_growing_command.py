@@ -84,7 +84,7 @@ def test_it_grows_until_decided_also_when_it_is_stopped_between(
     assert "BernoulliBandit-v0, look 1 of " in whole
     counts = pd.read_csv("whole/bandits/summary.csv")["agent"].value_counts()
     assert last_line(whole).startswith(
-        f"{counts.sum()} runs, where 20 seeds of each agent are 60; "
+        f"{counts.sum()} runs, where 20 seeds of each agent would be 60; "
     )
     do_runs, calls = study_output.execute, []
 
@@ -118,7 +118,8 @@ def test_runs_that_fail_are_tried_once_and_do_not_hold_a_study_up(type_command, 
     assert "Fragile-v0, look 1 of 2: 1 of 1 pairs is undecided" in out
     assert "qlearning and sarsa go on to 7 seeds" in out
     assert last_line(out) == (
-        "14 runs, where 7 seeds of each agent are 14; undecided: qlearning and sarsa on Fragile-v0"
+        "14 runs, where 7 seeds of each agent would be 14; "
+        "undecided: qlearning and sarsa on Fragile-v0"
     )
 
 
