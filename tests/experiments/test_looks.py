@@ -103,6 +103,14 @@ def test_too_few_seeds_to_say_anything_are_no_look(tmp_path):
     assert number_of_looks(tmp_path) == 2
 
 
+def test_what_is_no_look_claims_nothing_of_failures_either(tmp_path):
+    ends = {"qlearning": [90] * 5, "sarsa": [0] * 5}
+    for n_seeds, claimed in ((4, ()), (5, (("sarsa", "qlearning"),))):
+        results = results_of(study_of(n_seeds=n_seeds), tmp_path, ends)
+        (environment,) = analyse(results).environments
+        assert environment.unreliable == claimed
+
+
 def test_a_run_that_is_damaged_since_costs_no_look_and_one_that_is_new_does(tmp_path):
     fewer = {**ENDS, "sarsa": [None, *ENDS["sarsa"][1:]]}
     other = {**ENDS, "sarsa": [99, *ENDS["sarsa"][1:]]}
