@@ -84,7 +84,7 @@ def _on_cost(counts: Counts, steps: Sequence[Step]) -> str:
     """How many runs it took, beside a design that gives every agent all seeds."""
     n_runs = sum(counts.values())
     most = max((step.design.sizes[-1] for step in steps), default=0)
-    text = f"{n_runs:,} runs, where {seeds(most)} of each agent are {most * len(counts):,}"
+    text = f"{n_runs:,} runs, where {seeds(most)} of each agent would be {most * len(counts):,}"
     undecided = [
         f"{first} and {second} on {step.environment}"
         for step in steps

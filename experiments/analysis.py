@@ -166,7 +166,7 @@ def _analyse_environment(
     study, table, environment = results.study, results.summary, evidence.environment
     table = table[table["environment"] == environment]
     sign = -1.0 if study.metric in COSTS else 1.0
-    agents = [_analyse_agent(results, environment, agent.label) for agent in study.agents]
+    agents = [_analyse_agent(results, environment, *each) for each in evidence.seeds.items()]
     missing = {agent.agent: agent.n_missing for agent in agents}
     agents = [agent for agent in agents if agent.n_runs]
     agents.sort(key=lambda agent: _rank(sign * agent.metric.mean.point), reverse=True)
@@ -223,7 +223,9 @@ def _rank(value: float) -> float:
     return -np.inf if np.isnan(value) else value
 
 
-def _analyse_agent(results: StudyResults, environment: str, agent: str) -> AgentAnalysis:
+def _analyse_agent(
+    results: StudyResults, environment: str, agent: str, n_seeds: int
+) -> AgentAnalysis:
     study, table = results.study, results.summary
     table = table[(table["environment"] == environment) & (table["agent"] == agent)]
 
@@ -240,7 +242,7 @@ def _analyse_agent(results: StudyResults, environment: str, agent: str) -> Agent
         agent=agent,
         algo=next(spec.algo for spec in study.agents if spec.label == agent),
         n_runs=len(table),
-        n_missing=results.n_planned[agent, environment] - len(table),
+        n_missing=n_seeds - len(table),
         metric=metric,
         score=summarise(values("score"), seed=RESAMPLING_SEED)
         if table["score"].notna().any()

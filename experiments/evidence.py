@@ -68,13 +68,21 @@ def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
     return Evidence(
         environment=environment,
         scores={name: sign * each for name, each in values.items()},
-        seeds={agent.label: results.n_planned[agent.label, environment] for agent in study.agents},
+        seeds=_seeds(results, environment),
         optimum=optimum,
         best_blind=blind,
         threshold=_first(table, "threshold"),
         margin=MARGIN * span if study.margin is None else study.margin,
         certain=agents_without_chance(results, table),
     )
+
+
+def _seeds(results: StudyResults, environment: str) -> dict[str, int]:
+    counts = dict.fromkeys((agent.label for agent in results.study.agents), 0)
+    for run in results.planned:
+        if run.environment == environment:
+            counts[run.agent] += run.n_runs
+    return counts
 
 
 def _first(table: pd.DataFrame, column: str) -> float | None:

@@ -163,9 +163,10 @@ def _check_runs(root: Path, looks: Looks, evidence: Evidence) -> None:
         UserError: naming the environment.
     """
     for there in looks.planned:
-        seeds = {name: n for name, n in there.seeds.items() if name in evidence.scores}
-        now = look_at(evidence, seeds, there.question, there.level, planned=True)
-        if not now.shows(there) and not there.shows(now) and now.runs == there.runs:
+        now = look_at(evidence, there.seeds, there.question, there.level, planned=True)
+        # Some may be missing now, or may have been then.
+        same = [name for name, n in there.runs.items() if now.runs[name] == n]
+        if any(now.digests[name] != there.digests[name] for name in same):
             raise UserError(
                 f"{root}: on {evidence.environment}, runs that were looked at are others now: "
                 "--name NAME makes another study"

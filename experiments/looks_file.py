@@ -11,12 +11,13 @@ from typing import Any
 
 from experiments.looks import Design, Look, LookLog, Looks, Question
 from experiments.study_spec import METRICS
-from pipeline.errors import UserError
+from pipeline.errors import UserError, one_line
 from pipeline.files import write_json
 
 FILE = "looks.json"
 _FORMAT = 1
 _LARGEST = 50_000_000  # bytes; a thousand agents looked at a hundred times take less
+_LARGEST_NUMBER = 1e300
 
 
 def write_looks(root: Path, log: LookLog) -> None:
@@ -38,6 +39,8 @@ def read_looks(root: Path) -> LookLog:
         data = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return LookLog()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
     except (ValueError, RecursionError) as error:
         raise _wrong(path, "it is no JSON") from error
     try:
@@ -72,7 +75,8 @@ def _is_count(value: Any) -> bool:
 
 
 def _is_number_or_none(value: Any) -> bool:
-    return value is None or (isinstance(value, int | float) and math.isfinite(value))
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return value is None or (is_number and -_LARGEST_NUMBER < value < _LARGEST_NUMBER)
 
 
 def _is_counts(value: Any) -> bool:
@@ -135,6 +139,8 @@ def _looks(data: Any, where: str) -> Looks:
     n_planned = len(looks.planned)
     if n_planned > (0 if design is None else len(design.sizes)):
         raise _WrongEntryError(f"{where}: the number of planned looks")
+    if any(design is None or look.seeds.keys() != design.seeds.keys() for look in looks.planned):
+        raise _WrongEntryError(f"{where}: the agents of planned looks")
     if design is not None and design.after > len(taken) - n_planned:
         raise _WrongEntryError(f"{where}: the number of looks before the design")
     # A look that was taken out between others, or put in, shows in what the others spent.

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -87,14 +85,6 @@ class StudyResults:
         """The runs that the results are of."""
         damaged = {one.planned.path for one in self.left_out}
         return [run for run in self.planned if run.path not in damaged and run.is_finished]
-
-    @cached_property
-    def n_planned(self) -> Counter[tuple[str, str]]:
-        """By labels of agent and environment, with how many seeds."""
-        counts: Counter[tuple[str, str]] = Counter()
-        for run in self.planned:
-            counts[run.agent, run.environment] += run.n_runs
-        return counts
 
 
 # Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.

@@ -192,9 +192,10 @@ def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
     level = f"{100 * look.level:.2g} %"
     if look.design is not None:
         n = len(look.design.sizes)
+        looks = "1 look that was" if n == 1 else f"{n} looks that were"
         yield (
-            f"Agents got more seeds until they were decided, at up to {n} looks that were settled "
-            f"beforehand: claims at {level} each."
+            f"Agents got more seeds until they were decided, at up to {looks} settled beforehand: "
+            f"claims at {level} each."
         )
     elif look.number > 1:
         yield f"This is the {ordinal(look.number)} look at this study: claims at {level}."

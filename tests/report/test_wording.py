@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from report.terminal_tables import print_episodes_table
-from report.wording import number
+from report.wording import number, ordinal, seeds
 
 
 @pytest.mark.parametrize(
@@ -27,6 +27,33 @@ from report.wording import number
 )
 def test_a_figure_has_four_digits(value, text):
     assert number(value) == text
+
+
+@pytest.mark.parametrize(
+    ("n", "word"),
+    [
+        (1, "first"),
+        (9, "ninth"),
+        (10, "10th"),
+        (11, "11th"),
+        (13, "13th"),
+        (21, "21st"),
+        (22, "22nd"),
+        (103, "103rd"),
+        (1111, "1,111th"),
+    ],
+)
+def test_which_of_several(n, word):
+    assert ordinal(n) == word
+
+
+def test_how_many_seeds():
+    assert (seeds(1), seeds(2), seeds(1000)) == ("1 seed", "2 seeds", "1,000 seeds")
+    assert (seeds(10, 40, 22), seeds(10, 10), seeds(0, 1)) == (
+        "10 to 40 seeds",
+        "10 seeds",
+        "0 to 1 seed",
+    )
 
 
 def test_episodes_stand_in_columns_that_end_on_one_line():

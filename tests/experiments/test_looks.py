@@ -1,0 +1,356 @@
+"""What counts as a look at a study, what each may spend, and the file that remembers them."""
+
+import json
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from experiments.analysis import analyse
+from experiments.growing import (
+    counts_after,
+    counts_of,
+    grown,
+    settle,
+    settled_looks,
+    take_planned_looks,
+)
+from experiments.looking import take_looks
+from experiments.looks_file import FILE, read_looks
+from experiments.study_plan import plan
+from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
+from report.sentences import sentences
+from verdicts import level_of_look
+
+LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
+# The first is far ahead; the others overlap, and need more seeds.
+ENDS = {
+    "qlearning": [90 + k % 7 for k in range(60)],
+    "sarsa": [(37 * k) % 50 for k in range(60)],
+    "expected_sarsa": [(29 * k) % 50 + 1 for k in range(60)],
+}
+
+
+def study_of(*agents, n_seeds=10, **fields):
+    specs = tuple(AgentSpec(name, name) for name in agents or ("qlearning", "sarsa"))
+    return StudySpec("s", "S", specs, (LAKE,), n_seeds, **fields)
+
+
+def results_of(study, root, ends=ENDS, counts=None):
+    """A study whose runs ended so, by agent and seed; None for one that is missing."""
+    planned = plan(study, root, counts)
+    rows = [
+        {
+            "agent": run.agent,
+            "environment": run.environment,
+            "env_id": run.spec.env_id,
+            "seed": run.seed,
+            "final": float(ends[run.agent][run.seed]),
+            "score": ends[run.agent][run.seed] / 100,
+            "area": float(ends[run.agent][run.seed]),
+            "exact": True,
+            "optimum": 100.0,
+            "best_blind": 0.0,
+        }
+        for run in planned
+        if ends[run.agent][run.seed] is not None
+    ]
+    tables = pd.DataFrame(rows, columns=RUN_COLUMNS), pd.DataFrame(columns=CURVE_COLUMNS)
+    return StudyResults(study, root, *tables, tuple(planned))
+
+
+def look(root, *agents, ends=ENDS, **fields):
+    """Which look it is, and its level."""
+    standing = take_looks(results_of(study_of(*agents, **fields), root, ends))["lake"]
+    return standing.number, standing.level
+
+
+def number_of_looks(root):
+    return len(read_looks(root).on("lake").taken)
+
+
+def level(k):
+    return level_of_look(0.05, k)
+
+
+def test_a_look_counts_when_the_runs_or_the_question_are_others(tmp_path):
+    three = ("qlearning", "sarsa", "expected_sarsa")
+    assert look(tmp_path) == (1, level(1))
+    assert look(tmp_path) == (1, level(1))
+    assert look(tmp_path, n_seeds=20) == (2, level(2))
+    assert look(tmp_path, n_seeds=10) == (1, level(1))
+    assert look(tmp_path, n_seeds=20, metric="area") == (3, level(3))
+    assert look(tmp_path, n_seeds=20, margin=1.0) == (4, level(4))
+    assert look(tmp_path, n_seeds=20, threshold=0.5) == (5, level(5))
+    assert look(tmp_path, *three, n_seeds=20) == (6, level(6))
+    assert look(tmp_path, *three, n_seeds=20) == (6, level(6))
+    assert look(tmp_path, n_seeds=20, first_seed=30) == (7, level(7))
+    assert number_of_looks(tmp_path) == 7
+    (tmp_path / FILE).unlink()
+    assert look(tmp_path, n_seeds=20) == (1, level(1))
+
+
+def test_too_few_seeds_to_say_anything_are_no_look(tmp_path):
+    assert look(tmp_path, n_seeds=4) == (1, level(1))
+    assert not (tmp_path / FILE).exists()
+    assert look(tmp_path, n_seeds=5) == (1, level(1))
+    # At the level of the second look it takes nine seeds.
+    assert look(tmp_path, n_seeds=8) == (2, level(2))
+    assert number_of_looks(tmp_path) == 1
+    assert look(tmp_path, n_seeds=9) == (2, level(2))
+    assert number_of_looks(tmp_path) == 2
+
+
+def test_what_is_no_look_claims_nothing_of_failures_either(tmp_path):
+    ends = {"qlearning": [90] * 5, "sarsa": [0] * 5}
+    for n_seeds, claimed in ((4, ()), (5, (("sarsa", "qlearning"),))):
+        results = results_of(study_of(n_seeds=n_seeds), tmp_path, ends)
+        (environment,) = analyse(results).environments
+        assert environment.unreliable == claimed
+
+
+def test_a_run_that_is_damaged_since_costs_no_look_and_one_that_is_new_does(tmp_path):
+    fewer = {**ENDS, "sarsa": [None, *ENDS["sarsa"][1:]]}
+    other = {**ENDS, "sarsa": [99, *ENDS["sarsa"][1:]]}
+    assert look(tmp_path) == (1, level(1))
+    assert look(tmp_path, ends=fewer) == (1, level(1))
+    assert look(tmp_path, ends=other) == (2, level(2))
+    (tmp_path / FILE).unlink()
+    assert look(tmp_path, ends=fewer) == (1, level(1))
+    assert look(tmp_path) == (2, level(2))
+
+
+def test_environments_are_counted_by_themselves(tmp_path):
+    study = study_of()
+    dry = EnvironmentSpec("dry", "FrozenLake-v1", {"n_timesteps": 10})
+    assert look(tmp_path) == (1, level(1))
+    both = take_looks(results_of(replace(study, environments=(LAKE, dry)), tmp_path))
+    assert [(name, each.number) for name, each in both.items()] == [("lake", 1), ("dry", 1)]
+    assert look(tmp_path, n_seeds=11) == (2, level(2))
+    assert len(read_looks(tmp_path).on("dry").taken) == 1
+
+
+def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
+    tmp_path, monkeypatch
+):
+    assert look(tmp_path) == (1, level(1))
+    before = (tmp_path / FILE).read_bytes()
+
+    def cut_off(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pipeline.files.put_in_place", cut_off)
+        with pytest.raises(KeyboardInterrupt):
+            look(tmp_path, n_seeds=20)
+    assert [path.name for path in tmp_path.iterdir()] == [FILE]
+    assert (tmp_path / FILE).read_bytes() == before
+    assert look(tmp_path, n_seeds=20) == (2, level(2))
+
+
+def test_page_and_terminal_say_which_look_it_is(tmp_path):
+    results = results_of(study_of(), tmp_path)
+    assert "look" not in " ".join(sentences(analyse(results, looks=take_looks(results))))
+    results = results_of(study_of(n_seeds=20), tmp_path)
+    text = " ".join(sentences(analyse(results, looks=take_looks(results))))
+    assert "On lake, this is the second look at this study: claims at 0.25 %." in text
+    results = results_of(study_of(n_seeds=8), tmp_path)
+    text = " ".join(sentences(analyse(results, looks=take_looks(results))))
+    assert "8 seeds cannot tell 2 agents apart, whatever they score; it takes 11 or more" in text
+
+
+def damages(data):
+    """The data of a file, each time with something that was not written so."""
+    lake = data["environments"]["lake"]
+    first = lake["taken"][0]
+    yield {}
+    yield []
+    yield {**data, "format": 2}
+    yield {**data, "environments": {"lake": []}}
+    for key in lake:
+        yield {**data, "environments": {"lake": {k: v for k, v in lake.items() if k != key}}}
+    yield {**data, "environments": {"lake": {**lake, "taken": lake["taken"][1:]}}}
+    yield {**data, "environments": {"lake": {**lake, "taken": lake["taken"][::-1]}}}
+    for key, value in [
+        ("level", 0.05),
+        ("level", None),
+        ("planned", True),
+        ("planned", 0),
+        ("seeds", {"qlearning": -1, "sarsa": 10}),
+        ("seeds", {"qlearning": 10}),
+        ("runs", {"qlearning": True, "sarsa": 10}),
+        ("digests", {"qlearning": 1, "sarsa": "2"}),
+        ("question", {**first["question"], "metric": "luck"}),
+        ("question", {**first["question"], "margin": 10**400}),
+        ("question", {**first["question"], "margin": "1"}),
+        ("question", {}),
+        ("date", 5),
+        ("more", 5),
+    ]:
+        looks = [{**first, key: value}, *lake["taken"][1:]]
+        yield {**data, "environments": {"lake": {**lake, "taken": looks}}}
+    design = {"question": first["question"], "sizes": [10, 20], "seeds": {"a": 10}, "after": 0}
+    for key, value in [
+        ("sizes", []),
+        ("sizes", [20, 10]),
+        ("sizes", [0, 10]),
+        ("sizes", "10"),
+        ("seeds", {"a": 11}),
+        ("after", 3),
+        ("after", -1),
+        ("after", 0),  # right in itself, but the first look had the level of the first
+    ]:
+        changed = {**lake, "design": {**design, key: value}}
+        yield {**data, "environments": {"lake": changed}}
+
+
+def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
+    look(tmp_path)
+    look(tmp_path, n_seeds=20)
+    path = tmp_path / FILE
+    data = json.loads(path.read_text())
+    found = list(damages(data))
+    assert len(found) > 25
+    for each in found:
+        path.write_text(json.dumps(each))
+        with pytest.raises(UserError, match=r"looks\.json is damaged: .* are forgotten$"):
+            read_looks(tmp_path)
+    for text in ("", "{", "[" * 100_000, "\x00", '{"format": 1e999}', "9" * 10_000):
+        path.write_text(text)
+        with pytest.raises(UserError, match=r"looks\.json is damaged: "):
+            read_looks(tmp_path)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(UserError, match="it is no JSON"):
+        read_looks(tmp_path)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(UserError, match="cannot be read"):
+        read_looks(tmp_path)
+
+
+def grow(study, root, most=None, steps=99, ends=ENDS):
+    """What the command does, with made-up runs; the steps."""
+    root.mkdir(exist_ok=True)
+    looks = settled_looks(study, root, most)
+    settle(root, looks)
+    counts, taken = counts_of(study, looks), []
+    for _ in range(steps):
+        taken.append(take_planned_looks(results_of(grown(study, counts), root, ends, counts)))
+        if all(step.growth.is_done for step in taken[-1]):
+            break
+        counts = counts_after(counts, taken[-1])
+    return counts, taken
+
+
+THREE = ("qlearning", "sarsa", "expected_sarsa")
+
+
+def test_a_study_grows_where_it_is_undecided_and_remembers_each_look(tmp_path):
+    study = study_of(*THREE)
+    counts, steps = grow(study, tmp_path, most=40)
+    assert {name: n for (name, _), n in counts.items()} == {
+        "qlearning": 10,
+        "sarsa": 40,
+        "expected_sarsa": 40,
+    }
+    assert [step.growth.n_looks for (step,) in steps] == [1, 2, 3, 4]
+    assert steps[-1][0].undecided == [("sarsa", "expected_sarsa")]
+    looks = read_looks(tmp_path).on("lake")
+    assert [dict(each.seeds)["sarsa"] for each in looks.taken] == [10, 16, 25, 40]
+    assert [dict(each.seeds)["qlearning"] for each in looks.taken] == [10] * 4
+    assert {each.level for each in looks.taken} == {level(1) / 4}
+    assert all(each.planned for each in looks.taken)
+    # Grown by hand, it is looked at with what is left.
+    assert look(tmp_path, *THREE, n_seeds=50) == (5, level(2))
+    assert look(tmp_path, *THREE, n_seeds=60) == (6, level(3))
+    # The same runs as at a look that was settled are that look.
+    assert look(tmp_path, *THREE, n_seeds=10) == (1, level(1) / 4)
+
+
+@pytest.mark.parametrize("stop", range(1, 4))
+def test_interrupted_at_any_look_it_ends_the_same(tmp_path, stop):
+    study = study_of(*THREE)
+    whole = grow(study, tmp_path / "whole", most=40)
+    grow(study, tmp_path / "parts", most=40, steps=stop)
+    parts = grow(study, tmp_path / "parts")
+    assert parts[0] == whole[0]
+    assert parts[1][-1][0].growth == whole[1][-1][0].growth
+    undated = [
+        [replace(each, date="") for each in read_looks(tmp_path / name).on("lake").taken]
+        for name in ("whole", "parts")
+    ]
+    assert undated[0] == undated[1]
+
+
+def test_after_a_look_by_hand_the_settled_ones_share_what_is_left(tmp_path):
+    assert look(tmp_path, *THREE) == (1, level(1))
+    grow(study_of(*THREE), tmp_path, most=40)
+    design = read_looks(tmp_path).on("lake").design
+    # At so low a level, ten seeds could not decide anything.
+    assert (design.after, design.sizes[0] > 10, design.level) == (1, True, level(2))
+    assert look(tmp_path, *THREE, n_seeds=50)[1] == level(3)
+
+
+@pytest.mark.parametrize(
+    ("study", "most", "words"),
+    [
+        (study_of(*THREE), 60, "looks at seeds [10, 16, 25, 40], now [10, 16, 24, 38, 60]"),
+        (study_of(*THREE, n_seeds=12), None, "looks at seeds"),
+        (study_of(*THREE, metric="area"), None, "metric final, now area"),
+        (study_of(*THREE, margin=3.0), None, "margin None, now 3.0"),
+        (study_of(*THREE, first_seed=5), None, "first_seed 0, now 5"),
+        (study_of(), None, "agents ['expected_sarsa', 'qlearning', 'sarsa'], now "),
+    ],
+)
+def test_what_was_settled_cannot_change(tmp_path, study, most, words):
+    grow(study_of(*THREE), tmp_path, most=40)
+    before = (tmp_path / FILE).read_bytes()
+    with pytest.raises(UserError, match="settled before the first look") as refusal:
+        settled_looks(study, tmp_path, most)
+    assert words in str(refusal.value)
+    assert (tmp_path / FILE).read_bytes() == before
+
+
+def test_nothing_is_settled_that_could_not_be(tmp_path):
+    with pytest.raises(UserError, match="two agents or more"):
+        settled_looks(study_of("qlearning"), tmp_path, None)
+    with pytest.raises(UserError, match="--max-seeds is 9, the study begins with 10 seeds"):
+        settled_looks(study_of(), tmp_path, 9)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_runs_that_were_looked_at_and_are_others_now_are_refused(tmp_path):
+    study = study_of(*THREE)
+    grow(study, tmp_path, most=40, steps=2)
+    with pytest.raises(UserError, match="on lake, runs that were looked at are others now"):
+        grow(study, tmp_path, ends={**ENDS, "sarsa": [99, *ENDS["sarsa"][1:]]})
+    # One that is missing now makes no such claim, nor one that was missing then.
+    grow(study, tmp_path, ends={**ENDS, "sarsa": [None, *ENDS["sarsa"][1:]]}, steps=1)
+    grow(study, tmp_path, steps=1)
+
+
+def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp_path):
+    study = study_of(*THREE)
+    counts, steps = grow(study, tmp_path, most=40)
+    results = results_of(grown(study, counts), tmp_path, counts=counts)
+    looks = {step.environment: step.standing for step in steps[-1]}
+    analysis = analyse(results, looks=looks)
+    text = " ".join(sentences(analysis))
+    assert "On lake, over 10 to 40 seeds, qlearning has the highest return" in text
+    assert "qlearning is better than " in text
+    assert text.count(", with 10 seeds)") == 2
+    assert "sarsa against expected_sarsa is undecided with 40 seeds (difference" in text
+    assert "up to 4 looks that were settled beforehand: claims at 1.1 % each." in text
+    assert "missing" not in text
+    # What was decided is what was said of those seeds then.
+    first = analyse(results_of(study, tmp_path), looks={"lake": steps[0][0].standing})
+    pairs = [
+        {frozenset((p.first, p.second)): p.difference for p in each.environments[0].pairs}
+        for each in (analysis, first)
+    ]
+    for other in ("sarsa", "expected_sarsa"):
+        assert (
+            pairs[0][frozenset(("qlearning", other))] == pairs[1][frozenset(("qlearning", other))]
+        )
