@@ -41,7 +41,7 @@ def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
         return f"On {environment.environment}, no run has a figure for the {words}."
     best = [a for a in environment.agents if math.isclose(a.metric.mean.point, value)]
     names = enumeration([agent.agent for agent in best])
-    if _none_has_learnt(study, environment):
+    if none_has_learnt(study, environment):
         return (
             f"On {environment.environment}, none of the agents has learnt: over "
             f"{seeds(study.n_seeds)}, no typical run is better than the best blind policy's "
@@ -63,7 +63,7 @@ def _on_the_best(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     return f"{text}{score}; the optimum is {number(environment.optimum)}."
 
 
-def _none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
+def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
     """Whether the typical run of every agent is as one that ignores what it observes."""
     blind, optimum = environment.best_blind, environment.optimum
     if study.metric not in ON_THE_SCALE or blind is None or optimum is None or optimum <= blind:
