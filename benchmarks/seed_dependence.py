@@ -7,8 +7,9 @@ Environment i of a run with seed s is seeded with s + i, as Stable-Baselines3 do
 environments the runs of seeds 0 and 1 have seven environment streams in common, in other places;
 their agents' streams differ. Printed is what comes of that: the correlation of final scores at
 lag 1, and by which factor lags 1 to 9 make the variance of a mean over ten seeds in a row larger
-than that of ten independent runs. The same for seeds that lie 16 apart, which share nothing. Budgets
-are cut so that scores differ between seeds. Errors are standard errors for independent scores.
+than that of ten independent runs. The same for seeds that lie 16 apart, which share nothing.
+Budgets are cut so that scores differ between seeds. Errors are standard errors for independent
+scores.
 """
 
 from __future__ import annotations

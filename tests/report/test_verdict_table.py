@@ -1,4 +1,4 @@
-"""The study as Markdown: marks, failures and cost in one table, and nothing of a label as markup."""
+"""The study as Markdown: marks, failures and cost in one table; labels are never markup."""
 
 import math
 from dataclasses import replace
