@@ -135,7 +135,6 @@ CURVE_COLUMNS = (
     "value",  # return
 )
 
-
 # Columns that have the same name in ``run.json``.
 _FIGURES = ("success_rate", "exact", "optimum", "best_blind", "gap", "score")
 
@@ -297,6 +296,5 @@ def _summary_row(
 
 
 def _episodes_by(episodes: Episodes, step: float) -> float:
-    if not np.isfinite(step):
-        return step
-    return float(np.searchsorted(episodes.steps, step, side="right"))
+    reached = np.searchsorted(episodes.steps, step, side="right")
+    return float(reached) if np.isfinite(step) else step

@@ -69,7 +69,7 @@ def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
     top, words = environment.agents[0], METRIC_WORDS[study.metric]
     if math.isnan(top.metric.mean.point):
         yield f"No run has a figure for the {words}."
-    elif _none_has_learnt(study, environment):
+    elif none_has_learnt(study, environment):
         yield (
             "None of the agents has learnt: no typical run is better than the best blind "
             f"policy's {number(environment.best_blind)}; the {_extreme(study)} mean {words} is "
@@ -166,7 +166,7 @@ def _where_the_median_differs(study: StudySpec, environment: EnvironmentAnalysis
         )
 
 
-def _none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
+def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
     """Whether the typical run of every agent is no better than acting at random."""
     blind, optimum = environment.best_blind, environment.optimum
     if study.metric not in ON_THE_SCALE or blind is None or optimum is None or optimum <= blind:

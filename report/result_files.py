@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from experiments.analysis import StudyAnalysis
 from experiments.study_results import StudyResults
-from pipeline.files import replacing
+from pipeline.files import replacing, write_text
+from report.verdict_table import verdicts_as_markdown
 
 
 def write_tables(results: StudyResults) -> list[Path]:
@@ -18,3 +20,10 @@ def write_tables(results: StudyResults) -> list[Path]:
             draft, index=False, float_format="%.8g", compression="gzip", lineterminator="\n"
         )
     return [summary, curves]
+
+
+def write_verdicts(analysis: StudyAnalysis, command: str) -> Path:
+    """Write ``verdicts.md``: what the study has shown, to be pasted where it is told of."""
+    path = analysis.results.root / "verdicts.md"
+    write_text(path, verdicts_as_markdown(analysis, command))
+    return path

@@ -166,6 +166,9 @@ def wait_for(condition, seconds=60):
         time.sleep(0.05)
 
 
+FILES = ["curves.csv.gz", "runs", "summary.csv", "verdicts.md"]
+
+
 def records(study):
     """When each run was written down, by agent and number."""
     return {
@@ -187,7 +190,7 @@ def test_what_is_there_is_not_run_again(type_command, folder):
     assert sorted(first) == [
         (agent, f"FrozenLake-v1_{n}") for agent in ("qlearning", "sarsa") for n in (1, 2)
     ]
-    assert sorted(path.name for path in study.iterdir()) == ["curves.csv.gz", "runs", "summary.csv"]
+    assert sorted(path.name for path in study.iterdir()) == FILES
     before = (study / "summary.csv").read_text()
 
     code, out, _ = type_command(*PAIR, "--seeds", 2)
@@ -342,7 +345,7 @@ def test_a_killed_driver_leaves_no_orphans_and_no_drafts(folder):
     wait_for(lambda: [path.name for path in study.iterdir()] == [".lock"])
     (folder / "mark").touch()
     assert finish(*SLOW)[0] == 0
-    assert sorted(path.name for path in study.iterdir()) == ["curves.csv.gz", "runs", "summary.csv"]
+    assert sorted(path.name for path in study.iterdir()) == FILES
 
 
 def test_ctrl_c_ends_with_130_and_goes_on_afterwards(folder):
@@ -403,7 +406,7 @@ def test_what_a_dead_driver_began_is_gone_on_with(folder):
     assert sorted(study.glob(".drafts/*")) == sorted(drafts)
     (folder / "mark").touch()
     assert finish(*SLOW)[0] == 0
-    assert sorted(path.name for path in study.iterdir()) == ["curves.csv.gz", "runs", "summary.csv"]
+    assert sorted(path.name for path in study.iterdir()) == FILES
 
 
 def test_an_environment_ends_its_run_and_nothing_else(folder):

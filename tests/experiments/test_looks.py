@@ -21,7 +21,7 @@ from experiments.study_plan import plan
 from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from report.sentences import sentences
+from report.conclusions import conclusion
 from verdicts import level_of_look
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 10})
@@ -65,6 +65,11 @@ def look(root, *agents, ends=ENDS, **fields):
     """Which look it is, and its level."""
     standing = take_looks(results_of(study_of(*agents, **fields), root, ends))["lake"]
     return standing.number, standing.level
+
+
+def everything_said(analysis):
+    """All sentences on the one environment."""
+    return " ".join(conclusion(analysis.study, analysis.environments[0]).everything)
 
 
 def number_of_looks(root):
@@ -152,12 +157,12 @@ def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
 
 def test_page_and_terminal_say_which_look_it_is(tmp_path):
     results = results_of(study_of(), tmp_path)
-    assert "look" not in " ".join(sentences(analyse(results, looks=take_looks(results))))
+    assert "look" not in everything_said(analyse(results, looks=take_looks(results)))
     results = results_of(study_of(n_seeds=20), tmp_path)
-    text = " ".join(sentences(analyse(results, looks=take_looks(results))))
-    assert "On lake, this is the second look at this study: claims at 0.25 %." in text
+    text = everything_said(analyse(results, looks=take_looks(results)))
+    assert "This is the second look at this study: claims at 0.25 %." in text
     results = results_of(study_of(n_seeds=8), tmp_path)
-    text = " ".join(sentences(analyse(results, looks=take_looks(results))))
+    text = everything_said(analyse(results, looks=take_looks(results)))
     assert "8 seeds cannot tell 2 agents apart, whatever they score; it takes 11 or more" in text
 
 
@@ -337,11 +342,12 @@ def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp
     results = results_of(grown(study, counts), tmp_path, counts=counts)
     looks = {step.environment: step.standing for step in steps[-1]}
     analysis = analyse(results, looks=looks)
-    text = " ".join(sentences(analysis))
-    assert "On lake, over 10 to 40 seeds, qlearning has the highest return" in text
+    text = everything_said(analysis)
+    assert text.startswith("qlearning is best: ")
     assert "qlearning is better than " in text
     assert text.count(", with 10 seeds)") == 2
-    assert "sarsa against expected_sarsa is undecided with 40 seeds (difference" in text
+    assert "sarsa is undecided against expected_sarsa (difference " in text
+    assert ", with 40 seeds" in text
     assert "up to 4 looks that were settled beforehand: claims at 1.1 % each." in text
     assert "missing" not in text
     # What was decided is what was said of those seeds then.

@@ -1,0 +1,172 @@
+"""A study as Markdown, to stand in a page or a paper as it is: verdicts, failures and cost."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from experiments.study_results import StudyResults
+from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
+from experiments.tuning_seeds import tuning_seeds
+from report.conclusions import conclusion, none_has_learnt
+from report.markdown import escaped, markdown_table, name_of
+from report.seed_sentence import seed_sentence
+from report.wording import interval, number, seeds
+from verdicts import Verdict
+
+# Against the agent whose median run is the highest: shown equivalent or itself, undecided, worse.
+Standing = Literal["best", "open", "behind"]
+
+_SEEN_BY_THE_LEADER: dict[Verdict, Standing] = {
+    "equivalent": "best",
+    "worse": "best",
+    "undecided": "open",
+    "better": "behind",
+}
+
+
+def verdicts_as_markdown(analysis: StudyAnalysis, command: str) -> str:
+    """The whole study: what seeds it has, the headline, and for each environment the verdicts."""
+    study = analysis.study
+    parts = [
+        f"# {escaped(study.title)}",
+        f"`{command.replace('`', ' ')}`",
+        escaped(seed_sentence(study.seeds, tuning_seeds(study))),
+        headline(analysis),
+    ]
+    for environment in analysis.environments:
+        said = [f"- {escaped(text)}" for text in conclusion(study, environment).everything]
+        parts += [
+            f"## {escaped(environment.environment)}",
+            ranking(analysis.results, environment),
+            "\n".join(said),
+        ]
+    return "\n\n".join(parts) + "\n"
+
+
+def headline(analysis: StudyAnalysis) -> str:
+    """A table of agents by environments, and what its marks mean."""
+    study, environments = analysis.study, analysis.environments
+    found = [_cells(analysis, environment) for environment in environments]
+    rows = [
+        [name_of(agent.label), *(cells.get(agent.label, "-") for cells in found)]
+        for agent in study.agents
+    ]
+    table = markdown_table(["", *(escaped(e.environment) for e in environments)], rows)
+    return f"{table}\n\n{_legend(study, analysis)}"
+
+
+def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
+    agents = [agent for environment in analysis.environments for agent in environment.agents]
+    if all(_has_score(study, agent) for agent in agents):
+        what = (
+            "Score of the median run: 1 is the optimum, 0 the best policy that ignores what it "
+            "observes."
+        )
+    else:
+        what = f"{METRIC_WORDS[study.metric].capitalize()}: the median run."
+    extreme = "lowest" if study.metric in COSTS else "highest"
+    text = (
+        f"{what} Bold: the {extreme}, and what is shown to be equivalent to it in the typical run. "
+        f"?: not told apart from it by {seeds(study.n_seeds)}. Plain: shown to be worse."
+    )
+    if processor_seconds(analysis.results):
+        text += " In brackets: processor time of the median run."
+    return text
+
+
+def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, str]:
+    """The cell of each agent that has a run."""
+    study, places = analysis.study, standings(analysis.study, environment)
+    costs = processor_seconds(analysis.results)
+    cells = {}
+    for agent in environment.agents:
+        value = _typical(study, agent)
+        text = f"**{value}**" if places.get(agent.agent) == "best" else value
+        text += " ?" if places.get(agent.agent) == "open" else ""
+        cost = costs.get((agent.agent, environment.environment))
+        text += "" if cost is None else f" ({duration(cost)})"
+        cells[agent.agent] = ", ".join([text, *_troubles(environment, agent)])
+    return cells
+
+
+def _typical(study: StudySpec, agent: AgentAnalysis) -> str:
+    if _has_score(study, agent):
+        assert agent.score is not None
+        return f"{agent.score.median.point:.3f}"
+    return number(agent.metric.median.point)
+
+
+def _has_score(study: StudySpec, agent: AgentAnalysis) -> bool:
+    return (
+        study.metric == "final"
+        and agent.score is not None
+        and not math.isnan(agent.score.median.point)
+    )
+
+
+def _troubles(environment: EnvironmentAnalysis, agent: AgentAnalysis) -> list[str]:
+    """Runs that failed, and runs that are not there."""
+    count = environment.failures.get(agent.agent)
+    told = [f"{count.n_failed} of {count.n} failed"] if count is not None and count.n_failed else []
+    return told + ([f"{agent.n_missing} missing"] if agent.n_missing else [])
+
+
+def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Standing]:
+    """How each agent stands against the one whose median run is the best.
+
+    Empty where no agent has learnt anything, or there is no figure.
+    """
+    sign = -1.0 if study.metric in COSTS else 1.0
+    known = [a for a in environment.agents if not math.isnan(a.metric.median.point)]
+    if not known or none_has_learnt(study, environment):
+        return {}
+    leader = max(known, key=lambda agent: sign * agent.metric.median.point).agent
+    found: dict[str, Standing] = {leader: "best"}
+    for pair in environment.pairs:
+        if leader in (pair.first, pair.second):
+            seen = pair if pair.first == leader else pair.swapped()
+            found[seen.second] = _SEEN_BY_THE_LEADER[seen.verdict]
+    return found
+
+
+def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> str:
+    """The agents of an environment with their figures, the best first."""
+    costs = processor_seconds(results)
+    rows = []
+    for agent in environment.agents:
+        count, stays = environment.failures.get(agent.agent), agent.steps_to_stay
+        cost = costs.get((agent.agent, environment.environment))
+        rows.append(
+            [
+                name_of(agent.agent),
+                interval(agent.metric.median),
+                interval(agent.metric.mean),
+                "-" if agent.score is None else number(agent.score.median.point),
+                "-" if count is None else f"{count.n_failed} of {count.n}",
+                "-" if stays is None else number(stays.median.point),
+                "-" if cost is None else duration(cost),
+            ]
+        )
+    headings = ["", "median", "mean", "score", "failed", "stays from", "processor time"]
+    return markdown_table(headings, rows)
+
+
+def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
+    """By agent and environment, the median over runs; only where all of them were measured."""
+    table = results.summary
+    found = {}
+    for (agent, environment), rows in table.groupby(["agent", "environment"], sort=False):
+        times = rows["cpu_seconds"].astype(float)
+        if len(times) and times.notna().all():
+            found[str(agent), str(environment)] = float(times.median())
+    return found
+
+
+def duration(time: float) -> str:
+    """Seconds with two significant digits."""
+    if time <= 0:
+        return "0 s"
+    digits = 1 - math.floor(math.log10(time))
+    return f"{round(time, digits):,.{max(digits, 0)}f} s"

@@ -1,0 +1,134 @@
+"""The study as Markdown: marks, failures and cost in one table; labels are never markup."""
+
+import math
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+
+from report.markdown import escaped, markdown_table, name_of
+from report.result_files import write_verdicts
+from report.verdict_table import duration, headline, processor_seconds, ranking, standings
+from verdicts import FailureCount, PairComparison
+
+NAMES = ["low", "same", "open", "first"]
+
+
+def pair(made_up, first, second, verdict):
+    some = made_up.estimate(1.0)
+    return PairComparison(first, second, some, 0.5, 0.5, some, verdict, None)
+
+
+@pytest.fixture
+def place(made_up):
+    """One that leads by its median, one equivalent to it, one undecided, one worse."""
+    agents = [made_up.agent(name, mean) for name, mean in zip(NAMES, (30, 89, 80, 90), strict=True)]
+    pairs = (
+        pair(made_up, "first", "same", "equivalent"),
+        pair(made_up, "open", "first", "undecided"),
+        pair(made_up, "low", "first", "worse"),
+        pair(made_up, "same", "low", "better"),
+    )
+    failed = {"first": FailureCount(0, 4, 0.6), "open": FailureCount(1, 4, 0.8)}
+    return made_up.environment(agents, pairs=pairs, failures=failed)
+
+
+def analysis_of(made_up, environment, cpu=(), root=None, **fields):
+    analysis = made_up.analysis([environment], NAMES, root=root, **fields)
+    rows = [
+        {"agent": agent, "environment": environment.environment, "cpu_seconds": seconds}
+        for agent, times in cpu
+        for seconds in times
+    ]
+    table = pd.DataFrame(rows, columns=["agent", "environment", "cpu_seconds"])
+    return replace(analysis, results=replace(analysis.results, summary=table))
+
+
+CPU = (("first", (30.0, 50.0, 40.4)), ("same", (0.1249,)), ("low", (1.0, None)))
+
+
+def test_the_headline_marks_who_is_best_and_counts_failures_and_cost(made_up, place):
+    table, legend = headline(analysis_of(made_up, place, CPU)).split("\n\n")
+    assert table.splitlines() == [
+        "|  | lake |",
+        "| --- | --- |",
+        "| `low` | 0.600 |",
+        "| `same` | **1.780** (0.12 s) |",
+        "| `open` | 1.600 ?, 1 of 4 failed |",
+        "| `first` | **1.800** (40 s) |",
+    ]
+    assert legend == (
+        "Score of the median run: 1 is the optimum, 0 the best policy that ignores what it "
+        "observes. Bold: the highest, and what is shown to be equivalent to it in the typical run. "
+        "?: not told apart from it by 4 seeds. Plain: shown to be worse. In brackets: processor "
+        "time of the median run."
+    )
+
+
+def test_other_metrics_show_their_own_figures_and_of_costs_the_lowest_leads(made_up, place):
+    analysis = analysis_of(made_up, place, metric="regret")
+    text = headline(analysis)
+    assert "| `low` | **31** |" in text
+    assert "| `open` | 81, 1 of 4 failed |" in text
+    assert "Regret of a run: the median run. Bold: the lowest" in text
+    assert "processor" not in text
+
+
+def test_an_agent_without_a_run_has_a_dash_and_missing_runs_are_counted(made_up, place):
+    some = made_up.agent("first", 90.0, n_missing=2)
+    text = headline(analysis_of(made_up, replace(place, agents=(some,), pairs=())))
+    assert "| `low` | - |" in text
+    assert "| `first` | **1.800**, 2 missing |" in text
+
+
+def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure(made_up, place):
+    study = made_up.study(NAMES)
+    assert standings(study, replace(place, best_blind=95.0)) == {}
+    assert standings(study, made_up.environment([made_up.agent("first", math.nan)])) == {}
+    assert set(standings(study, place)) == set(NAMES)
+
+
+def test_cost_is_the_median_of_runs_that_were_all_measured(made_up, place):
+    found = processor_seconds(analysis_of(made_up, place, CPU).results)
+    assert found == {("first", "lake"): 40.4, ("same", "lake"): 0.1249}
+
+
+def test_the_ranking_of_an_environment(made_up, place):
+    text = ranking(analysis_of(made_up, place, CPU).results, place)
+    row = "| `first` | 91 [90.9, 91.2] | 90 [89.9, 90.2] | 1.8 | 0 of 4 | 100 | 40 s |"
+    assert row in text.splitlines()
+    assert text.splitlines()[0] == (
+        "|  | median | mean | score | failed | stays from | processor time |"
+    )
+
+
+def test_the_file_says_the_seeds_first_and_the_verdicts_last(made_up, place, tmp_path):
+    path = write_verdicts(analysis_of(made_up, place, root=tmp_path), "python compare.py a.yml")
+    text = path.read_text(encoding="utf-8")
+    assert path.name == "verdicts.md"
+    parts = text.split("\n\n")
+    assert parts[:3] == [
+        "# S",
+        "`python compare.py a.yml`",
+        "Seeds 0 to 3: nothing was tuned on these.",
+    ]
+    assert "## lake" in parts
+    assert parts[-1].startswith("- ")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.1249, "0.12 s"), (0.0, "0 s"), (0.0071, "0.0071 s"), (9.96, "10.0 s"), (44.6, "45 s"),
+     (1234.0, "1,200 s")],
+)  # fmt: skip
+def test_durations(seconds, text):
+    assert duration(seconds) == text
+
+
+def test_nothing_of_a_text_is_markup():
+    assert escaped("double_dqn by 2 [1, 3]") == "double_dqn by 2 [1, 3]"
+    assert escaped("a|b <b>*x*</b> [x](y) `c`") == "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"
+    assert escaped("# one\n\ntwo _three_") == "\\# one two \\_three\\_"
+    assert name_of("dqn") == "`dqn`"
+    assert name_of("a`b|") == "a\\`b\\|"
+    assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
