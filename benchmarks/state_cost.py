@@ -53,7 +53,8 @@ def watched(saved: Saved, started: list[float]) -> None:
         start(self)
         started[0] = time.process_time()
 
-    state_saver.time = SimpleNamespace(monotonic=time.process_time)  # type: ignore[assignment]
+    clock = SimpleNamespace(monotonic=time.process_time)
+    state_saver.time = clock  # type: ignore[attr-defined,assignment]
     StateSaver.save = timed  # type: ignore[method-assign]
     StateSaver._on_training_start = noted  # type: ignore[method-assign]
 

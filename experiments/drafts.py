@@ -96,7 +96,10 @@ def take_over(draft: Path) -> bool:
     left = [
         one
         for one in _drafts(draft.parent.parent)
-        if one != draft and _run_of(one) == _run_of(draft) and _is_dead(one)
+        if one != draft
+        and not one.is_symlink()
+        and _run_of(one) == _run_of(draft)
+        and _is_dead(one)
     ]
     for one in sorted(left, key=holds_state, reverse=True):
         with contextlib.suppress(OSError):  # another was faster

@@ -111,7 +111,13 @@ def test_each_draft_is_judged_by_itself(tmp_path, dead_pid, live_pid):
     assert sorted((tmp_path / ".drafts").iterdir()) == sorted([alive, elsewhere])
 
 
-def test_a_state_is_kept_for_a_run_that_is_still_to_do(tmp_path, dead_pid):
+def test_a_draft_is_kept_for_a_run_that_is_still_to_do(tmp_path, dead_pid):
+    draft = draft_of(tmp_path, f"{dead_pid}-2-{drafts._place(liveness.mark())}")
+    remove_dead_drafts(tmp_path, {RUN})
+    assert draft.is_dir()
+    leave_drafts(tmp_path, RUN)
+    assert not draft.exists()
+    # One with a state waits for the next command.
     draft = draft_of(tmp_path, dead_pid, state=True)
     remove_dead_drafts(tmp_path, {RUN})
     leave_drafts(tmp_path, RUN)
@@ -133,13 +139,18 @@ def test_the_next_process_takes_over_what_a_dead_one_has_left(tmp_path, dead_pid
     assert not take_over(own)
     draft_of(tmp_path, dead_pid, run="qlearning@lake_2", state=True)
     draft_of(tmp_path, live_pid, state=True)
-    draft_of(tmp_path, f"{dead_pid}-2-{drafts._place(liveness.mark())}")  # without a state
     assert not take_over(own)
     assert not own.exists()
+    stateless = draft_of(tmp_path, f"{dead_pid}-2-{drafts._place(liveness.mark())}")
     left = draft_of(tmp_path, dead_pid, state=True)
     assert take_over(own)
     assert not left.exists()
     assert (own / "state" / "odd.state").read_text() == "far"
+    # What holds no state says that the run was cut off before its first.
+    remove_draft(own)
+    assert take_over(own)
+    assert not stateless.exists()
+    assert own.is_dir()
 
 
 def test_a_link_is_taken_over_by_nobody(tmp_path, dead_pid):

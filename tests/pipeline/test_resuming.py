@@ -383,10 +383,6 @@ def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     assert not saver.wants_position()
     clock[0] += 0.2
     assert saver.wants_position()
-    known = SavedState(Snapshot(), {"pause": saver.pause})
-    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail, known)
-    assert saver.pause == 25.0
-    assert StateSaver(Run(tmp_path, ""), SaveInterval(30.0), pytest.fail, known).pause == 30.0
 
 
 def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
@@ -400,15 +396,22 @@ def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
     assert gc.isenabled()
 
 
-def test_what_goes_on_is_saved_sooner(tmp_path, monkeypatch):
+def test_what_was_cut_off_is_saved_sooner(tmp_path, monkeypatch):
     """Where it is cut off every few seconds, it gets ahead all the same."""
     clock = [0.0]
     monkeypatch.setattr("pipeline.resuming.state_saver.time.monotonic", lambda: clock[0])
-    begun = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
-    state = SavedState(None, {"number": 3})
-    gone_on = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail, state)
-    asked = StateSaver(Run(tmp_path, ""), SaveInterval(seconds=30.0), pytest.fail, state)
-    assert [saver.pause for saver in (begun, gone_on, asked)] == [1.0, 0.1, 30.0]
+
+    def saver_of(note, seconds=0.0, was_cut_off=True):
+        state = None if note is None else SavedState(Snapshot(), note)
+        interval = SaveInterval(seconds=seconds)
+        return StateSaver(Run(tmp_path, ""), interval, pytest.fail, state, was_cut_off)
+
+    assert saver_of(None, was_cut_off=False).pause == 2.5
+    assert saver_of(None).pause == 0.1  # it was cut off before its first state
+    assert saver_of({"pause": 25.0}).pause == 0.5  # what saving took
+    assert saver_of({"pause": 25.0}, seconds=30.0).pause == 30.0
+    gone_on = saver_of({"number": 3})
+    assert gone_on.pause == 0.1
 
     def write(self):
         clock[0] += 0.5
