@@ -100,6 +100,8 @@ def wait(browser, condition):
 
 
 def plots(browser):
+    """How many figures are there, those drawn too that nobody has come near yet."""
+    browser.execute_script("report.drawAll()")
     return browser.execute_script("return document.querySelectorAll('.plot .main-svg').length")
 
 
@@ -121,6 +123,7 @@ def figure(browser, css):
     return browser.execute_script(
         """
         const plot = document.querySelector(arguments[0]);
+        report.drawAll();
         return {
           x: plot.data.map((trace) => trace.x),
           y: plot.data.map((trace) => trace.y),
@@ -410,3 +413,78 @@ def test_a_phone_shows_bandits_within_its_edge(bandit_page):
         Select(find(bandit_page, "#environment")).select_by_index(environment)
         time.sleep(0.3)
         assert bandit_page.execute_script("return document.documentElement.scrollWidth") <= 380
+
+
+# --- on paper ------------------------------------------------------------------------------------
+
+PAPER = 688  # CSS pixels between the margins of A4
+
+
+@pytest.fixture
+def paper(browser, report_study):
+    """The page as it is printed from a dark screen."""
+    dark = {"name": "prefers-color-scheme", "value": "dark"}
+    resize(browser, PAPER)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [dark]})
+    browser.get(report_study.page.as_uri())
+    wait(browser, lambda: plots(browser) >= 5)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print", "features": [dark]})
+    wait(browser, lambda: find_all(browser, ".sheet"))
+    yield browser
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": []})
+
+
+def test_paper_has_every_environment_and_loses_nothing_at_its_edge(paper):
+    shown = [e.text for e in find_all(paper, "h2 .where") if e.is_displayed()]
+    # Ranking, learning curves, differences, policies, films, settings.
+    assert shown == ["FrozenLake-v1", "Warehouse-v0"] * 6
+    for css in (".sheet .plot .main-svg", ".sheet table", ".sheet .board", "h1", "#verdict .card"):
+        rights = paper.execute_script(
+            "return [...document.querySelectorAll(arguments[0])]"
+            ".filter((e) => e.getClientRects().length)"
+            ".map((e) => e.getBoundingClientRect().right)",
+            css,
+        )
+        assert rights, css
+        assert max(rights) <= PAPER, css
+    assert find_all(paper, ".sheet details:not([open])") == []
+
+
+def test_curves_on_paper_go_to_the_last_step_in_light_colours(paper):
+    drawn = paper.execute_script(
+        """
+        const plot = document.querySelector(".sheet .tall .main-svg");
+        const ticks = [...document.querySelectorAll(".sheet .tall .xtick text")];
+        return {
+          last: ticks.map((tick) => tick.textContent).includes("2,000") ||
+            ticks.map((tick) => tick.textContent).includes("2k"),
+          ink: getComputedStyle(ticks[0]).fill,
+          page: getComputedStyle(document.documentElement).getPropertyValue("--card"),
+          clip: [...document.querySelectorAll(".sheet [clip-path]")].map((e) =>
+            /#([^)"']+)/.exec(e.getAttribute("clip-path"))[1]),
+        };
+        """
+    )
+    assert drawn["last"]
+    assert drawn["ink"] == "rgb(27, 31, 35)"
+    assert drawn["page"].strip() == "#ffffff"
+    # A drawing's parts are its own, not those of the same figure of another environment.
+    assert drawn["clip"]
+    for name in set(drawn["clip"]):
+        assert len(find_all(paper, f'[id="{name}"]')) == 1, name
+
+
+def test_after_printing_the_page_is_as_before(paper):
+    paper.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "screen", "features": []})
+    wait(paper, lambda: not find_all(paper, ".sheet"))
+    shown = {e.text for e in find_all(paper, "h2 .where") if e.is_displayed()}
+    assert shown == {"FrozenLake-v1"}
+    assert find(paper, "#curves .controls").is_displayed()
+
+
+def test_figures_are_drawn_when_they_come_near(browser, report_study):
+    resize(browser, 1280)
+    browser.get(report_study.page.as_uri())
+    assert find_all(browser, "#profiles .main-svg") == []
+    browser.execute_script("document.querySelector('#profiles').scrollIntoView()")
+    wait(browser, lambda: find_all(browser, "#profiles .main-svg"))

@@ -25,9 +25,22 @@
     spikethickness: 1,
   });
 
-  // Draws what `build` returns, traces and layout, into the element, now and after each change.
-  report.figure = (element, build) => {
+  // Figures are drawn when they come near the window, and not all at once.
+  const figures = new Map();
+  const nearness = new IntersectionObserver(
+    (entries) => entries.forEach((entry) => figures.get(entry.target).come(entry.isIntersecting)),
+    { rootMargin: "50% 0px" },
+  );
+  report.drawAll = () => figures.forEach((figure) => figure.draw());
+
+  // Draws what `build` returns, traces and layout, into the element, and again after each change.
+  // Where there is nothing to draw the figure is hidden. Returns what draws it anew.
+  report.figure = (element, build, isThere = () => true) => {
+    let isNear = false;
+    let isStale = true;
     const draw = () => {
+      if (!isStale) return;
+      isStale = false;
       const { traces, layout } = build();
       const { xaxis, yaxis, ...rest } = layout;
       Plotly.react(
@@ -42,15 +55,27 @@
           modebar: { bgcolor: "rgba(0,0,0,0)", color: report.css("--muted"), activecolor: report.css("--accent") },
           hoverlabel: { bgcolor: report.css("--card"), bordercolor: report.css("--line"), font: { color: report.css("--ink") } },
           ...rest,
+          ...report.paper?.(element),
           xaxis: { ...axis(), ...xaxis },
           yaxis: { ...axis(), ...yaxis },
         },
         CONFIG,
       );
     };
-    report.onChange(draw);
-    draw();
-    return draw;
+    const update = () => {
+      isStale = isThere();
+      element.closest("figure").hidden = !isStale;
+      if (isNear) draw();
+    };
+    const come = (isHere) => {
+      isNear = isHere;
+      if (isNear) draw();
+    };
+    figures.set(element, { draw, come });
+    nearness.observe(element);
+    report.onChange(update);
+    update();
+    return update;
   };
 
   // Plotly reads tags and entities in its texts.
@@ -228,40 +253,6 @@
         fixedrange: true,
         showgrid: false,
         ticks: "",
-      },
-    };
-  };
-
-  // Who beats whom with which probability, as a heat map.
-  report.matrix = (agents, chances) => {
-    const low = report.css("--agent-1");
-    const high = report.css("--agent-0");
-    return {
-      traces: [
-        {
-          type: "heatmap",
-          z: chances,
-          x: agents.map((_, i) => i),
-          y: agents.map((_, i) => i),
-          zmin: 0,
-          zmax: 1,
-          colorscale: [[0, low], [0.5, report.css("--card")], [1, high]],
-          text: chances.map((row) => row.map((chance) => (chance === null ? "" : chance.toFixed(2)))),
-          texttemplate: "%{text}",
-          customdata: agents.map((row) => agents.map((column) => [report.text(row), report.text(column)])),
-          hovertemplate: "%{customdata[0]} beats %{customdata[1]}: %{z:.2f}<extra></extra>",
-          hoverongaps: false,
-          xgap: 2,
-          ygap: 2,
-          showscale: !narrow.matches,
-          colorbar: { thickness: 10, outlinewidth: 0, tickformat: ".1f" },
-        },
-      ],
-      layout: {
-        height: 130 + 46 * agents.length,
-        margin: { l: 50, r: 14, t: 30, b: 20 },
-        xaxis: { side: "top", tickvals: agents.map((_, i) => i), ticktext: agents.map(report.tick), fixedrange: true, showgrid: false, showline: false, ticks: "" },
-        yaxis: { autorange: "reversed", tickvals: agents.map((_, i) => i), ticktext: agents.map(report.tick), fixedrange: true, showgrid: false, showline: false, ticks: "" },
       },
     };
   };

@@ -1,5 +1,5 @@
 // Maps of grid worlds: what agents do on each cell, at one moment of their training.
-report.section("policies", (root, data) => {
+report.section("policies", (root, _, chosen) => {
   const SVG = "http://www.w3.org/2000/svg";
   const [boards, readout, output] = [".boards", ".cell", "output"].map((query) => root.querySelector(query));
   const [seed, layer] = [".seed", ".layer"].map((query) => root.querySelector(query));
@@ -10,7 +10,6 @@ report.section("policies", (root, data) => {
   let moments = []; // steps that the slider stops at
   let timer = null;
 
-  const chosen = () => data[report.environment];
   const moment = () => moments[Number(slider.value)];
   const runs = () => chosen().runs.filter((run) => run.seed === Number(seed.lastElementChild.value));
   const nCells = () => chosen().rows.length * chosen().rows[0].length;
@@ -137,6 +136,7 @@ report.section("policies", (root, data) => {
     const text = `after ${moment().toLocaleString("en")} steps`;
     output.textContent = text;
     slider.setAttribute("aria-valuetext", text);
+    root.querySelector(".moment").textContent = `Policies ${text} of the run with seed ${seed.lastElementChild.value}.`;
     root.querySelector(".range").textContent = `${report.number(colours[0])} or less to ${report.number(colours[1])}`;
   };
 
