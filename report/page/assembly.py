@@ -16,6 +16,7 @@ from report.page import (
     curve_section,
     film_section,
     overall_section,
+    overview_section,
     policy_section,
     ranking_section,
     settings_section,
@@ -36,11 +37,12 @@ from report.series.study_series import StudySeries
 # package plotly.js-basic-dist-min 4.1.1 has it.
 PLOTLY = "plotly/plotly-basic.min.js"
 
-STYLES = ("templates/page.css", "templates/paper.css")
+STYLES = ("templates/parts.css", "templates/page.css", "templates/paper.css")
 
 # A new kind of section is a module with such a function, named here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     verdict_section.section,
+    overview_section.section,
     ranking_section.section,
     curve_section.section,
     bandit_section.section,
@@ -61,7 +63,7 @@ def write_report(series: StudySeries, path: Path, command: str, tell: Tell = tel
         command: the command that reproduces the study.
         tell: told how far the writing is.
     """
-    report = Report(series, command)
+    report = Report(series, command, tell)
     sections = []
     for place, make in enumerate(SECTIONS, start=1):
         tell(f"section {place} of {len(SECTIONS)}")
@@ -107,7 +109,7 @@ def render(report: Report, sections: list[Section]) -> str:
 
 def _own_script(sections: list[Section]) -> str:
     """The scripts of the page and of its sections, as one."""
-    shared = ["core.js", "figures.js", "tables.js"]
+    shared = ["core.js", "exports.js", "figures.js", "tables.js"]
     names = [*shared, *(f"{section.name}.js" for section in sections), "paper.js"]
     return "\n".join(text for name in names if (text := template_file(name)) is not None)
 

@@ -66,6 +66,7 @@ def section(report: Report) -> Section | None:
         groups.append([])
         without_room.append([])
         for run in runs:
+            report.tell(f"filming {run.agent} on {run.environment}")
             path = film_of(run)
             if path is None:
                 continue

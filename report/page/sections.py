@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from experiments.analysis import StudyAnalysis
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.series.study_series import StudySeries
 from verdicts import Estimate
 
@@ -18,10 +19,12 @@ class Report:
     Attributes:
         series: the numbers that its figures show.
         command: the command that reproduces the study.
+        tell: told how far the slow parts are.
     """
 
     series: StudySeries
     command: str
+    tell: Tell = tell_nobody
 
     @property
     def analysis(self) -> StudyAnalysis:

@@ -52,7 +52,7 @@ def data_of(page, name):
 
 def test_the_page_has_pulls_and_no_empty_curves(page):
     anchors = re.findall(r'<section id="(\w+)"', page)
-    assert anchors == ["verdict", "ranking", "bandits", "comparison", "settings"]
+    assert anchors == ["verdict", "overview", "ranking", "bandits", "comparison", "settings"]
     assert 'id="data-curves' not in page
     # A batch's agents are gone: there is nobody to film, and no return of a final policy.
     assert "Final returns are" not in page

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from report.figures.figure_style import line_style
-from report.page import film_section, policy_section, write_report
-from report.page.assembly import SECTIONS
+from report.page import film_section, overview_section, policy_section, write_report
+from report.page.assembly import PLOTLY, SECTIONS
 from report.page.comparison_section import improvement_matrix
 from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
-from report.page.markup import inline_script, p_value, plain, setting
+from report.page.markup import inline_script, p_value, package_file, plain, setting
 from report.page.sections import Report
 from report.sentences import sentences
 from report.series.agent_marks import COLOURS, agent_marks
@@ -29,6 +29,7 @@ HOSTILE = "</script><script>document.title='taken'</script>"
 LOADING = {"src", "srcset", "data", "poster", "action", "formaction", "background", "ping"}
 SECTION_NAMES = [
     "verdict",
+    "overview",
     "ranking",
     "curves",
     "comparison",
@@ -156,7 +157,7 @@ def test_a_study_on_one_environment_compares_nothing_over_environments(one_envir
     write_report(study_series(one_environment), tmp_path / "page.html", "python compare.py x.yml")
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     names = [attributes["id"] for attributes, _ in page.all("section")]
-    assert names == [name for name in SECTION_NAMES if name != "overall"]
+    assert names == [name for name in SECTION_NAMES if name not in {"overview", "overall"}]
     assert not [a for a, _ in page.all("select") if a.get("id") == "environment"]
 
 
@@ -294,7 +295,7 @@ def test_a_film_that_is_none_is_made_anew(report_study, name, content):
 
 
 def test_labels_stay_text(page, text):
-    assert HOSTILE in page.all("section")[1][1]
+    assert HOSTILE in page.all("section")[2][1]
     scripts = [script for _, script in page.all("script")]
     assert not [script for script in scripts if script.startswith("document.title")]
     assert len(scripts) == len(data_names(page)) + 3
@@ -369,3 +370,32 @@ def test_words_for_figures():
         "lin_0.1",
         '{"a": [1]}',
     ]
+
+
+def test_plotly_is_the_build_that_was_published():
+    """As the npm package plotly.js-basic-dist-min 4.1.1 has it: nobody has edited it."""
+    digest = hashlib.sha256(package_file(PLOTLY).encode()).hexdigest()
+    assert digest == "99784e3abfb07b142a15e521a439e6d9addceadb3f79553fd24c72774f0649ba"
+    assert "Permission is hereby granted" in package_file("plotly/LICENSE")
+
+
+def test_small_figures_keep_the_lines_within(page, report_study):
+    found = overview_section.section(Report(study_series(report_study.analysis), ""))
+    lake, warehouse = found.context["figures"]
+    assert (lake.name, warehouse.name) == ("FrozenLake-v1", "Warehouse-v0")
+    for figure in (lake, warehouse):
+        assert list(figure.lines) == [
+            agent.agent
+            for environment in report_study.analysis.environments
+            if environment.environment == figure.name
+            for agent in environment.agents
+        ]
+        corners = np.array(
+            [corner.split(",") for line in figure.lines.values() for corner in line.split()],
+            dtype=float,
+        )
+        assert (corners >= 0).all()
+        assert corners[:, 0].max() == overview_section.WIDTH
+        assert corners[:, 1].max() <= overview_section.HEIGHT
+        # Nothing lies above the optimum.
+        assert corners[:, 1].min() >= figure.optimum - 0.1

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import time
+from itertools import pairwise
 
 import pytest
 from selenium import webdriver
@@ -488,3 +489,89 @@ def test_figures_are_drawn_when_they_come_near(browser, report_study):
     assert find_all(browser, "#profiles .main-svg") == []
     browser.execute_script("document.querySelector('#profiles').scrollIntoView()")
     wait(browser, lambda: find_all(browser, "#profiles .main-svg"))
+
+
+# --- for every eye and hand ----------------------------------------------------------------------
+
+
+def test_a_small_figure_chooses_its_environment(page):
+    small = find_all(page, "#overview [data-choose]")
+    assert [one.get_attribute("aria-pressed") for one in small] == ["true", "false"]
+    script_click(page, small[1])
+    assert [one.get_attribute("aria-pressed") for one in small] == ["false", "true"]
+    assert Select(find(page, "#environment")).first_selected_option.text == "Warehouse-v0"
+    assert find(page, "#ranking .where:not([hidden])").text == "Warehouse-v0"
+
+
+def test_the_arrows_go_from_cell_to_cell(page):
+    board = find_all(page, ".board svg")[1]
+    board.send_keys(Keys.ARROW_RIGHT)
+    assert find(page, "#policies .cell").text.startswith("row 1, column 1: optimum 0.7442 (left)")
+    board.send_keys(Keys.ARROW_DOWN, Keys.ARROW_DOWN, Keys.ARROW_DOWN, Keys.ARROW_DOWN)
+    board.send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
+    assert find(page, "#policies .cell").text.startswith("row 4, column 3: optimum 0.924 (down)")
+    assert len(find_all(page, '.board [data-cell="14"] .cursor')) == len(find_all(page, ".board"))
+    assert find(page, "#policies .cell").get_attribute("aria-live") == "polite"
+
+
+def test_a_picture_to_take_along_has_title_legend_and_name(page):
+    name, kind, picture = page.execute_script(
+        """
+        report.drawAll();
+        return report.picture(document.querySelector("#curves .plot"), "svg")
+          .then(async ({name, blob}) => [name, blob.type, await blob.text()]);
+        """
+    )
+    assert name == "small-b-bold-b-learning-curves-frozenlake-v1.svg"
+    assert kind == "image/svg+xml"
+    assert "Learning curves · FrozenLake-v1" in picture
+    assert "sarsa" in picture
+    assert "<script" not in picture
+
+
+def test_a_table_to_take_along(page):
+    lines = page.execute_script(
+        "return report.csv(document.querySelector('#ranking table'))"
+    ).splitlines()
+    assert lines[0].startswith('Agent,"Mean, over seeds",')
+    assert len(lines) == 4
+    assert sorted(line[:5] for line in lines[1:]) == ["</scr", "Q-lea", "sarsa"]
+    mean = float(lines[1].split(",")[1])
+    assert 0 <= mean <= 1
+    # A label that a spreadsheet would run.
+    guarded = page.execute_script(
+        """
+        const table = document.createElement("table");
+        table.innerHTML = "<thead><tr><th>a</th><th>b</th></tr></thead>" +
+          "<tbody><tr><th>=1+1</th><td data-value='-2'>-2</td></tr></tbody>";
+        return report.csv(table);
+        """
+    )
+    assert guarded == "a,b\n'=1+1,-2\n"
+
+
+def test_the_ranking_needs_no_sideways_scrolling_on_a_laptop(page):
+    for css in ("#ranking", "#comparison"):
+        reach, width = page.execute_script(
+            "const e = document.querySelector(arguments[0] + ' figure:not([hidden]) .scroll');"
+            "return [e.scrollWidth, e.clientWidth]",
+            css,
+        )
+        assert reach <= width
+
+
+def test_no_tick_is_printed_over_another(page):
+    for low, high, linear in ((-27_427, 79, 79), (-1000, 79, 79), (-3, 1e6, 9)):
+        at = page.execute_script(
+            "const axis = report.symlog(arguments[2]);"
+            "const {tickvals} = axis.ticks(arguments[0], arguments[1]);"
+            "return [tickvals.sort((a, b) => a - b), axis.height(arguments[0]),"
+            "        axis.height(arguments[1])]",
+            low,
+            high,
+            linear,
+        )
+        ticks, bottom, top = at
+        assert len(ticks) >= 4
+        gaps = [b - a for a, b in pairwise(ticks)]
+        assert min(gaps) >= 0.085 * (top - bottom)

@@ -5,9 +5,16 @@
     displaylogo: false,
     displayModeBar: "hover",
     modeBarButtonsToRemove: [
+      "toImage", // those below have a title and a legend
       "select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d",
       "sendChartToCloud", // a page that needs no network offers none
     ],
+    modeBarButtonsToAdd: ["svg", "png"].map((format) => ({
+      name: format,
+      title: `Save as ${format.toUpperCase()}`,
+      icon: format === "svg" ? Plotly.Icons.disk : Plotly.Icons.camera,
+      click: (plot) => report.savePicture(plot, format),
+    })),
   };
   const narrow = matchMedia("(max-width: 40rem)");
   narrow.addEventListener("change", () => report.changed());
@@ -42,7 +49,9 @@
       if (!isStale) return;
       isStale = false;
       const { traces, layout } = build();
-      const { xaxis, yaxis, ...rest } = layout;
+      const { xaxis, yaxis, ...rest } = { ...layout, ...report.paper?.(element) };
+      // Plotly takes the element's height when the window changes.
+      element.style.height = rest.height === undefined ? "" : `${rest.height}px`;
       Plotly.react(
         element,
         traces,
@@ -50,12 +59,11 @@
           paper_bgcolor: "rgba(0,0,0,0)",
           plot_bgcolor: "rgba(0,0,0,0)",
           font: { family: getComputedStyle(document.body).fontFamily, size: 13, color: report.css("--ink") },
-          margin: { l: 50, r: 14, t: 38, b: 46 },
+          margin: { l: 50, r: 14, t: 54, b: 46 },
           showlegend: false,
           modebar: { bgcolor: "rgba(0,0,0,0)", color: report.css("--muted"), activecolor: report.css("--accent") },
           hoverlabel: { bgcolor: report.css("--card"), bordercolor: report.css("--line"), font: { color: report.css("--ink") } },
           ...rest,
-          ...report.paper?.(element),
           xaxis: { ...axis(), ...xaxis },
           yaxis: { ...axis(), ...yaxis },
         },
@@ -171,7 +179,12 @@
       for (let size = step * 10; size <= Math.max(Math.abs(low), Math.abs(high)); size *= 10) {
         values.push(size, -size);
       }
-      const shown = values.filter((value) => value >= low && value <= high);
+      // Powers of ten come first: no tick is printed over another.
+      const room = 0.09 * (height(high) - height(low));
+      const order = [0, ...values.slice(3).reverse(), inner, -inner];
+      const shown = order
+        .filter((value) => value >= low && value <= high)
+        .reduce((kept, value) => (kept.every((other) => Math.abs(height(other) - height(value)) >= room) ? [...kept, value] : kept), []);
       return { tickvals: shown.map(height), ticktext: shown.map(report.number) };
     };
     return { height, ticks };
@@ -245,7 +258,7 @@
     });
     return {
       traces,
-      height: 98 + 46 * rows.length,
+      height: 114 + 46 * rows.length,
       yaxis: {
         tickvals: rows.map((_, i) => rows.length - 1 - i),
         ticktext: rows.map((row) => report.tick(row.agent)),
