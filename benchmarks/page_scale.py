@@ -55,8 +55,9 @@ def made_up(n_agents: int, n_environments: int, n_seeds: int, root: Path) -> Stu
                 end = talent if rng.random() < 0.95 else 0.1
                 both = [_curve(rng, end, speed, kind) for kind in ("evaluation", "training")]
                 for table in both:
-                    labels = {"agent": agent.label, "environment": environment.label, "seed": seed}
-                    curves.append(table.assign(**labels)[list(CURVE_COLUMNS)])
+                    table["agent"], table["environment"] = agent.label, environment.label
+                    table["seed"] = seed
+                    curves.append(table[list(CURVE_COLUMNS)])
                 rows.append(_row(agent.label, environment.label, seed, both[0]))
     summary = pd.DataFrame(rows, columns=list(RUN_COLUMNS))
     return StudyResults(study, root, summary, pd.concat(curves, ignore_index=True), ())
@@ -144,11 +145,11 @@ def _of_children() -> float:
 
 def main() -> None:
     """Print the table."""
-    sizes = [int(word) for word in sys.argv[1:4]] or [10, 10, 30]
+    n_agents, n_environments, n_seeds = map(int, sys.argv[1:4] or ["10", "10", "30"])
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)
         page, empty = root / "report.html", root / "empty.html"
-        results = timed("making it up", lambda: made_up(*sizes, root))
+        results = timed("making it up", lambda: made_up(n_agents, n_environments, n_seeds, root))
         analysis = timed("judging", lambda: analyse(results))
         series = timed("working out the curves", lambda: study_series(analysis))
         timed("drawing the figures", lambda: write_figures(series, None))

@@ -448,7 +448,7 @@ def test_paper_has_every_environment_and_loses_nothing_at_its_edge(paper):
         )
         assert rights, css
         assert max(rights) <= PAPER, css
-    assert find_all(paper, ".sheet details:not([open])") == []
+    assert find_all(paper, "details:not([open])") == []
 
 
 def test_curves_on_paper_go_to_the_last_step_in_light_colours(paper):
@@ -481,6 +481,7 @@ def test_after_printing_the_page_is_as_before(paper):
     shown = {e.text for e in find_all(paper, "h2 .where") if e.is_displayed()}
     assert shown == {"FrozenLake-v1"}
     assert find(paper, "#curves .controls").is_displayed()
+    assert find_all(paper, "details[open]") == []
 
 
 def test_figures_are_drawn_when_they_come_near(browser, report_study):

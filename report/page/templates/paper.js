@@ -14,13 +14,13 @@
     sheet.innerHTML = sheet.innerHTML
       .replace(/\bid="/g, `id="on-paper-${place}-`)
       .replace(/url\((&quot;|["']?)#/g, `url($1#on-paper-${place}-`);
-    sheet.querySelectorAll("details").forEach((details) => (details.open = true));
     ["id", "data-places"].forEach((name) => sheet.removeAttribute(name));
     sheet.className = "sheet";
     return sheet;
   };
 
   let chosen = 0;
+  let folded = [];
   const lay = () => {
     if (sheets !== null) return;
     sheets = [];
@@ -31,6 +31,8 @@
       autosize: false,
     });
     theme.forPaper(true);
+    folded = [...document.querySelectorAll("details:not([open])")];
+    folded.forEach((details) => (details.open = true));
     report.page.environments.forEach((_, place) => {
       report.choose(place);
       report.drawAll();
@@ -43,6 +45,7 @@
     if (sheets === null) return;
     sheets.flat().forEach((sheet) => sheet.remove());
     sheets = null;
+    folded.forEach((details) => (details.open = false));
     report.paper = undefined;
     document.documentElement.classList.remove("on-paper");
     theme.forPaper(false);
