@@ -13,7 +13,7 @@ import numpy as np
 import torch as th
 from rich.console import Console
 
-from commands.run_output import describe, print_refusal
+from commands.run_output import describe, episodes, print_refusal
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator, model_refusal, why_not_exact
 from pipeline.filming import write_film
@@ -85,7 +85,7 @@ class _Show:
 
     def after_step(self, done: bool) -> None:
         self.steps += 1
-        self.activity.at(f"{self.steps:,} steps, {len(self.returns):,} episodes")
+        self.activity.at(f"{self.steps:,} steps, {episodes(len(self.returns))}")
         if self.mode not in KEPT_MODES:
             return
         drawn = self.taker.take(done)
@@ -151,7 +151,7 @@ def _write_film(console: Console, path: Path, frames: list[Any]) -> None:
 def _print_returns(console: Console, returns: list[float], lengths: list[int]) -> None:
     if returns:
         console.print(
-            f"return {np.mean(returns):.2f} ± {np.std(returns):.2f} over {len(returns)} episodes, "
+            f"return {np.mean(returns):.2f} ± {np.std(returns):.2f} over {episodes(len(returns))}, "
             f"length {np.mean(lengths):.1f}"
         )
     else:

@@ -31,7 +31,7 @@ def describe(evaluation: Evaluation) -> str:
     if evaluation.is_exact:
         text += " (exact)"
     else:
-        text += f" ± {evaluation.std_return:.2f} over {len(evaluation.returns)} episodes"
+        text += f" ± {evaluation.std_return:.2f} over {episodes(len(evaluation.returns))}"
     if evaluation.success_rate is not None:
         text += f", success {evaluation.success_rate:.1%}"
     yardstick = evaluation.yardstick
@@ -41,6 +41,11 @@ def describe(evaluation: Evaluation) -> str:
             f"score {yardstick.score(evaluation.mean_return):.2f}"
         )
     return text
+
+
+def episodes(n: int) -> str:
+    """So many episodes."""
+    return f"{n:,} episode{'s' if n != 1 else ''}"
 
 
 def describe_pulls(pulls: PullSummary) -> str:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -55,15 +56,22 @@ def analyse_overall(results: StudyResults) -> OverallAnalysis | None:
     thresholds = np.linspace(0, 1, 101)
     return OverallAnalysis(
         scores={agent: summaries[agent] for agent in order},
-        improvement={
-            (one, two): probability_of_improvement(scores[one], scores[two], seed=RESAMPLING_SEED)
-            for one in order
-            for two in order
-            if one != two
-        },
+        improvement=_improvement({agent: scores[agent] for agent in order}),
         thresholds=thresholds,
         profiles={
             agent: performance_profile(scores[agent], thresholds, seed=RESAMPLING_SEED)
             for agent in order
         },
     )
+
+
+def _improvement(scores: Mapping[str, Floats]) -> dict[tuple[str, str], Estimate]:
+    """How probable it is that one agent scores higher than another, seen from both sides."""
+    found = {}
+    for one, two in combinations(scores, 2):
+        chance = probability_of_improvement(scores[one], scores[two], seed=RESAMPLING_SEED)
+        found[one, two] = chance
+        found[two, one] = replace(
+            chance, point=1 - chance.point, low=1 - chance.high, high=1 - chance.low
+        )
+    return found

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Sequence
 
-from experiments.study_results import StudyResults
+import numpy as np
+import pandas as pd
+
+from experiments.study_results import TRAINING_POINTS, StudyResults
 from mdp.array_types import Floats
 from verdicts import Band, curve_band, on_grid, shared_grid
 
 RESAMPLING_SEED = 0  # the same runs give the same figures
-CURVE_POINTS = 200
+CURVE_POINTS = TRAINING_POINTS  # no run has more of training; a figure shows no more of them
 
 
 def values_over_seeds(results: StudyResults, environment: str, column: str) -> dict[str, Floats]:
@@ -23,27 +26,32 @@ def values_over_seeds(results: StudyResults, environment: str, column: str) -> d
     return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
 
 
-def mean_curve(
-    results: StudyResults, environment: str, agent: str, kind: str, by: str
-) -> tuple[Floats, Band] | None:
+def curves_by_agent(
+    results: StudyResults, environment: str
+) -> dict[tuple[str, str], list[pd.DataFrame]]:
+    """The learning curve of each run on an environment, by agent and kind."""
+    table = results.curves
+    table = table[table["environment"] == environment]
+    found: dict[tuple[str, str], list[pd.DataFrame]] = {}
+    for (agent, kind, _), rows in table.groupby(["agent", "kind", "seed"]):
+        found.setdefault((str(agent), str(kind)), []).append(rows)
+    return found
+
+
+def mean_curve(curves: Sequence[pd.DataFrame], by: str) -> tuple[Floats, Band] | None:
     """The mean learning curve of an agent over its seeds.
 
     Args:
-        results: the runs.
-        environment: label of the environment.
-        agent: label of the agent.
-        kind: ``"evaluation"`` or ``"training"``.
+        curves: those of its runs, from `curves_by_agent`.
         by: ``"step"``, ``"episode"`` or ``"seconds"``.
 
     Returns:
         The points, shape (n,), and the mean there with its interval; None without any run, or where
         one ended before the first point of another.
     """
-    table = results.curves
-    chosen = (table["environment"] == environment) & (table["agent"] == agent)
     runs = [
         (rows[by].to_numpy(dtype=np.float64), rows["value"].to_numpy(dtype=np.float64))
-        for _, rows in table[chosen & (table["kind"] == kind)].groupby("seed")
+        for rows in curves
     ]
     if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
         return None

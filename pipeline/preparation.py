@@ -29,6 +29,7 @@ from pipeline.evaluation.exact import (
     why_not_exact,
 )
 from pipeline.evaluation.sampled import takes_batches
+from pipeline.evaluation.value_maps import map_refusal
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
 from pipeline.models.continuation import (
@@ -183,6 +184,8 @@ def _exact_evaluator(
     )
     if reason:
         console.print(f"[dim]evaluations are sampled, not exact: {escape(reason)}[/]")
+    elif exact is not None and (note := map_refusal(exact)) is not None:
+        _say(console, note)
     return None if reason else exact
 
 

@@ -8,6 +8,7 @@ from typing import TypeVar
 import pandas as pd
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
@@ -15,21 +16,30 @@ from experiments.study_spec import METRIC_WORDS, StudySpec
 from experiments.tuning_seeds import tuning_seeds
 from report.conclusions import conclusion
 from report.pair_sentences import seeds_of
+from report.ranking_cells import Cell
 from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, BanditRow, Column, Row, filled
 from report.seed_sentence import seed_sentence
 from report.verdict_matrix import LEGEND, SIGNS, says_more, verdict_matrix
-from report.wording import number
+from report.wording import enumeration, number
 
 MOST_AGENT_WIDTH = 20
+UNBOUNDED = 10_000  # columns
 
 AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+# Where a table is wider than the terminal it goes without these, in this order; the page has all.
+FIRST_LEFT_OUT = (
+    *("training", "IQM", "solved", "stays from"),
+    *("simple regret", "reward", "time", "score", "best arm"),
+)
 
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
     """Print a table for each environment and what it says in words, then what seeds these are."""
     for environment in analysis.environments:
         console.print()
-        console.print(_ranking(analysis, environment))
+        _print_ranking(console, analysis, environment)
         _print_conclusion(console, analysis.study, environment)
     console.print()
     origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
@@ -68,7 +78,9 @@ def _matrix(environment: EnvironmentAnalysis) -> Table:
     return table
 
 
-def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table:
+def _print_ranking(
+    console: Console, analysis: StudyAnalysis, environment: EnvironmentAnalysis
+) -> None:
     pulls, label = analysis.results.pulls, environment.environment
     on_bandit = [
         BanditRow(agent, environment, pulls[agent.agent, label])
@@ -76,23 +88,47 @@ def _ranking(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> Table
         if (agent.agent, label) in pulls
     ]
     if on_bandit:
-        table = _titled(escape(label), _bandit_caption(analysis.study))
-        return _fill(table, BANDIT_COLUMNS, on_bandit)
-    rows = [Row(agent, environment) for agent in environment.agents]
-    table = _titled(_title(environment), _caption(analysis.study, environment))
-    return _fill(table, [column for column in COLUMNS if column.terminal], rows)
+        left_out = _print_fitting(console, escape(label), BANDIT_COLUMNS, on_bandit)
+        explained = _bandit_caption(analysis.study, left_out)
+    else:
+        rows = [Row(agent, environment) for agent in environment.agents]
+        columns = [column for column in COLUMNS if column.terminal]
+        left_out = _print_fitting(console, _title(environment), columns, rows)
+        explained = _caption(analysis.study, environment, left_out)
+    if left_out:
+        explained.append(f"a wider terminal shows {enumeration(left_out)} too")
+    # As wide as the terminal, and not as the table, which may be narrow.
+    console.print("; ".join(explained), style="italic dim", highlight=False, markup=False)
 
 
-def _titled(title: str, caption: str) -> Table:
-    return Table(title=title, caption=caption, title_justify="left", caption_justify="left")
+def _print_fitting(
+    console: Console, title: str, columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]
+) -> list[str]:
+    """Print a table with as many columns as there is room for; the headings of the others."""
+    shown = filled(columns, rows)
+    left_out: list[str] = []
+    table = _table(title, shown, rows)
+    for heading in FIRST_LEFT_OUT:
+        if Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum <= (
+            console.width
+        ):
+            break
+        if heading in [column.terminal for column, _ in shown]:
+            shown = [(column, cells) for column, cells in shown if column.terminal != heading]
+            left_out.append(heading)
+            table = _table(title, shown, rows)
+    console.print(table)
+    return left_out
 
 
-def _fill(table: Table, columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]) -> Table:
+def _table(
+    title: str, shown: Sequence[tuple[Column[AnyRow], list[Cell]]], rows: Sequence[AnyRow]
+) -> Table:
+    table = Table(title=title, title_justify="left")
     names = [row.agent.agent for row in rows]
     # Longer names go over several lines.
     width = min(max(map(len, names)), MOST_AGENT_WIDTH)
-    table.add_column("agent", overflow="fold", min_width=width)
-    shown = filled(columns, rows)
+    table.add_column("agent", overflow="fold", min_width=width, max_width=MOST_AGENT_WIDTH)
     for column, _ in shown:
         table.add_column(column.terminal, justify="right")
     for place, name in enumerate(names):
@@ -109,32 +145,40 @@ def _title(environment: EnvironmentAnalysis) -> str:
     return title
 
 
-def _caption(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+def _caption(
+    study: StudySpec, environment: EnvironmentAnalysis, left_out: Sequence[str]
+) -> list[str]:
     n_seeds = seeds_of(study, environment)
     metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals over {n_seeds}"
     rows = [Row(agent, environment) for agent in environment.agents]
-    explained = [column for column in COLUMNS if column.terminal and column.caption]
+    explained = [
+        column
+        for column in COLUMNS
+        if column.terminal and column.caption and column.terminal not in left_out
+    ]
     on_variant = any(agent.on_variant for agent in environment.agents)
     words = {
         "threshold": number(environment.threshold),
         "variants": " (*: on a variant of the environment)" if on_variant else "",
     }
-    return "; ".join(
-        [
-            f"mean, IQM: {metric}",
-            *(
-                f"{column.terminal}: {column.caption.format(**words)}"
-                for column, _ in filled(explained, rows)
-            ),
-        ]
-    )
+    means = ", ".join(name for name in ("mean", "IQM") if name not in left_out)
+    return [
+        f"{means}: {metric}",
+        *(
+            f"{column.terminal}: {column.caption.format(**words)}"
+            for column, _ in filled(explained, rows)
+        ),
+    ]
 
 
-def _bandit_caption(study: StudySpec) -> str:
-    return (
-        f"regret: sum over the pulls of a run, with 95 % intervals over {study.n_seeds} runs; "
-        "simple regret: of recommending the arm pulled most; reward, best arm: at the last pulls"
-    )
+def _bandit_caption(study: StudySpec, left_out: Sequence[str]) -> list[str]:
+    explained = [
+        f"regret: sum over the pulls of a run, with 95 % intervals over {study.n_seeds} runs"
+    ]
+    if "simple regret" not in left_out:
+        explained.append("simple regret: of recommending the arm pulled most")
+    last = [name for name in ("reward", "best arm") if name not in left_out]
+    return [*explained, f"{', '.join(last)}: at the last pulls"] if last else explained
 
 
 def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:

@@ -9,8 +9,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from verdicts.bootstrap import check_confidence
-from verdicts.estimates import Estimate, Statistic, estimate
+from verdicts.bootstrap import (
+    check_confidence,
+    enough_resamples,
+    interval_tail,
+    percentile_interval,
+    resample_counts,
+)
+from verdicts.estimates import Estimate
 from verdicts.score_arrays import Floats
 
 # As many points as a figure can show.
@@ -124,18 +130,15 @@ def on_grid(steps: ArrayLike, values: ArrayLike, grid: ArrayLike) -> Floats:
 
 
 def curve_band(
-    values: ArrayLike,
-    statistic: Statistic = "mean",
-    *,
-    seed: int,
-    confidence: float = 0.95,
-    n_resamples: int = 2000,
+    values: ArrayLike, *, seed: int, confidence: float = 0.95, n_resamples: int = 2000
 ) -> Band:
-    """A statistic over seeds at each point, with intervals that hold point by point.
+    """The mean over seeds at each point, with intervals that hold point by point.
+
+    They are those that ``estimate`` gives each point by itself.
 
     Args:
-        values: shape (n_seeds, n_points), on a common grid. NaN is left out at its point.
-        statistic: see ``Summary``.
+        values: shape (n_seeds, n_points), on a common grid. What is not finite is left out at its
+            point.
         seed: of the resampling, which draws the same seeds at every point.
         confidence: of the intervals.
         n_resamples: how many resamples they come from.
@@ -143,11 +146,29 @@ def curve_band(
     Raises:
         ValueError: for arguments out of range.
     """
-    estimates = [
-        estimate(column, statistic, seed=seed, confidence=confidence, n_resamples=n_resamples)
-        for column in np.asarray(values, dtype=np.float64).T
-    ]
-    return Band(*np.array([(one.point, one.low, one.high) for one in estimates]).T)
+    table = np.asarray(values, dtype=np.float64)
+    known = np.isfinite(table)
+    band = np.full((3, table.shape[1]), np.nan)
+    # Points that have the same seeds are resampled together: mostly all of them.
+    for there in np.unique(known, axis=1).T:
+        if there.any():
+            places = (known == there[:, None]).all(axis=0)
+            columns = table[there][:, places]
+            band[:, places] = _resampled_means(columns, seed, confidence, n_resamples)
+    return Band(*band)
+
+
+def _resampled_means(columns: Floats, seed: int, confidence: float, n_resamples: int) -> Floats:
+    """Mean, low and high end at each point, shape (3, n_points), of (n_seeds, n_points)."""
+    n = len(columns)
+    rng = np.random.default_rng(seed)
+    counts = resample_counts(n, enough_resamples(n_resamples, n), rng)
+    # Counted from the smallest value, so that equal values keep theirs exactly.
+    least = columns.min(axis=0)
+    above = columns - least
+    resampled = least + (counts @ above) / n
+    tail = interval_tail([np.arange(n, dtype=np.float64)], confidence)
+    return np.array([least + above.mean(axis=0), *percentile_interval(resampled, tail)])
 
 
 def steps_to_threshold(steps: ArrayLike, values: ArrayLike, threshold: float) -> float:

@@ -89,6 +89,14 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
     )
 
 
+def map_refusal(evaluator: ExactEvaluator) -> str | None:
+    """Why there is no map of a grid world; None where there is one, or no grid world."""
+    n_states = evaluator.model.n_states
+    if evaluator.layout is None or n_states <= MAX_STATES:
+        return None
+    return f"no value map: {n_states:,} states are too many to see, it has up to {MAX_STATES:,}"
+
+
 def _deterministic_policy(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
     """What the agent does at each step in each state, shape (1 or horizon, S)."""
     if evaluator.layout is None or evaluator.model.n_states > MAX_STATES:

@@ -91,15 +91,21 @@ def _compress_outliers(axes: Axes, returns: Floats) -> None:
 def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> None:
     if not len(steps):
         return
-    smooth = moving_average(returns, MOVING_AVERAGE_EPISODES)
+    n_averaged = min(MOVING_AVERAGE_EPISODES, len(returns))
+    smooth = moving_average(returns, n_averaged)
     stride = max(len(steps) // MAX_POINTS, 1)
-    axes.plot(steps[::stride], returns[::stride], ".", color=GREY, markersize=2, alpha=0.4)
     axes.plot(
         steps[::stride],
-        smooth[::stride],
-        color=ORANGE,
-        label=f"{what}, mean of {MOVING_AVERAGE_EPISODES} episodes",
+        returns[::stride],
+        ".",
+        color=GREY,
+        markersize=2,
+        alpha=0.4,
+        label=f"{what}, each episode" if stride == 1 else f"{what}, every {stride}th episode",
     )
+    if n_averaged > 1:
+        label = f"{what}, mean of {n_averaged} episodes"
+        axes.plot(steps[::stride], smooth[::stride], color=ORANGE, label=label)
 
 
 def _evaluations(run: Run) -> tuple[Floats, Floats]:
@@ -177,6 +183,6 @@ def draw_learning_curve(
         axes.spines[["top", "right"]].set_visible(False)
     if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
         # Outside, where it covers no episode.
-        figure.legend(loc="outside lower left", ncols=4, frameon=False, fontsize=9)
+        figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9, markerscale=3)
     with replacing(run.curve_path) as draft:
         figure.savefig(draft, format="png")

@@ -51,6 +51,8 @@ def figure(
             with replacing(target) as draft:
                 canvas.savefig(draft, format=suffix[1:], **options)
             written.append(target)
+            # The second file looks as the first: finding places for all takes longest.
+            canvas.set_layout_engine("none")
 
 
 def shared_legend(axes: Axes) -> None:

@@ -16,18 +16,33 @@ from report.page import (
     curve_section,
     film_section,
     overall_section,
+    overview_section,
     policy_section,
     ranking_section,
     settings_section,
     verdict_section,
 )
-from report.page.markup import inline_script, plain, script_hash, template_file, templates
+from report.page.markup import (
+    inline_script,
+    package_file,
+    plain,
+    script_hash,
+    template_file,
+    templates,
+)
 from report.page.sections import Report, Section
 from report.series.study_series import StudySeries
+
+# Plotly's build for lines, dots and bars, which is a quarter of all of it; unchanged, as npm's
+# package plotly.js-basic-dist-min 4.1.1 has it.
+PLOTLY = "plotly/plotly-basic.min.js"
+
+STYLES = ("templates/parts.css", "templates/page.css", "templates/paper.css")
 
 # A new kind of section is a module with such a function, named here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     verdict_section.section,
+    overview_section.section,
     ranking_section.section,
     curve_section.section,
     bandit_section.section,
@@ -48,7 +63,7 @@ def write_report(series: StudySeries, path: Path, command: str, tell: Tell = tel
         command: the command that reproduces the study.
         tell: told how far the writing is.
     """
-    report = Report(series, command)
+    report = Report(series, command, tell)
     sections = []
     for place, make in enumerate(SECTIONS, start=1):
         tell(f"section {place} of {len(SECTIONS)}")
@@ -61,8 +76,6 @@ def write_report(series: StudySeries, path: Path, command: str, tell: Tell = tel
 
 def render(report: Report, sections: list[Section]) -> str:
     """The page as HTML."""
-    from plotly.offline import get_plotlyjs
-
     environment = templates()
     study = report.analysis.study
     marks = report.series.marks
@@ -80,14 +93,14 @@ def render(report: Report, sections: list[Section]) -> str:
         for section in sections
     }
     early = template_file("theme.js") or ""
-    scripts = [get_plotlyjs(), _own_script(sections)]
+    scripts = [package_file(PLOTLY), _own_script(sections)]
     return environment.get_template("page.html").render(
         study=study,
         environments=report.analysis.environments,
         sections=sections,
         bodies=bodies,
         data=_data(report, sections),
-        style=Markup(template_file("page.css") or ""),  # noqa: S704  # our own file
+        style=Markup("\n".join(package_file(name) for name in STYLES)),  # noqa: S704  # our own
         scripts=[inline_script(script) for script in scripts],
         early=inline_script(early),
         policy=" ".join(map(script_hash, [early, *scripts])),
@@ -96,12 +109,13 @@ def render(report: Report, sections: list[Section]) -> str:
 
 def _own_script(sections: list[Section]) -> str:
     """The scripts of the page and of its sections, as one."""
-    names = ["core.js", "figures.js", "tables.js", *(f"{section.name}.js" for section in sections)]
+    shared = ["core.js", "exports.js", "figures.js", "tables.js"]
+    names = [*shared, *(f"{section.name}.js" for section in sections), "paper.js"]
     return "\n".join(text for name in names if (text := template_file(name)) is not None)
 
 
 def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
-    """What the scripts work with, by section."""
+    """What the scripts work with, by the name of its element."""
     page = {
         "agents": [vars(mark) for mark in report.series.marks.values()],
         "environments": [
@@ -114,7 +128,7 @@ def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
             for environment in report.analysis.environments
         ],
     }
-    return {
-        "page": plain(page),
-        **{section.name: plain(section.data) for section in sections if section.data is not None},
-    }
+    data = {"page": page, **{section.name: section.data for section in sections}}
+    for section in sections:
+        data |= {f"{section.name}-{place}": item for place, item in enumerate(section.places)}
+    return {name: plain(item) for name, item in data.items() if item is not None}

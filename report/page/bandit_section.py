@@ -69,7 +69,7 @@ def section(report: Report) -> Section | None:
         "spread": SPREAD,
         "has_bounds": any(series is not None and series.bounds for series in bandits),
     }
-    return Section("bandits", "Pulls and regret", context, data, by_environment=True)
+    return Section("bandits", "Pulls and regret", context, places=data, by_environment=True)
 
 
 def context_tables(pulls: Pulls) -> list[ContextTable]:

@@ -19,25 +19,23 @@ def section(report: Report) -> Section | None:
     """Intervals and each run as figures, the pairs as a table and as a matrix."""
     analysis = report.analysis
     metric = METRIC_WORDS[analysis.study.metric]
-    data = {
-        "metric": metric,
-        "environments": [_data(one) for one in report.series.environments],
-    }
     context = {
         "metric": metric,
         "phrases": PHRASES,
         "most_dots": MOST_DOTS,
         "lower_is_better": analysis.study.metric in COSTS,
+        "matrices": [improvement_matrix(one) for one in analysis.environments],
     }
-    return Section("comparison", "Differences", context, data, by_environment=True)
+    places = [_data(one) for one in report.series.environments]
+    return Section(
+        "comparison", "Differences", context, {"metric": metric}, places, by_environment=True
+    )
 
 
 def _data(one: EnvironmentSeries) -> dict[str, Any]:
     return {
         "intervals": [_runs(agent) for agent in one.runs.agents],
         "linearUpTo": one.runs.linear_up_to,
-        "agents": [agent.agent for agent in one.runs.agents],
-        "improvement": improvement_matrix(one.environment),
     }
 
 

@@ -27,7 +27,7 @@ def section(report: Report) -> Section | None:
         "tables": [[] if item is None else _table(item["evaluation"]) for item in curves],
     }
     data = [None if item is None else _environment_data(item) for item in curves]
-    return Section("curves", "Learning curves", context, data, by_environment=True)
+    return Section("curves", "Learning curves", context, places=data, by_environment=True)
 
 
 def _environment_data(curves: Mapping[str, LearningCurves]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ COLOURS = 128
 MAX_SIDE = 320  # pixels of a picture's longer side
 MAX_BYTES = 300_000  # of a film
 MAX_FIGURE = 1e300  # in the caption
-ALL_BYTES = 6_000_000  # of the films of a page, a third more as text
+ALL_BYTES = 1_000_000  # of the films of a page, a third more as text
 
 
 @dataclass(frozen=True)
@@ -43,14 +43,14 @@ class Film:
     Attributes:
         agent: its label.
         still: the first frame as a data URI.
-        film: all frames, likewise.
+        place: that of its film among those of the page, which agents of one route share.
         width, height: in pixels.
         caption: how the episode went.
     """
 
     agent: str
     still: str
-    film: str
+    place: int
     width: int
     height: int
     caption: str
@@ -58,18 +58,31 @@ class Film:
 
 def section(report: Report) -> Section | None:
     """The films of each environment; None where nothing can be drawn."""
-    films: list[list[Film]] = []
-    room = ALL_BYTES
-    for runs in _runs_to_film(report.analysis):
-        films.append([])
+    groups: list[list[Film]] = []
+    contents: dict[bytes, int] = {}  # and their places on the page
+    without_room: list[list[str]] = []
+    runs_to_film = _runs_to_film(report.analysis)
+    for n_done, runs in enumerate(runs_to_film, start=1):
+        groups.append([])
+        without_room.append([])
         for run in runs:
+            report.tell(f"filming {run.agent} on {run.environment}")
             path = film_of(run)
-            if path is not None and path.stat().st_size <= room:
-                room -= path.stat().st_size
-                films[-1].append(_film(run.agent, path))
-    if not any(films):
+            if path is None:
+                continue
+            content = path.read_bytes()
+            # What an environment does not take is left to the next ones.
+            room = ALL_BYTES * n_done // len(runs_to_film) - sum(map(len, contents))
+            if content in contents or len(content) <= room:
+                place = contents.setdefault(content, len(contents))
+                groups[-1].append(_film(run.agent, path, place))
+            else:
+                without_room[-1].append(run.agent)
+    if not any(groups):
         return None
-    return Section("films", "Episodes", {"films": films}, by_environment=True)
+    data = [data_uri("image/gif", content) for content in contents]
+    context = {"films": groups, "without_room": without_room}
+    return Section("films", "Episodes", context, data, by_environment=True)
 
 
 def _runs_to_film(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
@@ -171,7 +184,7 @@ def _encoded(frames: list[Any]) -> bytes:
         return path.read_bytes()
 
 
-def _film(agent: str, path: Path) -> Film:
+def _film(agent: str, path: Path, place: int) -> Film:
     still = io.BytesIO()
     with Image.open(path) as picture:
         width, height = picture.size
@@ -179,7 +192,7 @@ def _film(agent: str, path: Path) -> Film:
     return Film(
         agent,
         data_uri("image/png", still.getvalue()),
-        data_uri("image/gif", path.read_bytes()),
+        place,
         width,
         height,
         _caption(json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))),

@@ -40,6 +40,11 @@ def template_file(name: str) -> str | None:
     return file.read_text(encoding="utf-8") if file.is_file() else None
 
 
+def package_file(name: str) -> str:
+    """The text of a file of this package."""
+    return (files("report.page") / name).read_text(encoding="utf-8")
+
+
 def plain(value: Any) -> Any:
     """The value as JSON knows it: rounded, and None in place of what is not finite."""
     if isinstance(value, np.ndarray | np.generic):

@@ -16,7 +16,14 @@ def section(report: Report) -> Section | None:
     if overall is None:
         return None
     agents = list(overall.scores)
-    context = {"agents": agents, "scores": _scores(report.analysis, agents)}
+    context = {
+        "agents": agents,
+        "scores": _scores(report.analysis, agents),
+        "improvement": [
+            [overall.improvement[one, two].point if one != two else None for two in agents]
+            for one in agents
+        ],
+    }
     return Section("overall", "Overall", context, _data(overall))
 
 
@@ -25,10 +32,6 @@ def _data(overall: OverallAnalysis) -> dict[str, Any]:
     return {
         "agents": agents,
         "iqm": [{"agent": agent, **estimate_data(overall.scores[agent].iqm)} for agent in agents],
-        "improvement": [
-            [overall.improvement[one, two].point if one != two else None for two in agents]
-            for one in agents
-        ],
         "thresholds": overall.thresholds,
         "profiles": {
             agent: {"y": band.point, "low": band.low, "high": band.high}

@@ -17,8 +17,9 @@ from pipeline.environments import make_single_env
 from report.page.sections import Report, Section
 
 MAX_MAPS = 40  # of a run: more than a slider needs
-# Figures on an environment, values and actions of all maps; a page takes about 8 bytes for each.
-MAX_FIGURES = 120_000
+MIN_MAPS = 2  # the first and the last
+# Figures of a page, values and actions of all maps, which environments share; each takes 4 bytes.
+MAX_FIGURES = 200_000
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -26,15 +27,16 @@ Arrays = Mapping[str, NDArray[Any]]
 def section(report: Report) -> Section | None:
     """The maps of every grid world; None where there is none."""
     analysis = report.analysis
-    data = [_environment_data(analysis, environment) for environment in analysis.environments]
+    room = MAX_FIGURES // len(analysis.environments)
+    data = [_environment_data(analysis, environment, room) for environment in analysis.environments]
     if not any(data):
         return None
     context = {"is_drawn": [item is not None for item in data]}
-    return Section("policies", "Policies", context, data, by_environment=True)
+    return Section("policies", "Policies", context, places=data, by_environment=True)
 
 
 def _environment_data(
-    analysis: StudyAnalysis, environment: EnvironmentAnalysis
+    analysis: StudyAnalysis, environment: EnvironmentAnalysis, room: int
 ) -> dict[str, Any] | None:
     runs = _recorded_runs(analysis, environment)
     if not runs:
@@ -47,7 +49,7 @@ def _environment_data(
         env.close()
     if layout is None or model is None:
         return None
-    maps = _read_maps(runs, layout)
+    maps = _read_maps(runs, layout, room)
     if not maps:
         return None
     optimum = next(iter(maps.values()))
@@ -77,27 +79,33 @@ def _recorded_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) ->
     return sorted(runs, key=lambda run: (run.seed, order.index(run.agent)))
 
 
-def _read_maps(runs: Sequence[PlannedRun], layout: GridLayout) -> dict[tuple[str, int], Arrays]:
+def _read_maps(
+    runs: Sequence[PlannedRun], layout: GridLayout, room: int
+) -> dict[tuple[str, int], Arrays]:
     """The maps by agent and seed, of the first seed and as many others as there is room for."""
+    n_agents = sum(run.seed == runs[0].seed for run in runs)
+    # Of the first seed all agents, if at few moments.
+    n_maps = min(max(room // (2 * layout.n_states * n_agents), MIN_MAPS), MAX_MAPS)
     maps: dict[tuple[str, int], Arrays] = {}
     figures = 0
     for run in runs:
-        arrays = _read(run)
+        arrays = _read(run, n_maps)
         if arrays["optimal_actions"].shape != (layout.n_states, len(layout.moves)):
             continue  # an agent that was given another map
         figures += 2 * arrays["values"].size
-        if figures > MAX_FIGURES and run.seed != runs[0].seed:
+        if figures > room and run.seed != runs[0].seed:
             # All agents of a seed, or none of them.
             return {key: found for key, found in maps.items() if key[1] != run.seed}
         maps[run.agent, run.seed] = arrays
     return maps
 
 
-def _read(run: PlannedRun) -> Arrays:
+def _read(run: PlannedRun, n_maps: int) -> Arrays:
+    """The maps of a run, at so many moments at most, the first and the last among them."""
     arrays = read_value_maps(run.run)
     n = len(arrays["timesteps"])
-    if n > MAX_MAPS:
-        kept = np.linspace(0, n - 1, MAX_MAPS).round().astype(np.int64)
+    if n > n_maps:
+        kept = np.linspace(0, n - 1, n_maps).round().astype(np.int64)
         arrays |= {name: arrays[name][kept] for name in ("timesteps", "values", "actions")}
     return arrays
 

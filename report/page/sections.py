@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from experiments.analysis import StudyAnalysis
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.series.study_series import StudySeries
 from verdicts import Estimate
 
@@ -18,10 +19,12 @@ class Report:
     Attributes:
         series: the numbers that its figures show.
         command: the command that reproduces the study.
+        tell: told how far the slow parts are.
     """
 
     series: StudySeries
     command: str
+    tell: Tell = tell_nobody
 
     @property
     def analysis(self) -> StudyAnalysis:
@@ -37,7 +40,9 @@ class Section:
         name: that of its template and script, and its anchor.
         title: its heading.
         context: what its template is filled with.
-        data: what its script works with, to be written as JSON; None where it has no script.
+        data: what its script works with, to be written as JSON; None where there is no such thing.
+        places: likewise what it works with on each environment, in their order, read when that is
+            chosen; None for one that it has nothing on.
         by_environment: whether it shows the environment that is chosen at the top of the page.
             Its template marks what belongs to environment i by ``data-environment="i"``.
     """
@@ -46,6 +51,7 @@ class Section:
     title: str
     context: Mapping[str, Any] = field(default_factory=dict)
     data: Any = None
+    places: Sequence[Any] = ()
     by_environment: bool = False
 
 

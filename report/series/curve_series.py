@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import pandas as pd
+
 from experiments.analysis import EnvironmentAnalysis
-from experiments.seed_values import mean_curve
+from experiments.seed_values import curves_by_agent, mean_curve
 from experiments.study_results import StudyResults
 from mdp.array_types import Floats
 from report.series.axis_scale import linear_up_to
@@ -47,8 +49,10 @@ def learning_curves(
 ) -> dict[str, LearningCurves]:
     """The curves on an environment, by kind."""
     found = {}
+    runs = curves_by_agent(results, environment.environment)
     for kind in KINDS:
-        by_axis = {by: _curves(results, environment, kind, by) for by in AXES}
+        of_agents = {agent.agent: runs.get((agent.agent, kind), []) for agent in environment.agents}
+        by_axis = {by: _curves(of_agents, by) for by in AXES}
         by_step = [curve.y for curve in by_axis["step"].values()]
         variants = [agent.agent for agent in environment.agents if agent.on_variant]
         found[kind] = LearningCurves(
@@ -59,16 +63,14 @@ def learning_curves(
     return found
 
 
-def _curves(
-    results: StudyResults, environment: EnvironmentAnalysis, kind: str, by: str
-) -> dict[str, Curve]:
+def _curves(of_agents: Mapping[str, Sequence[pd.DataFrame]], by: str) -> dict[str, Curve]:
     curves = {}
-    for agent in environment.agents:
+    for agent, runs in of_agents.items():
         try:
-            found = mean_curve(results, environment.environment, agent.agent, kind, by)
+            found = mean_curve(runs, by)
         except ValueError:
             continue  # a clock that was set back has made wall times fall
         if found is not None:
             points, band = found
-            curves[agent.agent] = Curve(points, band.point, band.low, band.high)
+            curves[agent] = Curve(points, band.point, band.low, band.high)
     return curves

@@ -13,7 +13,7 @@ from PIL import Image
 from rich.console import Console
 
 from experiments.analysis import analyse
-from experiments.seed_values import mean_curve, values_over_seeds
+from experiments.seed_values import curves_by_agent, mean_curve, values_over_seeds
 from experiments.study_plan import plan
 from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, read_results
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
@@ -440,16 +440,17 @@ def test_curves_that_share_no_point_are_left_out(tmp_path):
     write_run(planned[0], [(50, 1.0), (100, 3.0)], [(50, 1.0)] * 2)
     write_run(planned[1], [(50, 1.0), (100, 3.0)], [(1, 1.0)] * 250)
     results = read_results(study, planned, tmp_path)
-    arguments = (results, "Warehouse-v0", "qlearning")
-    assert mean_curve(*arguments, "training", "episode") is None
-    points, band = mean_curve(*arguments, "evaluation", "step")
+    curves = curves_by_agent(results, "Warehouse-v0")
+    assert mean_curve(curves["qlearning", "training"], "episode") is None
+    points, band = mean_curve(curves["qlearning", "evaluation"], "step")
     assert (points.tolist(), band.point.tolist()) == ([50, 100], [1, 3])
     everything(results, tmp_path)
 
 
 def test_the_mean_curve_of_runs(tmp_path):
     results = results_of(study_of(n_seeds=2), tmp_path, {"qlearning": [10, 20], "sarsa": [5, None]})
-    points, band = mean_curve(results, "Warehouse-v0", "qlearning", "evaluation", "step")
+    curves = curves_by_agent(results, "Warehouse-v0")
+    points, band = mean_curve(curves["qlearning", "evaluation"], "step")
     assert points.tolist() == [50, 100]
     assert band.point.tolist() == [7.5, 15.0]
     assert (band.low <= band.point).all()

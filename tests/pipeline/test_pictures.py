@@ -192,7 +192,7 @@ def test_the_legend_covers_nothing(run, monkeypatch):
     figure.draw_without_rendering()
     (legend,) = figure.legends
     texts = [text.get_text() for text in legend.get_texts()]
-    assert texts[2:] == ["optimum", "best blind policy"]
+    assert texts[3:] == ["optimum", "best blind policy"]
     box, (axes,) = legend.get_window_extent(), figure.axes
     assert not box.overlaps(axes.get_tightbbox())
     assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
@@ -222,7 +222,7 @@ def names_in(axes):
 def test_training_on_a_variant_is_drawn_apart(run, monkeypatch):
     upper, lower = axes_drawn(run, monkeypatch, on_variant=True)
     assert names_in(upper) == ["evaluation, mean return", "optimum", "best blind policy"]
-    assert names_in(lower) == ["training, mean of 100 episodes"]
+    assert names_in(lower) == ["training, each episode", "training, mean of 50 episodes"]
     assert lower.get_title(loc="left") == "training, on a variant of the environment"
     assert upper.get_title(loc="left") == "title"
     # Steps go together, returns do not.
@@ -233,7 +233,8 @@ def test_training_on_a_variant_is_drawn_apart(run, monkeypatch):
 def test_training_on_the_environment_itself_is_drawn_with_the_evaluations(run, monkeypatch):
     (axes,) = axes_drawn(run, monkeypatch)
     assert names_in(axes) == [
-        "training, mean of 100 episodes",
+        "training, each episode",
+        "training, mean of 50 episodes",
         "evaluation, mean return",
         "optimum",
         "best blind policy",
@@ -242,7 +243,10 @@ def test_training_on_the_environment_itself_is_drawn_with_the_evaluations(run, m
 
 def test_a_variant_without_evaluations_is_called_so(run, monkeypatch):
     (axes,) = axes_drawn(run, monkeypatch, judged=False, on_variant=True)
-    assert names_in(axes) == ["training on a variant, mean of 100 episodes"]
+    assert names_in(axes) == [
+        "training on a variant, each episode",
+        "training on a variant, mean of 50 episodes",
+    ]
 
 
 def scale_of(returns):

@@ -10,7 +10,7 @@ from mdp import policy_return
 from pipeline.environments import make_training_env
 from pipeline.evaluation import value_maps
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.value_maps import ValueMapRecorder, value_map
+from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal, value_map
 from pipeline.models.model_loading import load_model
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -115,6 +115,8 @@ def test_where_there_is_no_map(env_id, env_kwargs, agent, tmp_path):
     spec = spec_of(env_id, entry={"env_kwargs": env_kwargs})
     evaluator = exact_evaluator(spec)
     assert value_map(evaluator, made(spec, agent)) is None
+    too_large = "no value map: 2,601 states are too many to see, it has up to 2,500"
+    assert map_refusal(evaluator) == (too_large if env_kwargs else None)
     recorder = ValueMapRecorder(tmp_path / "maps.npz", evaluator)
     recorder.record(made(spec, agent), 1)
     recorder.finish(made(spec, agent), 2)

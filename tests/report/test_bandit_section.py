@@ -44,14 +44,16 @@ def page(analysis):
 
 
 def data_of(page, name):
-    found = re.search(f'<script type="application/json" id="data-{name}">(.*?)</script>', page)
-    return None if found is None else json.loads(found[1])
+    """A section's data on each environment; None where it has none."""
+    pattern = '<script type="application/json" id="data-{}-{}">(.*?)</script>'
+    found = [re.search(pattern.format(name, place), page) for place in range(2)]
+    return [None if one is None else json.loads(one[1]) for one in found]
 
 
 def test_the_page_has_pulls_and_no_empty_curves(page):
     anchors = re.findall(r'<section id="(\w+)"', page)
-    assert anchors == ["verdict", "ranking", "bandits", "comparison", "settings"]
-    assert data_of(page, "curves") is None
+    assert anchors == ["verdict", "overview", "ranking", "bandits", "comparison", "settings"]
+    assert 'id="data-curves' not in page
     # A batch's agents are gone: there is nobody to film, and no return of a final policy.
     assert "Final returns are" not in page
     assert 'aria-sort="ascending"' in page
@@ -150,7 +152,7 @@ def test_bandits_whose_arms_are_drawn_anew(tmp_path, do_study):
     agents = (AGENTS[2], AGENTS[3])
     study = StudySpec("s", "S", agents, PLACES[2:], n_seeds=3, metric="regret")
     analysis = analyse(do_study(study, tmp_path))
-    (item,) = bandit_section.section(Report(study_series(analysis), "")).data
+    (item,) = bandit_section.section(Report(study_series(analysis), "")).places
     assert item["best"] == pytest.approx(1.5388, abs=1e-4)
     assert (item["bounds"], item["arms"], item["posteriors"]) == (None, None, [])
     assert set(item["curves"]) == {"normal", "eager"}

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import time
+from itertools import pairwise
 
 import pytest
 from selenium import webdriver
@@ -100,6 +101,8 @@ def wait(browser, condition):
 
 
 def plots(browser):
+    """How many figures are there, those drawn too that nobody has come near yet."""
+    browser.execute_script("report.drawAll()")
     return browser.execute_script("return document.querySelectorAll('.plot .main-svg').length")
 
 
@@ -121,6 +124,7 @@ def figure(browser, css):
     return browser.execute_script(
         """
         const plot = document.querySelector(arguments[0]);
+        report.drawAll();
         return {
           x: plot.data.map((trace) => trace.x),
           y: plot.data.map((trace) => trace.y),
@@ -410,3 +414,165 @@ def test_a_phone_shows_bandits_within_its_edge(bandit_page):
         Select(find(bandit_page, "#environment")).select_by_index(environment)
         time.sleep(0.3)
         assert bandit_page.execute_script("return document.documentElement.scrollWidth") <= 380
+
+
+# --- on paper ------------------------------------------------------------------------------------
+
+PAPER = 688  # CSS pixels between the margins of A4
+
+
+@pytest.fixture
+def paper(browser, report_study):
+    """The page as it is printed from a dark screen."""
+    dark = {"name": "prefers-color-scheme", "value": "dark"}
+    resize(browser, PAPER)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [dark]})
+    browser.get(report_study.page.as_uri())
+    wait(browser, lambda: plots(browser) >= 5)
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print", "features": [dark]})
+    wait(browser, lambda: find_all(browser, ".sheet"))
+    yield browser
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": []})
+
+
+def test_paper_has_every_environment_and_loses_nothing_at_its_edge(paper):
+    shown = [e.text for e in find_all(paper, "h2 .where") if e.is_displayed()]
+    # Ranking, learning curves, differences, policies, films, settings.
+    assert shown == ["FrozenLake-v1", "Warehouse-v0"] * 6
+    for css in (".sheet .plot .main-svg", ".sheet table", ".sheet .board", "h1", "#verdict .card"):
+        rights = paper.execute_script(
+            "return [...document.querySelectorAll(arguments[0])]"
+            ".filter((e) => e.getClientRects().length)"
+            ".map((e) => e.getBoundingClientRect().right)",
+            css,
+        )
+        assert rights, css
+        assert max(rights) <= PAPER, css
+    assert find_all(paper, "details:not([open])") == []
+
+
+def test_curves_on_paper_go_to_the_last_step_in_light_colours(paper):
+    drawn = paper.execute_script(
+        """
+        const plot = document.querySelector(".sheet .tall .main-svg");
+        const ticks = [...document.querySelectorAll(".sheet .tall .xtick text")];
+        return {
+          last: ticks.map((tick) => tick.textContent).includes("2,000") ||
+            ticks.map((tick) => tick.textContent).includes("2k"),
+          ink: getComputedStyle(ticks[0]).fill,
+          page: getComputedStyle(document.documentElement).getPropertyValue("--card"),
+          clip: [...document.querySelectorAll(".sheet [clip-path]")].map((e) =>
+            /#([^)"']+)/.exec(e.getAttribute("clip-path"))[1]),
+        };
+        """
+    )
+    assert drawn["last"]
+    assert drawn["ink"] == "rgb(27, 31, 35)"
+    assert drawn["page"].strip() == "#ffffff"
+    # A drawing's parts are its own, not those of the same figure of another environment.
+    assert drawn["clip"]
+    for name in set(drawn["clip"]):
+        assert len(find_all(paper, f'[id="{name}"]')) == 1, name
+
+
+def test_after_printing_the_page_is_as_before(paper):
+    paper.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "screen", "features": []})
+    wait(paper, lambda: not find_all(paper, ".sheet"))
+    shown = {e.text for e in find_all(paper, "h2 .where") if e.is_displayed()}
+    assert shown == {"FrozenLake-v1"}
+    assert find(paper, "#curves .controls").is_displayed()
+    assert find_all(paper, "details[open]") == []
+
+
+def test_figures_are_drawn_when_they_come_near(browser, report_study):
+    resize(browser, 1280)
+    browser.get(report_study.page.as_uri())
+    assert find_all(browser, "#profiles .main-svg") == []
+    browser.execute_script("document.querySelector('#profiles').scrollIntoView()")
+    wait(browser, lambda: find_all(browser, "#profiles .main-svg"))
+
+
+# --- for every eye and hand ----------------------------------------------------------------------
+
+
+def test_a_small_figure_chooses_its_environment(page):
+    small = find_all(page, "#overview [data-choose]")
+    assert [one.get_attribute("aria-pressed") for one in small] == ["true", "false"]
+    script_click(page, small[1])
+    assert [one.get_attribute("aria-pressed") for one in small] == ["false", "true"]
+    assert Select(find(page, "#environment")).first_selected_option.text == "Warehouse-v0"
+    assert find(page, "#ranking .where:not([hidden])").text == "Warehouse-v0"
+
+
+def test_the_arrows_go_from_cell_to_cell(page):
+    board = find_all(page, ".board svg")[1]
+    board.send_keys(Keys.ARROW_RIGHT)
+    assert find(page, "#policies .cell").text.startswith("row 1, column 1: optimum 0.7442 (left)")
+    board.send_keys(Keys.ARROW_DOWN, Keys.ARROW_DOWN, Keys.ARROW_DOWN, Keys.ARROW_DOWN)
+    board.send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
+    assert find(page, "#policies .cell").text.startswith("row 4, column 3: optimum 0.924 (down)")
+    assert len(find_all(page, '.board [data-cell="14"] .cursor')) == len(find_all(page, ".board"))
+    assert find(page, "#policies .cell").get_attribute("aria-live") == "polite"
+
+
+def test_a_picture_to_take_along_has_title_legend_and_name(page):
+    name, kind, picture = page.execute_script(
+        """
+        report.drawAll();
+        return report.picture(document.querySelector("#curves .plot"), "svg")
+          .then(async ({name, blob}) => [name, blob.type, await blob.text()]);
+        """
+    )
+    assert name == "small-b-bold-b-learning-curves-frozenlake-v1.svg"
+    assert kind == "image/svg+xml"
+    assert "Learning curves · FrozenLake-v1" in picture
+    assert "sarsa" in picture
+    assert "<script" not in picture
+
+
+def test_a_table_to_take_along(page):
+    lines = page.execute_script(
+        "return report.csv(document.querySelector('#ranking table'))"
+    ).splitlines()
+    assert lines[0].startswith('Agent,"Mean, over seeds",')
+    assert len(lines) == 4
+    assert sorted(line[:5] for line in lines[1:]) == ["</scr", "Q-lea", "sarsa"]
+    mean = float(lines[1].split(",")[1])
+    assert 0 <= mean <= 1
+    # A label that a spreadsheet would run.
+    guarded = page.execute_script(
+        """
+        const table = document.createElement("table");
+        table.innerHTML = "<thead><tr><th>a</th><th>b</th></tr></thead>" +
+          "<tbody><tr><th>=1+1</th><td data-value='-2'>-2</td></tr></tbody>";
+        return report.csv(table);
+        """
+    )
+    assert guarded == "a,b\n'=1+1,-2\n"
+
+
+def test_the_ranking_needs_no_sideways_scrolling_on_a_laptop(page):
+    for css in ("#ranking", "#comparison"):
+        reach, width = page.execute_script(
+            "const e = document.querySelector(arguments[0] + ' figure:not([hidden]) .scroll');"
+            "return [e.scrollWidth, e.clientWidth]",
+            css,
+        )
+        assert reach <= width
+
+
+def test_no_tick_is_printed_over_another(page):
+    for low, high, linear in ((-27_427, 79, 79), (-1000, 79, 79), (-3, 1e6, 9)):
+        at = page.execute_script(
+            "const axis = report.symlog(arguments[2]);"
+            "const {tickvals} = axis.ticks(arguments[0], arguments[1]);"
+            "return [tickvals.sort((a, b) => a - b), axis.height(arguments[0]),"
+            "        axis.height(arguments[1])]",
+            low,
+            high,
+            linear,
+        )
+        ticks, bottom, top = at
+        assert len(ticks) >= 4
+        gaps = [b - a for a, b in pairwise(ticks)]
+        assert min(gaps) >= 0.085 * (top - bottom)

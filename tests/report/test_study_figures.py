@@ -382,12 +382,15 @@ def test_too_many_agents_make_no_lines(series, made_up, tmp_path):
     assert [path.name for path in found] == ["island_sweep.png", "island_sweep.svg"]
 
 
-def test_marks_go_through_the_colours_and_then_through_the_dashes(made_up):
+def test_marks_go_through_colours_and_dashes_together(made_up):
     labels = [f"agent {n}" for n in range(9)]
     marks = agent_marks(made_up.study(labels))
     assert list(marks) == labels
     assert [mark.colour for mark in marks.values()] == [0, 1, 2, 3, 4, 5, 6, 0, 1]
-    assert [mark.dash for mark in marks.values()] == ["solid"] * 7 + ["dash"] * 2
+    assert [mark.dash for mark in marks.values()] == [*DASHES, *DASHES, "solid"]
+    assert [mark.shape for mark in marks.values()] == [0] * 7 + [1] * 2
+    many = agent_marks(made_up.study([f"agent {n}" for n in range(28)])).values()
+    assert len({(mark.colour, mark.dash) for mark in many}) == 28
     styles = [line_style(Mark("a", 2, dash)) for dash in DASHES]
     assert [style["linestyle"] for style in styles] == ["-", "--", "-.", ":"]
     assert {style["color"] for style in styles} == {GREEN}

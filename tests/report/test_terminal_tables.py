@@ -93,6 +93,10 @@ CAPTION = (
     "the last 100 training episodes; stays from: step from which on the median run stays at a "
     "return of 96"
 )
+NARROW_CAPTION = (
+    "mean: return of the final policy, with 95 % intervals over 4 seeds; stays from: step from "
+    "which on the median run stays at a return of 96; a wider terminal shows training and IQM too"
+)
 SENTENCES = [
     ("first is best: return of the final policy 90 [89.9, 90.2], score 0.9; the optimum is 100."),
     "first is better than second (by 50 [45, 55]).",
@@ -118,10 +122,37 @@ def test_a_title_a_table_a_caption_and_sentences(analysis, width, is_terminal):
         lambda console: print_analysis(console, analysis), width, force_terminal=is_terminal
     )
     assert lines[:2] == ["", "lake: optimum 100, best blind policy 20"]
-    assert cells(lines) == [HEADINGS, *ROWS]
     origin = "Seeds 0 to 3: nothing was tuned on these."
-    assert below(lines) == " ".join([CAPTION, *SENTENCES, origin])
+    if width == 120:
+        assert cells(lines) == [HEADINGS, *ROWS]
+        assert below(lines) == " ".join([CAPTION, *SENTENCES, origin])
+    else:
+        kept = [place for place, name in enumerate(HEADINGS) if name not in {"training", "IQM"}]
+        assert cells(lines) == [[row[place] for place in kept] for row in [HEADINGS, *ROWS]]
+        assert below(lines) == " ".join([NARROW_CAPTION, *SENTENCES, origin])
     assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 200])
+def test_no_figure_is_cut_and_no_border_lost(made_up, width):
+    agents = [
+        made_up.agent(name, -27_427.0)
+        for name in ("a name that is longer than twenty letters", "second")
+    ]
+    analysis = made_up.analysis([made_up.environment(agents)], [a.agent for a in agents])
+    _, lines = lines_of(lambda console: print_analysis(console, analysis), width)
+    assert max(map(len, lines)) <= width
+    assert not any("…" in line for line in lines)
+    (top,) = [line for line in lines if line.startswith("┏")]
+    (bottom,) = [line for line in lines if line.startswith("└")]
+    assert top.endswith("┓")
+    assert len(top) == len(bottom)
+    headings, *rows = cells(lines)
+    assert rows[-1][:2] == ["second", "-27,427 [-27,427, -27,427]"]
+    assert ("training" in headings) is (width == 200)
+    # One line for each row, but for the long name's.
+    assert sum(line.startswith("│") for line in lines) == 4
 
 
 def test_a_pipe_gets_no_colours_and_a_terminal_the_same_words(analysis):
@@ -251,23 +282,23 @@ def test_bandits_have_a_table_of_their_own(made_up, width):
     _, lines = lines_of(lambda console: print_analysis(console, analysis), width)
     assert lines[1] == "coins"
     # The sums of regret are .6 and .3, and the last pulls .3 and 0; the last rewards 1 and 0.
-    assert cells(lines) == [
-        [
-            "agent",
-            "mean regret",
-            "5% to 95% of runs",
-            "simple regret",
-            "reward",
-            "best arm",
-            "time",
-        ],
-        ["first", "7 [6.9, 7.2]", "0.315 to 0.585", "0.15", "0.5", "50.0%", "10 s"],
-    ]
-    assert below(lines).startswith(
-        "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; simple regret: of "
-        "recommending the arm pulled most; reward, best arm: at the last pulls Undecided: 4 "
-        "seeds decide nothing. first has the lowest mean so far: regret of a run 1 [0.9, 1.2]."
+    headings = ["agent", "mean regret", "5% to 95% of runs", "simple regret", "reward", "best arm"]
+    row = ["first", "7 [6.9, 7.2]", "0.315 to 0.585", "0.15", "0.5", "50.0%", "10 s"]
+    table = [[*headings, "time"], row]
+    regret = "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; "
+    simple = "simple regret: of recommending the arm pulled most; "
+    last = "reward, best arm: at the last pulls"
+    sentence = (
+        " Undecided: 4 seeds decide nothing. first has the lowest mean so far: regret of a run "
+        "1 [0.9, 1.2]."
     )
+    if width == 120:
+        assert cells(lines) == table
+        assert below(lines).startswith(regret + simple + last + sentence)
+    else:
+        assert cells(lines) == [[*row[:3], *row[4:]] for row in table]
+        more = "; a wider terminal shows simple regret too"
+        assert below(lines).startswith(regret + last + more + sentence)
 
 
 # --- blocks of episodes --------------------------------------------------------------------------

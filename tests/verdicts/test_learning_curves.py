@@ -104,11 +104,21 @@ def test_curves_with_unequal_evaluations_compare_on_a_grid():
 def test_a_band_is_the_estimate_at_each_point():
     values = np.random.default_rng(0).normal(size=(6, 3))
     values[0, 1] = NAN
-    band = curve_band(values, "iqm", seed=2)
+    values[:, 2] = 0.1  # equal values keep theirs to the last bit
+    band = curve_band(values, seed=2)
     for place, column in enumerate(values.T):
-        one = estimate(column, "iqm", seed=2, n_resamples=2000)
+        one = estimate(column, "mean", seed=2, n_resamples=2000)
         found = [band.point[place], band.low[place], band.high[place]]
-        assert found == [one.point, one.low, one.high]
+        assert found == pytest.approx([one.point, one.low, one.high], abs=1e-12)
+    assert (band.low[2], band.point[2], band.high[2]) == (0.1, 0.1, 0.1)
+
+
+def test_a_band_has_nothing_where_no_run_has():
+    band = curve_band([[1.0, NAN], [3.0, NAN]], seed=0)
+    assert (band.point[0], np.isnan(band.point[1]), np.isnan(band.low[1])) == (2, True, True)
+    alone = curve_band([[1.0, 2.0]], seed=0)
+    assert alone.point.tolist() == [1, 2]
+    assert np.isnan(alone.low).all()
 
 
 # --- censored steps ------------------------------------------------------------------------------

@@ -1,23 +1,15 @@
-report.section("bandits", (root, data) => {
+report.section("bandits", (root, _, current) => {
   const chosen = (name) => root.querySelector(`input[name="${name}"]:checked`).value;
-  const current = () => data[report.environment];
   const same = (value) => value;
   const redraws = [];
   const redraw = () => redraws.forEach((draw) => draw());
   const isShown = report.legend(root.querySelector(".legend"), redraw);
   const agents = (items) => Object.entries(items).filter(([label]) => isShown(label));
-  const nothing = { traces: [], layout: {} };
 
   // A figure that is there where `has` says so of the environment.
   const figure = (name, has, build) => {
     const element = root.querySelector(`#${name}`);
-    redraws.push(
-      report.figure(element, () => {
-        const isThere = current() !== null && has(current());
-        element.closest("figure").hidden = !isThere;
-        return isThere ? build(current()) : nothing;
-      }),
-    );
+    redraws.push(report.figure(element, () => build(current()), () => current() !== null && has(current())));
   };
 
   const xaxis = (type = chosen("pull-axis")) => ({

@@ -1,6 +1,4 @@
-report.section("comparison", (root, data) => {
-  const chosen = () => data.environments[report.environment];
-
+report.section("comparison", (root, data, chosen) => {
   report.figure(root.querySelector("#intervals"), () => {
     const { intervals: rows, linearUpTo: linear } = chosen();
     const { optimum, blind } = report.page.environments[report.environment];
@@ -20,12 +18,5 @@ report.section("comparison", (root, data) => {
         yaxis,
       },
     };
-  });
-
-  const matrix = root.querySelector("#matrix");
-  report.figure(matrix.querySelector(".plot"), () => {
-    const { agents, improvement } = chosen();
-    matrix.hidden = agents.length < 2;
-    return report.matrix(agents, improvement);
   });
 });

@@ -2,9 +2,14 @@
 
 // What all sections use: their data, the environment that is chosen, the theme, agents' colours.
 const report = (() => {
+  // Data are parsed when they are asked for: a page may hold those of a hundred curves.
+  const known = new Map();
   const read = (name) => {
-    const element = document.getElementById(`data-${name}`);
-    return element === null ? null : JSON.parse(element.textContent);
+    if (!known.has(name)) {
+      const element = document.getElementById(`data-${name}`);
+      known.set(name, element === null ? null : JSON.parse(element.textContent));
+    }
+    return known.get(name);
   };
   const page = read("page");
   const marks = new Map(page.agents.map((mark) => [mark.label, mark]));
@@ -28,10 +33,11 @@ const report = (() => {
     get environment() {
       return environment;
     },
-    // Calls `start` with a section's element and data, if the page has that section.
+    // Calls `start` with a section's element, its data, and what gives those of the environment
+    // that is chosen, if the page has that section.
     section(name, start) {
       const root = document.getElementById(name);
-      if (root !== null) start(root, read(name));
+      if (root !== null) start(root, read(name), () => read(`${name}-${environment}`));
     },
     // Calls `listener` whenever the environment or the theme has changed.
     onChange(listener) {

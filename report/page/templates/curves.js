@@ -1,4 +1,4 @@
-report.section("curves", (root, data) => {
+report.section("curves", (root, _, place) => {
   const TITLES = { step: "environment steps", episode: "episodes", seconds: "wall time (s)" };
   const chosen = (name) => root.querySelector(`input[name="${name}"]:checked`).value;
   const figure = root.querySelector(".plot");
@@ -15,20 +15,14 @@ report.section("curves", (root, data) => {
   };
 
   const build = () => {
-    const isBandit = data[report.environment] === null;
-    [root.querySelector(".controls"), root.querySelector("figure")].forEach((element) => {
-      element.hidden = isBandit;
-    });
-    if (isBandit) return { traces: [], layout: {} };
     const [kind, by, across] = ["kind", "by", "across"].map(chosen);
-    const { linearUpTo: linear, onVariant } = data[report.environment][kind];
+    const { linearUpTo: linear, onVariant } = place()[kind];
     // Nobody is to read returns of a variant against the optimum of the environment itself.
     const judged = report.page.environments[report.environment];
     const environment = onVariant.length ? { ...judged, optimum: null, blind: null } : judged;
-    scale.hidden = linear === null;
     const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
     const height = symlog?.height ?? ((value) => value);
-    const curves = Object.entries(data[report.environment][kind][by]).filter(([label]) => isShown(label));
+    const curves = Object.entries(place()[kind][by]).filter(([label]) => isShown(label));
     const words = symlog ? [`The vertical axis is linear up to ±${report.number(linear)} and logarithmic beyond.`] : [];
     if (onVariant.length) words.push(`Trained on a variant of the environment: ${onVariant.join(", ")}.`);
     detail.textContent = words.join(" ");
@@ -46,6 +40,11 @@ report.section("curves", (root, data) => {
       },
     };
   };
-  redraw = report.figure(figure, build);
+  const isThere = () => {
+    root.querySelector(".controls").hidden = place() === null;
+    scale.hidden = (place()?.[chosen("kind")].linearUpTo ?? null) === null;
+    return place() !== null;
+  };
+  redraw = report.figure(figure, build, isThere);
   root.querySelectorAll(".controls input").forEach((input) => input.addEventListener("change", redraw));
 });

@@ -5,9 +5,16 @@
     displaylogo: false,
     displayModeBar: "hover",
     modeBarButtonsToRemove: [
+      "toImage", // those below have a title and a legend
       "select2d", "lasso2d", "autoScale2d", "zoomIn2d", "zoomOut2d",
       "sendChartToCloud", // a page that needs no network offers none
     ],
+    modeBarButtonsToAdd: ["svg", "png"].map((format) => ({
+      name: format,
+      title: `Save as ${format.toUpperCase()}`,
+      icon: format === "svg" ? Plotly.Icons.disk : Plotly.Icons.camera,
+      click: (plot) => report.savePicture(plot, format),
+    })),
   };
   const narrow = matchMedia("(max-width: 40rem)");
   narrow.addEventListener("change", () => report.changed());
@@ -25,11 +32,26 @@
     spikethickness: 1,
   });
 
-  // Draws what `build` returns, traces and layout, into the element, now and after each change.
-  report.figure = (element, build) => {
+  // Figures are drawn when they come near the window, and not all at once.
+  const figures = new Map();
+  const nearness = new IntersectionObserver(
+    (entries) => entries.forEach((entry) => figures.get(entry.target).come(entry.isIntersecting)),
+    { rootMargin: "50% 0px" },
+  );
+  report.drawAll = () => figures.forEach((figure) => figure.draw());
+
+  // Draws what `build` returns, traces and layout, into the element, and again after each change.
+  // Where there is nothing to draw the figure is hidden. Returns what draws it anew.
+  report.figure = (element, build, isThere = () => true) => {
+    let isNear = false;
+    let isStale = true;
     const draw = () => {
+      if (!isStale) return;
+      isStale = false;
       const { traces, layout } = build();
-      const { xaxis, yaxis, ...rest } = layout;
+      const { xaxis, yaxis, ...rest } = { ...layout, ...report.paper?.(element) };
+      // Plotly takes the element's height when the window changes.
+      element.style.height = rest.height === undefined ? "" : `${rest.height}px`;
       Plotly.react(
         element,
         traces,
@@ -37,7 +59,7 @@
           paper_bgcolor: "rgba(0,0,0,0)",
           plot_bgcolor: "rgba(0,0,0,0)",
           font: { family: getComputedStyle(document.body).fontFamily, size: 13, color: report.css("--ink") },
-          margin: { l: 50, r: 14, t: 38, b: 46 },
+          margin: { l: 50, r: 14, t: 54, b: 46 },
           showlegend: false,
           modebar: { bgcolor: "rgba(0,0,0,0)", color: report.css("--muted"), activecolor: report.css("--accent") },
           hoverlabel: { bgcolor: report.css("--card"), bordercolor: report.css("--line"), font: { color: report.css("--ink") } },
@@ -48,9 +70,20 @@
         CONFIG,
       );
     };
-    report.onChange(draw);
-    draw();
-    return draw;
+    const update = () => {
+      isStale = isThere();
+      element.closest("figure").hidden = !isStale;
+      if (isNear) draw();
+    };
+    const come = (isHere) => {
+      isNear = isHere;
+      if (isNear) draw();
+    };
+    figures.set(element, { draw, come });
+    nearness.observe(element);
+    report.onChange(update);
+    update();
+    return update;
   };
 
   // Plotly reads tags and entities in its texts.
@@ -146,7 +179,12 @@
       for (let size = step * 10; size <= Math.max(Math.abs(low), Math.abs(high)); size *= 10) {
         values.push(size, -size);
       }
-      const shown = values.filter((value) => value >= low && value <= high);
+      // Powers of ten come first: no tick is printed over another.
+      const room = 0.09 * (height(high) - height(low));
+      const order = [0, ...values.slice(3).reverse(), inner, -inner];
+      const shown = order
+        .filter((value) => value >= low && value <= high)
+        .reduce((kept, value) => (kept.every((other) => Math.abs(height(other) - height(value)) >= room) ? [...kept, value] : kept), []);
       return { tickvals: shown.map(height), ticktext: shown.map(report.number) };
     };
     return { height, ticks };
@@ -220,7 +258,7 @@
     });
     return {
       traces,
-      height: 98 + 46 * rows.length,
+      height: 114 + 46 * rows.length,
       yaxis: {
         tickvals: rows.map((_, i) => rows.length - 1 - i),
         ticktext: rows.map((row) => report.tick(row.agent)),
@@ -228,40 +266,6 @@
         fixedrange: true,
         showgrid: false,
         ticks: "",
-      },
-    };
-  };
-
-  // Who beats whom with which probability, as a heat map.
-  report.matrix = (agents, chances) => {
-    const low = report.css("--agent-1");
-    const high = report.css("--agent-0");
-    return {
-      traces: [
-        {
-          type: "heatmap",
-          z: chances,
-          x: agents.map((_, i) => i),
-          y: agents.map((_, i) => i),
-          zmin: 0,
-          zmax: 1,
-          colorscale: [[0, low], [0.5, report.css("--card")], [1, high]],
-          text: chances.map((row) => row.map((chance) => (chance === null ? "" : chance.toFixed(2)))),
-          texttemplate: "%{text}",
-          customdata: agents.map((row) => agents.map((column) => [report.text(row), report.text(column)])),
-          hovertemplate: "%{customdata[0]} beats %{customdata[1]}: %{z:.2f}<extra></extra>",
-          hoverongaps: false,
-          xgap: 2,
-          ygap: 2,
-          showscale: !narrow.matches,
-          colorbar: { thickness: 10, outlinewidth: 0, tickformat: ".1f" },
-        },
-      ],
-      layout: {
-        height: 130 + 46 * agents.length,
-        margin: { l: 50, r: 14, t: 30, b: 20 },
-        xaxis: { side: "top", tickvals: agents.map((_, i) => i), ticktext: agents.map(report.tick), fixedrange: true, showgrid: false, showline: false, ticks: "" },
-        yaxis: { autorange: "reversed", tickvals: agents.map((_, i) => i), ticktext: agents.map(report.tick), fixedrange: true, showgrid: false, showline: false, ticks: "" },
       },
     };
   };

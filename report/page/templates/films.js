@@ -1,5 +1,5 @@
 // Films run where the reader's system does not ask for less motion, and stop when pressed.
-report.section("films", (root) => {
+report.section("films", (root, films) => {
   const still = matchMedia("(prefers-reduced-motion: reduce)");
   const all = root.querySelector(".all-films");
   const shown = () => [...root.querySelectorAll(".films:not([hidden]) .screen")];
@@ -7,7 +7,7 @@ report.section("films", (root) => {
   const play = (screen, isPlaying) => {
     const picture = screen.querySelector("img");
     screen.dataset.still ??= picture.src;
-    picture.src = isPlaying ? screen.dataset.film : screen.dataset.still;
+    picture.src = isPlaying ? films[screen.dataset.film] : screen.dataset.still;
     screen.setAttribute("aria-pressed", String(isPlaying));
   };
   const isPlaying = (screen) => screen.getAttribute("aria-pressed") === "true";

@@ -18,5 +18,4 @@ report.section("overall", (root, data) => {
       yaxis: { title: { text: "share of runs with a higher score" }, range: [0, 1.02], tickformat: ".0%" },
     },
   }));
-  report.figure(root.querySelector("#overall-matrix"), () => report.matrix(data.agents, data.improvement));
 });

@@ -1,5 +1,5 @@
 // Maps of grid worlds: what agents do on each cell, at one moment of their training.
-report.section("policies", (root, data) => {
+report.section("policies", (root, _, chosen) => {
   const SVG = "http://www.w3.org/2000/svg";
   const [boards, readout, output] = [".boards", ".cell", "output"].map((query) => root.querySelector(query));
   const [seed, layer] = [".seed", ".layer"].map((query) => root.querySelector(query));
@@ -10,7 +10,6 @@ report.section("policies", (root, data) => {
   let moments = []; // steps that the slider stops at
   let timer = null;
 
-  const chosen = () => data[report.environment];
   const moment = () => moments[Number(slider.value)];
   const runs = () => chosen().runs.filter((run) => run.seed === Number(seed.lastElementChild.value));
   const nCells = () => chosen().rows.length * chosen().rows[0].length;
@@ -48,7 +47,7 @@ report.section("policies", (root, data) => {
     },
     ...runs().map((run) => ({
       title: run.agent,
-      colour: report.mark(run.agent).colour,
+      mark: report.mark(run.agent),
       value: (state) => run.values[current(run)][state],
       actions: (state) => [Number(run.actions[current(run)][state])],
     })),
@@ -90,7 +89,10 @@ report.section("policies", (root, data) => {
       const best = bestActions(state);
       const actions = map.actions(state);
       const isRight = actions.every((action) => best.includes(action));
-      if (!isRight) group.append(element("rect", { x: -0.46, y: -0.46, width: 0.92, height: 0.92, class: "differs" }));
+      if (!isRight) {
+        group.append(element("rect", { x: -0.46, y: -0.46, width: 0.92, height: 0.92, class: "differs" }));
+        group.append(element("path", { d: "M.5,-.5V-.18L.18,-.5Z", class: "wrong-corner" })); // told apart without colour
+      }
       group.append(...actions.map((action) => arrow(moves[action], isRight)));
       if (letter === "S") group.append(element("circle", { r: 0.42, class: "start" }));
     }
@@ -113,10 +115,11 @@ report.section("policies", (root, data) => {
     const title = document.createElement("h3");
     const name = document.createElement("span");
     name.className = "agent";
-    if (map.colour !== undefined) {
+    if (map.mark !== undefined) {
       const swatch = document.createElement("span");
       swatch.className = "swatch";
-      swatch.dataset.colour = map.colour;
+      swatch.dataset.colour = map.mark.colour;
+      swatch.dataset.shape = map.mark.shape;
       name.append(swatch);
     }
     name.append(map.title);
@@ -124,8 +127,8 @@ report.section("policies", (root, data) => {
     const note = document.createElement("p");
     note.className = "note";
     note.textContent =
-      map.colour === undefined ? "all optimal actions" : `${seen.length - wrong.length} of ${seen.length} cells optimal`;
-    const picture = element("svg", { viewBox: `-.04 -.04 ${width + 0.08} ${height + 0.08}`, role: "img", "aria-label": `${map.title}: ${note.textContent}` });
+      map.mark === undefined ? "all optimal actions" : `${seen.length - wrong.length} of ${seen.length} cells optimal`;
+    const picture = element("svg", { viewBox: `-.04 -.04 ${width + 0.08} ${height + 0.08}`, role: "img", tabindex: 0, "aria-label": `${map.title}: ${note.textContent}` });
     picture.append(...cells.map((cell) => drawCell(map, cell, colours)));
     figure.append(title, picture, note);
     return figure;
@@ -137,6 +140,7 @@ report.section("policies", (root, data) => {
     const text = `after ${moment().toLocaleString("en")} steps`;
     output.textContent = text;
     slider.setAttribute("aria-valuetext", text);
+    root.querySelector(".moment").textContent = `Policies ${text} of the run with seed ${seed.lastElementChild.value}.`;
     root.querySelector(".range").textContent = `${report.number(colours[0])} or less to ${report.number(colours[1])}`;
   };
 
@@ -188,14 +192,41 @@ report.section("policies", (root, data) => {
     timer = setInterval(step, 500);
   });
 
-  boards.addEventListener("pointerover", (event) => {
-    const cell = Number(event.target.closest("[data-cell]")?.dataset.cell ?? NaN);
-    if (Number.isNaN(cell)) return;
+  const tell = (cell) => {
     const state = firstState() + cell;
     const figures = chosen().matters[state] !== "1" ? "no action is taken here" : maps
       .map((map) => `${map.title} ${report.number(map.value(state))} (${map.actions(state).map((action) => word(chosen().moves[action])).join(" or ")})`)
       .join(" · ");
     readout.textContent = `${place(cell)}: ${figures}`;
+  };
+  boards.addEventListener("pointerover", (event) => {
+    const cell = Number(event.target.closest("[data-cell]")?.dataset.cell ?? NaN);
+    if (!Number.isNaN(cell)) tell(cell);
+  });
+  // The arrows go from cell to cell, on all maps at once.
+  let cursor = null;
+  const point = () => {
+    boards.querySelectorAll(".cursor").forEach((old) => old.remove());
+    if (cursor === null) return;
+    boards.querySelectorAll(`[data-cell="${cursor}"]`).forEach((cell) =>
+      cell.append(element("rect", { x: -0.45, y: -0.45, width: 0.9, height: 0.9, class: "cursor" })),
+    );
+    readout.setAttribute("aria-live", "polite");
+    tell(cursor);
+  };
+  boards.addEventListener("keydown", (event) => {
+    const [height, width] = [chosen().rows.length, chosen().rows[0].length];
+    const move = { ArrowUp: [-1, 0], ArrowDown: [1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] }[event.key];
+    if (move === undefined || event.target.closest(".board svg") === null) return;
+    event.preventDefault();
+    const [row, column] = cursor === null ? [0, 0] : [Math.floor(cursor / width) + move[0], (cursor % width) + move[1]];
+    cursor = Math.min(Math.max(row, 0), height - 1) * width + Math.min(Math.max(column, 0), width - 1);
+    point();
+  });
+  boards.addEventListener("focusout", () => {
+    cursor = null;
+    point();
+    readout.textContent = still;
   });
   boards.addEventListener("pointerleave", () => {
     readout.textContent = still;

@@ -6,6 +6,7 @@ const theme = (() => {
   const system = matchMedia("(prefers-color-scheme: dark)");
   let choice = "auto";
   let listener = () => {};
+  let onPaper = false;
   try {
     choice = localStorage.getItem("theme") ?? "auto";
   } catch {
@@ -13,7 +14,7 @@ const theme = (() => {
   }
 
   const apply = () => {
-    const dark = choice === "auto" ? system.matches : choice === "dark";
+    const dark = !onPaper && (choice === "auto" ? system.matches : choice === "dark");
     document.documentElement.dataset.theme = dark ? "dark" : "light";
     listener();
   };
@@ -31,6 +32,11 @@ const theme = (() => {
       } catch {
         // As above.
       }
+      apply();
+    },
+    // Paper is white.
+    forPaper(isPaper) {
+      onPaper = isPaper;
       apply();
     },
     onChange(call) {
