@@ -25,6 +25,7 @@ from report.page import (
 from report.page.markup import (
     inline_script,
     package_file,
+    packed,
     plain,
     script_hash,
     template_file,
@@ -32,10 +33,6 @@ from report.page.markup import (
 )
 from report.page.sections import Report, Section
 from report.series.study_series import StudySeries
-
-# Plotly's build for lines, dots and bars, which is a quarter of all of it; unchanged, as npm's
-# package plotly.js-basic-dist-min 4.1.1 has it.
-PLOTLY = "plotly/plotly-basic.min.js"
 
 STYLES = ("templates/parts.css", "templates/page.css", "templates/paper.css")
 
@@ -92,8 +89,10 @@ def render(report: Report, sections: list[Section]) -> str:
         )
         for section in sections
     }
-    early = template_file("theme.js") or ""
-    scripts = [package_file(PLOTLY), _own_script(sections)]
+    from plotly.offline import get_plotlyjs
+
+    early, start = package_file("templates/theme.js"), package_file("templates/start.js")
+    plotly, own = get_plotlyjs(), _own_script(sections)
     return environment.get_template("page.html").render(
         study=study,
         environments=report.analysis.environments,
@@ -101,9 +100,11 @@ def render(report: Report, sections: list[Section]) -> str:
         bodies=bodies,
         data=_data(report, sections),
         style=Markup("\n".join(package_file(name) for name in STYLES)),  # noqa: S704  # our own
-        scripts=[inline_script(script) for script in scripts],
         early=inline_script(early),
-        policy=" ".join(map(script_hash, [early, *scripts])),
+        plotly=packed(plotly),
+        own=inline_script(own),
+        start=inline_script(start),
+        policy=" ".join(map(script_hash, [early, plotly, own, start])),
     )
 
 

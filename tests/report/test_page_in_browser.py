@@ -102,6 +102,8 @@ def wait(browser, condition):
 
 def plots(browser):
     """How many figures are there, those drawn too that nobody has come near yet."""
+    if browser.execute_script("return typeof report === 'undefined'"):
+        return 0  # the scripts are unpacked after the page is there
     browser.execute_script("report.drawAll()")
     return browser.execute_script("return document.querySelectorAll('.plot .main-svg').length")
 
