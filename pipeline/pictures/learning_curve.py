@@ -101,7 +101,7 @@ def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> Non
         color=GREY,
         markersize=2,
         alpha=0.4,
-        label=f"{what}, each episode" if stride == 1 else f"{what}, every {stride}th episode",
+        label=f"{what}, " + ("each episode" if stride == 1 else f"1 episode in {stride}"),
     )
     if n_averaged > 1:
         label = f"{what}, mean of {n_averaged} episodes"
@@ -139,6 +139,16 @@ def _places(figure: Figure, *, apart: bool) -> tuple[Axes, Axes]:
     lower.set(xlabel="environment steps", ylabel="return there")
     lower.set_title("training, on a variant of the environment", loc="left", fontsize=10)
     return upper, lower
+
+
+def _add_legend(figure: Figure) -> None:
+    """Below, where it covers no episode."""
+    from matplotlib.lines import Line2D
+
+    legend = figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D) and handle.get_color() == GREY:
+            handle.set(markersize=6, alpha=1)  # a dot as small as those drawn is hard to see
 
 
 def draw_learning_curve(
@@ -182,7 +192,6 @@ def draw_learning_curve(
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
-        # Outside, where it covers no episode.
-        figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9, markerscale=3)
+        _add_legend(figure)
     with replacing(run.curve_path) as draft:
         figure.savefig(draft, format="png")

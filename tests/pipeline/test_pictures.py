@@ -199,7 +199,7 @@ def test_the_legend_covers_nothing(run, monkeypatch):
     assert figure.bbox.y0 <= box.y0
 
 
-def axes_drawn(run, monkeypatch, judged=True, **options):
+def axes_drawn(run, monkeypatch, judged=True, n_episodes=50, **options):
     """The axes of the picture, of a run with returns above its optimum, by their titles."""
     from matplotlib.figure import Figure
 
@@ -207,7 +207,7 @@ def axes_drawn(run, monkeypatch, judged=True, **options):
     monkeypatch.setattr(
         Figure, "savefig", lambda figure, draft, **_: (draft.touch(), drawn.append(figure))
     )
-    write_monitor(run.path, 0, [(89.0, 10, i) for i in range(50)])
+    write_monitor(run.path, 0, [(89.0, 10, i) for i in range(n_episodes)])
     if judged:
         write_evaluations(run, [[70.0], [79.0]])
     yardstick = Yardstick(optimum=79, blind=0) if judged else None
@@ -247,6 +247,17 @@ def test_a_variant_without_evaluations_is_called_so(run, monkeypatch):
         "training on a variant, each episode",
         "training on a variant, mean of 50 episodes",
     ]
+
+
+def test_the_mean_is_of_as_many_episodes_as_there_are(run, monkeypatch):
+    axes = axes_drawn(run, monkeypatch, n_episodes=1)[0]
+    assert "training, each episode" in names_in(axes)
+    assert not any("mean of" in name for name in names_in(axes))
+    axes = axes_drawn(run, monkeypatch, n_episodes=200)[0]
+    assert "training, mean of 100 episodes" in names_in(axes)
+    monkeypatch.setattr(learning_curve, "MAX_POINTS", 100)
+    axes = axes_drawn(run, monkeypatch, n_episodes=200)[0]
+    assert "training, 1 episode in 2" in names_in(axes)
 
 
 def scale_of(returns):
