@@ -4,8 +4,8 @@
 
 A Q-learning agent that explores with probability 0.1 is evaluated on Warehouse-v0 and on
 FrozenLake-v1, exactly and by episodes. From the exact variance of an episode's return follows how
-many episodes give a mean whose standard error is 1 % of the range between the best blind policy and
-the optimum. Times are medians, of the process alone (`time.process_time`), everything compiled.
+many episodes give a mean whose standard error is 1 % of the range between the baseline and the
+optimum. Times are medians, of the process alone (`time.process_time`), everything compiled.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from pipeline.train_spec import TrainSpec
 
 EPISODES = 100
 TRAINING_STEPS = 200_000
-# Standard error that is asked for, as a share of the range from blind to optimal.
+# Standard error that is asked for, as a share of the range from baseline to optimal.
 PRECISION = 0.01
 ENVS = ("Warehouse-v0", "FrozenLake-v1")
 
@@ -46,7 +46,7 @@ def seconds(work: Callable[[], object], repeats: int) -> float:
 
 def episodes_needed(std: float, yardstick: Yardstick) -> int:
     """Episodes whose mean return has the standard error that is asked for."""
-    return math.ceil((std / (PRECISION * (yardstick.optimum - yardstick.blind))) ** 2)
+    return math.ceil((std / (PRECISION * (yardstick.optimum - yardstick.baseline))) ** 2)
 
 
 def measure(env_id: str, deterministic: bool) -> dict[str, Any]:

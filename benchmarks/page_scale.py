@@ -32,7 +32,7 @@ from report.series.study_series import study_series
 N_STEPS = 100_000
 N_EVALUATIONS = 20
 N_BLOCKS = 100
-OPTIMUM, BLIND, WORST = 1.0, 0.0, -20.0
+OPTIMUM, BASELINE, WORST = 1.0, 0.0, -20.0
 SETTLING = 3  # seconds
 
 
@@ -98,9 +98,9 @@ def _row(agent: str, environment: str, seed: int, evaluations: pd.DataFrame) -> 
         "success_rate": float(np.clip(final, 0, 1)),
         "exact": True,
         "optimum": OPTIMUM,
-        "best_blind": BLIND,
+        "baseline": BASELINE,
         "gap": OPTIMUM - final,
-        "score": (final - BLIND) / (OPTIMUM - BLIND),
+        "score": (final - BASELINE) / (OPTIMUM - BASELINE),
         "best": float(evaluations["value"].max()),
         "area": float(evaluations["value"].mean()),
         "training": final - 0.1,

@@ -37,7 +37,8 @@ def describe(evaluation: Evaluation) -> str:
     yardstick = evaluation.yardstick
     if yardstick is not None:
         text += (
-            f", optimum {yardstick.optimum:.2f}, best blind policy {yardstick.blind:.2f}, "
+            f", optimum {yardstick.optimum:.2f}"
+            f", best random or constant policy {yardstick.baseline:.2f}, "
             f"score {yardstick.score(evaluation.mean_return):.2f}"
         )
     return text

@@ -45,8 +45,8 @@ class AgentAnalysis:
         n_runs: runs that finished.
         n_missing: runs that did not.
         metric: estimates of what the verdicts are about, over seeds.
-        score: the same of the final policy between the best blind policy (0) and the optimum (1);
-            None where those are not known.
+        score: the same of the final policy between the best random or constant policy (0) and the
+            optimum (1); None where those are not known.
         final: mean return of the final policy.
         area: mean return over the learning curve.
         last_episodes: mean return of the last training episodes.
@@ -86,7 +86,7 @@ class EnvironmentAnalysis:
         environment: its label.
         env_id: its Gymnasium id.
         optimum: the highest expected return that any policy has, or None.
-        best_blind: that of the best policy that ignores what it observes, or None.
+        baseline: that of the best random or constant policy, or None.
         threshold: the return that counts as solved, or None.
         margin: the difference within which agents count as equivalent.
         exact: whether all final returns are expectations rather than means of episodes.
@@ -104,7 +104,7 @@ class EnvironmentAnalysis:
     environment: str
     env_id: str
     optimum: float | None
-    best_blind: float | None
+    baseline: float | None
     threshold: float | None
     margin: float
     exact: bool
@@ -172,13 +172,13 @@ def _analyse_environment(
     agents.sort(key=lambda agent: _rank(sign * agent.metric.mean.point), reverse=True)
     names = [agent.agent for agent in agents]
     scores = {name: evidence.scores[name] for name in names}
-    failed = failures(study.metric, scores, evidence.best_blind, look.level, evidence.certain)
+    failed = failures(study.metric, scores, evidence.baseline, look.level, evidence.certain)
     fewest = evidence.fewest(look.level)
     return EnvironmentAnalysis(
         environment=environment,
         env_id=str(table["env_id"].iloc[0]),
         optimum=evidence.optimum,
-        best_blind=evidence.best_blind,
+        baseline=evidence.baseline,
         threshold=evidence.threshold,
         margin=evidence.margin,
         exact=bool((table["exact"] == True).all()),  # noqa: E712  # None is no False here

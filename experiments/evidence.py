@@ -16,7 +16,7 @@ from experiments.study_spec import COSTS
 from mdp.array_types import Floats
 from verdicts import FEWEST_SEEDS, fewest_seeds
 
-MARGIN = 0.02  # of the way from the best blind policy to the optimum
+MARGIN = 0.02  # of the way from the best random or constant policy to the optimum
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Evidence:
         scores: by agent, the higher the better, shape (n_seeds,): NaN where there is no run.
         seeds: by agent, how many of the seeds it was to have.
         optimum: the highest expected return that any policy has, or None.
-        best_blind: that of the best policy that ignores what it observes, or None.
+        baseline: that of the best random or constant policy, or None.
         threshold: the return that counts as solved, or None.
         margin: the difference within which agents count as equivalent.
         certain: the agents that do not depend on chance.
@@ -38,7 +38,7 @@ class Evidence:
     scores: Mapping[str, Floats]
     seeds: Mapping[str, int]
     optimum: float | None
-    best_blind: float | None
+    baseline: float | None
     threshold: float | None
     margin: float
     certain: frozenset[str]
@@ -63,14 +63,14 @@ def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
         return None
     sign = -1.0 if study.metric in COSTS else 1.0
     values = values_over_seeds(results, environment, study.metric)
-    optimum, blind = _first(table, "optimum"), _first(table, "best_blind")
-    span = 0.0 if optimum is None or blind is None else optimum - blind
+    optimum, baseline = _first(table, "optimum"), _first(table, "baseline")
+    span = 0.0 if optimum is None or baseline is None else optimum - baseline
     return Evidence(
         environment=environment,
         scores={name: sign * each for name, each in values.items()},
         seeds=_seeds(results, environment),
         optimum=optimum,
-        best_blind=blind,
+        baseline=baseline,
         threshold=_first(table, "threshold"),
         margin=MARGIN * span if study.margin is None else study.margin,
         certain=agents_without_chance(results, table),

@@ -22,7 +22,7 @@ class Question:
     Attributes:
         metric: what verdicts are about.
         margin: difference within which agents are equivalent; None for the usual share of the way
-            from the best blind policy to the optimum.
+            from the best random or constant policy to the optimum.
         threshold: return that counts as solved; None for the usual.
         first_seed: the first seed.
     """

@@ -19,7 +19,7 @@ from verdicts import (
     failure_threshold,
 )
 
-# Of the metrics, those on the scale of the best blind policy.
+# Of the metrics, those on the scale of the best random or constant policy.
 ON_THE_SCALE = ("final", "best")
 
 # Where the agents live whose policies do not depend on what they go through.
@@ -41,20 +41,21 @@ def agents_without_chance(results: StudyResults, table: pd.DataFrame) -> frozens
 def failures(
     metric: str,
     scores: Mapping[str, Floats],
-    best_blind: float | None,
+    baseline: float | None,
     level: float,
     certain: Collection[str],
 ) -> dict[str, FailureCount]:
-    """By agent that depends on chance, its runs less than half as far above blind as the best are.
+    """By agent that depends on chance, the runs that get less than half as far as the best do.
 
-    The bounds of all agents hold together. Nothing where the best blind policy is not known.
+    Both counted from the baseline. The bounds of all agents hold together. Nothing where the
+    baseline is not known.
     """
     by_chance = {name: values for name, values in scores.items() if name not in certain}
-    if metric not in ON_THE_SCALE or best_blind is None or not by_chance:
+    if metric not in ON_THE_SCALE or baseline is None or not by_chance:
         return {}
     known = [values[np.isfinite(values)] for values in scores.values()]
     typical = max((float(np.median(values)) for values in known if len(values)), default=np.nan)
-    threshold = failure_threshold(best_blind, typical)
+    threshold = failure_threshold(baseline, typical)
     if np.isnan(threshold):
         return {}
     return {

@@ -22,6 +22,7 @@ from pipeline.file_digests import DamagedFileError
 from pipeline.run_folder import Run
 
 LARGEST_FIGURE = 1e300
+_FORMER_BASELINE = "best_blind"  # what earlier versions called it
 _OPTIONAL = ("cpu_seconds",)  # older versions did not measure it
 _FINAL_FIGURES = (
     "mean_return",
@@ -121,7 +122,9 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
     final = info.get("final")
     if not (final is None or isinstance(final, dict)):
         raise DamagedFileError(run.info_path, "is damaged: final holds no figures")
-    final = final or {}
+    final = dict(final or {})
+    if _FORMER_BASELINE in final:
+        final["baseline"] = final.pop(_FORMER_BASELINE)
     missing = [name for name in required if name not in info]
     if missing:
         raise DamagedFileError(run.info_path, f"is damaged: it lacks {missing[0]}")
@@ -131,7 +134,7 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
     for name, value in (given | figures).items():
         if not (value is None or _is_figure(value)):
             raise DamagedFileError(run.info_path, f"is damaged: {name} is no figure")
-    yardstick = [final[name] for name in ("optimum", "best_blind") if name in final]
+    yardstick = [final[name] for name in ("optimum", "baseline") if name in final]
     if len(yardstick) == 1 or not all(_is_figure(value) for value in yardstick):
         raise DamagedFileError(run.info_path, "is damaged: it lacks the optimum's figures")
     _check_texts(run, info)

@@ -100,9 +100,9 @@ RUN_COLUMNS = (
     "success_rate",
     "exact",  # whether these are expectations rather than means of episodes
     "optimum",
-    "best_blind",
+    "baseline",
     "gap",  # optimum minus final
-    "score",  # final, with 0 at the best blind policy and 1 at the optimum
+    "score",  # final, with 0 at the best random or constant policy and 1 at the optimum
     "best",  # highest return of an evaluation during training
     "best_timesteps",
     "area",  # mean return over the learning curve
@@ -136,7 +136,7 @@ CURVE_COLUMNS = (
 )
 
 # Columns that have the same name in ``run.json``.
-_FIGURES = ("success_rate", "exact", "optimum", "best_blind", "gap", "score")
+_FIGURES = ("success_rate", "exact", "optimum", "baseline", "gap", "score")
 
 
 def read_results(
@@ -241,8 +241,8 @@ def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float 
     if study.threshold is not None:
         return study.threshold
     if "optimum" in final:
-        optimum, blind = float(final["optimum"]), float(final["best_blind"])
-        return blind + 0.95 * (optimum - blind)
+        optimum, baseline = float(final["optimum"]), float(final["baseline"])
+        return baseline + 0.95 * (optimum - baseline)
     registered = gym.spec(env_id.rpartition(":")[2]).reward_threshold
     return None if registered is None else float(registered)
 

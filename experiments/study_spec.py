@@ -124,7 +124,7 @@ class StudySpec:
         eval_episodes: episodes of each evaluation that has to be sampled.
         metric: what the verdicts are about.
         margin: difference of the metric within which two agents count as equivalent; None for 2 %
-            of the way from the best blind policy to the optimum, where that is known.
+            of the way from the best random or constant policy to the optimum, where that is known.
         threshold: return that counts as solved; None for 95 % of that way, or else what the
             environment has registered.
         episodes_table: episodes in each row of the table of training returns; 0 for no table.

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mdp.optimal_policies import Plan, policy_iteration, value_iteration
     from mdp.policy_evaluation import (
         PolicyReturn,
-        best_blind_return,
-        blind_policies,
+        baseline_policies,
+        baseline_return,
         policy_return,
         state_visitation,
     )
@@ -28,8 +28,8 @@ __all__ = [
     "Plan",
     "PolicyReturn",
     "TransitionModel",
-    "best_blind_return",
-    "blind_policies",
+    "baseline_policies",
+    "baseline_return",
     "finite_horizon_optimum",
     "optimal_choices",
     "policy_iteration",
@@ -46,8 +46,8 @@ _HOMES = {
     "policy_iteration": "mdp.optimal_policies",
     "value_iteration": "mdp.optimal_policies",
     "PolicyReturn": "mdp.policy_evaluation",
-    "best_blind_return": "mdp.policy_evaluation",
-    "blind_policies": "mdp.policy_evaluation",
+    "baseline_return": "mdp.policy_evaluation",
+    "baseline_policies": "mdp.policy_evaluation",
     "policy_return": "mdp.policy_evaluation",
     "state_visitation": "mdp.policy_evaluation",
     "optimal_choices": "mdp.valuation",

@@ -105,8 +105,8 @@ def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None
     return visits
 
 
-def blind_policies(model: TransitionModel) -> list[Floats]:
-    """The policies that ignore the observation: uniformly random first, then each constant action.
+def baseline_policies(model: TransitionModel) -> list[Floats]:
+    """The policies of agents that have learnt nothing: random first, then each constant action.
 
     Returns:
         Policy matrices of shape (S, A), 1 + A of them.
@@ -116,16 +116,16 @@ def blind_policies(model: TransitionModel) -> list[Floats]:
     return [np.broadcast_to(row, shape) for row in (uniform, *np.eye(model.n_actions))]
 
 
-def best_blind_return(model: TransitionModel, horizon: int, discount: float = 1.0) -> float:
-    """The largest expected return of a policy that ignores the observation.
+def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0) -> float:
+    """The largest expected return of uniformly random actions and of each constant action.
 
-    This is what an agent is worth that has learnt nothing about where it is. Random actions
-    alone would be too low a mark: wherever mistakes cost more than time, standing still beats
-    them by far.
+    Random actions alone would be too low a mark: wherever mistakes cost more than time, standing
+    still beats them by far. (Not the best that ignores the observation: a fixed list of actions
+    does too, and may be optimal where nothing is random.)
     """
     return max(
         policy_return(model, policy, horizon, discount).expected_return
-        for policy in blind_policies(model)
+        for policy in baseline_policies(model)
     )
 
 

@@ -71,9 +71,9 @@ def _lead(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
         yield f"No run has a figure for the {words}."
     elif none_has_learnt(study, environment):
         yield (
-            "None of the agents has learnt: no typical run is better than the best blind "
-            f"policy's {number(environment.best_blind)}; the {_extreme(study)} mean {words} is "
-            f"{interval(top.metric.mean)}, of {enumeration(_equal_to(top, environment))}."
+            "None of the agents has learnt: no typical run is better than the best random or "
+            f"constant policy's {number(environment.baseline)}; the {_extreme(study)} mean {words} "
+            f"is {interval(top.metric.mean)}, of {enumeration(_equal_to(top, environment))}."
         )
     else:
         yield from _standing(study, environment)
@@ -168,10 +168,15 @@ def _where_the_median_differs(study: StudySpec, environment: EnvironmentAnalysis
 
 def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
     """Whether the typical run of every agent is no better than acting at random."""
-    blind, optimum = environment.best_blind, environment.optimum
-    if study.metric not in ON_THE_SCALE or blind is None or optimum is None or optimum <= blind:
+    baseline, optimum = environment.baseline, environment.optimum
+    if (
+        study.metric not in ON_THE_SCALE
+        or baseline is None
+        or optimum is None
+        or optimum <= baseline
+    ):
         return False
-    reach = blind + environment.margin
+    reach = baseline + environment.margin
     return all(agent.metric.median.point <= reach for agent in environment.agents)
 
 

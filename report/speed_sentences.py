@@ -70,9 +70,11 @@ def _on_arrival(agent: AgentAnalysis) -> str:
 
 
 def _goal(environment: EnvironmentAnalysis) -> str:
-    threshold, optimum, blind = environment.threshold, environment.optimum, environment.best_blind
-    if threshold is not None and optimum is not None and blind is not None:
-        share = (threshold - blind) / (optimum - blind) if optimum > blind else float("nan")
+    threshold, optimum, baseline = environment.threshold, environment.optimum, environment.baseline
+    if threshold is not None and optimum is not None and baseline is not None:
+        share = (
+            (threshold - baseline) / (optimum - baseline) if optimum > baseline else float("nan")
+        )
         if math.isclose(share, 0.95):
             return "a score of 0.95"
     return f"a return of {number(threshold)}"

@@ -141,7 +141,7 @@ def _title(environment: EnvironmentAnalysis) -> str:
     title = escape(environment.environment)
     if environment.optimum is not None:
         title += f": optimum {number(environment.optimum)}"
-        title += f", best blind policy {number(environment.best_blind)}"
+        title += f", best random or constant policy {number(environment.baseline)}"
     return title
 
 

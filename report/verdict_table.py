@@ -60,10 +60,7 @@ def headline(analysis: StudyAnalysis) -> str:
 def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
     agents = [agent for environment in analysis.environments for agent in environment.agents]
     if all(_has_score(study, agent) for agent in agents):
-        what = (
-            "Score of the median run: 1 is the optimum, 0 the best policy that ignores what it "
-            "observes."
-        )
+        what = "Score of the median run: 1 is the optimum, 0 the best random or constant policy."
     else:
         what = f"{METRIC_WORDS[study.metric].capitalize()}: the median run."
     extreme = "lowest" if study.metric in COSTS else "highest"

@@ -28,17 +28,17 @@ class FailureCount:
     most: float
 
 
-def failure_threshold(blind: float, typical: float) -> float:
-    """The score below which a run failed: half-way from the best blind policy to ``typical``.
+def failure_threshold(baseline: float, typical: float) -> float:
+    """The score below which a run failed: half-way from the baseline to ``typical``.
 
     Args:
-        blind: the best score of a policy that ignores what it observes.
+        baseline: the score of the best random or constant policy.
         typical: the median score of the agent that has the highest.
 
     Returns:
-        The threshold; NaN where no agent is better than blind, so that nothing sets failures apart.
+        The threshold; NaN where no agent is better than that, so that nothing sets failures apart.
     """
-    return (blind + typical) / 2 if typical > blind else float("nan")
+    return (baseline + typical) / 2 if typical > baseline else float("nan")
 
 
 def count_failures(scores: ArrayLike, threshold: float, level: float = 0.05) -> FailureCount:

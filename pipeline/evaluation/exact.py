@@ -29,7 +29,7 @@ from envs.known_models import (
 from envs.layout import GridLayout, grid_layout
 from mdp import (
     TransitionModel,
-    best_blind_return,
+    baseline_return,
     finite_horizon_optimum,
     optimal_choices,
     policy_return,
@@ -54,7 +54,7 @@ class ExactEvaluator:
         observations: what an agent observes in each state, states along the first axis.
         horizon: the time limit.
         success: the outcomes that count as success, shape (S, A, K), or None.
-        yardstick: the best possible and the best blind return.
+        yardstick: the best possible and the baseline's return.
         layout: where the states lie on a map, for grid worlds.
         masks: what may be done in each state, bool of shape (S, A), or None where that is not
             known; for agents that are told.
@@ -118,7 +118,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         layout = None  # a grid world of somebody's own has states that are no cells
     yardstick = Yardstick(
         optimum=float(finite_horizon_optimum(model, horizon).start_value),
-        blind=float(best_blind_return(model, horizon)),
+        baseline=float(baseline_return(model, horizon)),
     )
     return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks)
 

@@ -25,22 +25,21 @@ class Yardstick:
 
     Attributes:
         optimum: the highest expected return that any policy has under the time limit.
-        blind: the highest that a policy has which ignores what it observes: the better of
-            uniformly random actions and every constant action.
+        baseline: the highest of uniformly random actions and of each constant action.
     """
 
     optimum: float
-    blind: float
+    baseline: float
 
     def gap(self, expected_return: float) -> float:
         """How far a return stays behind the optimum."""
         return self.optimum - expected_return
 
     def score(self, expected_return: float) -> float:
-        """The return on a scale where 1 is the optimum and 0 the best blind policy."""
-        if self.optimum == self.blind:
+        """The return on a scale where 1 is the optimum and 0 the best random or constant policy."""
+        if self.optimum == self.baseline:
             return 1.0 if expected_return >= self.optimum else 0.0
-        return (expected_return - self.blind) / (self.optimum - self.blind)
+        return (expected_return - self.baseline) / (self.optimum - self.baseline)
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ class Evaluation:
         if self.yardstick is not None:
             figures |= {
                 "optimum": self.yardstick.optimum,
-                "best_blind": self.yardstick.blind,
+                "baseline": self.yardstick.baseline,
                 "gap": self.yardstick.gap(self.mean_return),
                 "score": self.yardstick.score(self.mean_return),
             }

@@ -123,7 +123,10 @@ def _draw_evaluations(axes: Axes, steps: Floats, means: Floats) -> None:
 
 
 def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
-    lines = (("optimum", yardstick.optimum, "-"), ("best blind policy", yardstick.blind, ":"))
+    lines = (
+        ("optimum", yardstick.optimum, "-"),
+        ("best random or constant policy", yardstick.baseline, ":"),
+    )
     for label, height, style in lines:
         axes.axhline(height, color=GREEN, linestyle=style, linewidth=1.2, label=label, zorder=1)
 

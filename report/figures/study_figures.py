@@ -78,7 +78,7 @@ def _draw_curve(axes: Axes, curve: Curve, mark: Mark, alpha: float = 0.2) -> Non
 def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
     for label, height, style in (
         ("optimum", environment.optimum, "-"),
-        ("best blind policy", environment.best_blind, ":"),
+        ("best random or constant policy", environment.baseline, ":"),
     ):
         if height is not None:
             axes.axhline(

@@ -123,7 +123,7 @@ def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
             {
                 "label": environment.environment,
                 "optimum": environment.optimum,
-                "blind": environment.best_blind,
+                "baseline": environment.baseline,
                 "agents": [agent.agent for agent in environment.agents],
             }
             for environment in report.analysis.environments

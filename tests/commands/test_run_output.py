@@ -52,7 +52,7 @@ EXACT = Evaluation(
     np.array([9.0]),
     successes=np.array([0.875]),
     exact_std=1.0,
-    yardstick=Yardstick(optimum=80.0, blind=-20.0),
+    yardstick=Yardstick(optimum=80.0, baseline=-20.0),
 )
 
 
@@ -91,7 +91,8 @@ def printed(outcome, spec):
 def test_evaluations_in_words():
     assert describe(SAMPLED) == "return 2.00 ± 1.00 over 2 episodes"
     assert describe(EXACT) == (
-        "return 70.00 (exact), success 87.5%, optimum 80.00, best blind policy -20.00, score 0.90"
+        "return 70.00 (exact), success 87.5%, optimum 80.00, "
+        "best random or constant policy -20.00, score 0.90"
     )
 
 

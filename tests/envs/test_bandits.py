@@ -18,7 +18,7 @@ from envs.bandits import Bandit, BernoulliBandit, GaussianBandit, LinearBandit, 
 from envs.bandits.clicks import ClickBandit
 from envs.known_models import observations_of_states, success_outcomes, time_limit, transition_model
 from envs.wrappers import ScaleReward
-from mdp import best_blind_return, finite_horizon_optimum, policy_return
+from mdp import baseline_return, finite_horizon_optimum, policy_return
 
 SIMPLE_IDS = ["BernoulliBandit-v0", "GaussianBandit-v0", "LinearBandit-v0", "SegmentBandit-v0"]
 every_id = pytest.mark.parametrize("env_id", SIMPLE_IDS)
@@ -304,7 +304,7 @@ def test_what_a_pooled_test_loses_is_exact() -> None:
     model, horizon = transition_model(env), time_limit(env)
     assert model is not None
     assert horizon is not None
-    assert best_blind_return(model, horizon) / horizon == pytest.approx(0.117, abs=1e-12)
+    assert baseline_return(model, horizon) / horizon == pytest.approx(0.117, abs=1e-12)
     assert finite_horizon_optimum(model, horizon).start_value / horizon == pytest.approx(
         0.159, abs=1e-12
     )

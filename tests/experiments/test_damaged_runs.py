@@ -130,7 +130,7 @@ def test_a_record_that_says_nothing_is_damage_and_no_other_run(copied, record):
         {"final": 3},
         {"final": {"mean_return": "much"}},
         {"final": {"mean_return": 1.0, "optimum": 2.0}},
-        {"final": {"optimum": None, "best_blind": 1.0}},
+        {"final": {"optimum": None, "baseline": 1.0}},
         {"seconds": "long"},
         {"cpu_seconds": "long"},
         {"n_timesteps": [1]},

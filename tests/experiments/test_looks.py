@@ -52,7 +52,7 @@ def results_of(study, root, ends=ENDS, counts=None):
             "area": float(ends[run.agent][run.seed]),
             "exact": True,
             "optimum": 100.0,
-            "best_blind": 0.0,
+            "baseline": 0.0,
         }
         for run in planned
         if ends[run.agent][run.seed] is not None

@@ -26,7 +26,7 @@ from report.series.study_series import study_series
 from report.terminal_tables import print_analysis, print_episodes_table
 from report.wording import enumeration, interval, number
 
-OPTIMUM, BLIND = 100.0, 0.0
+OPTIMUM, BASELINE = 100.0, 0.0
 ENVIRONMENT = EnvironmentSpec("Warehouse-v0", "Warehouse-v0", {"n_timesteps": 100})
 UNKNOWN = EnvironmentSpec("CartPole-v1", "CartPole-v1", {"n_timesteps": 100})
 
@@ -51,7 +51,7 @@ def write_run(planned, evaluations, episodes=((10, 1.0),) * 10, known=True, **in
         final = {"mean_return": values[-1], "std_return": 0.0, "mean_length": 10.0}
         final |= {"success_rate": 1.0, "exact": known}
         if known:
-            final |= {"optimum": OPTIMUM, "best_blind": BLIND}
+            final |= {"optimum": OPTIMUM, "baseline": BASELINE}
             final |= {"gap": OPTIMUM - values[-1], "score": values[-1] / OPTIMUM}
     record = {
         "state": FINISHED,
@@ -98,7 +98,7 @@ def test_a_row_for_each_run(tmp_path):
     assert (row["agent"], row["environment"], row["seed"]) == ("qlearning", "Warehouse-v0", 0)
     assert (row["algo"], row["env_id"]) == ("qlearning", "Warehouse-v0")
     assert (row["final"], row["gap"], row["score"]) == (90.0, 10.0, 0.9)
-    assert (row["optimum"], row["best_blind"], row["best"]) == (OPTIMUM, BLIND, 96.0)
+    assert (row["optimum"], row["baseline"], row["best"]) == (OPTIMUM, BASELINE, 96.0)
     # 0.95 of the way from 0 to 100, reached at the second evaluation; 6 episodes were over then.
     assert (row["threshold"], row["steps_to_threshold"]) == (95.0, 60.0)
     assert row["episodes_to_threshold"] == 5
@@ -125,7 +125,7 @@ def test_the_columns_of_the_files_that_others_read():
         "success_rate",
         "exact",
         "optimum",
-        "best_blind",
+        "baseline",
         "gap",
         "score",
         "best",
@@ -203,7 +203,7 @@ def test_ranks_estimates_and_pairs(tmp_path):
     results = results_of(study_of(n_seeds=5), tmp_path, finals)
     (environment,) = analyse(results).environments
     assert [agent.agent for agent in environment.agents] == ["sarsa", "qlearning"]
-    assert (environment.optimum, environment.best_blind, environment.exact) == (100, 0, True)
+    assert (environment.optimum, environment.baseline, environment.exact) == (100, 0, True)
     assert environment.margin == pytest.approx(2.0)
     best = environment.agents[0]
     assert best.metric.mean.point == pytest.approx(91.0)
@@ -262,8 +262,8 @@ VERDICTS = {
     "none has learnt": (
         {"qlearning": [0, 0, 0, 1], "sarsa": [0, -5, 0, 90]},
         (
-            "None of the agents has learnt: no typical run is better than the best blind policy's "
-            "0; the highest mean return of the final policy is 21.25 ["
+            "None of the agents has learnt: no typical run is better than the best random or "
+            "constant policy's 0; the highest mean return of the final policy is 21.25 ["
         ),
     ),
     "undecided": (
@@ -508,7 +508,12 @@ def test_figures_as_png_and_svg_whose_text_is_text(tmp_path):
         texts = re.findall(r"<text [^>]*>([^<]*)</text>", path.read_text())
         assert "qlearning" in " ".join(texts)
         if "curves" in path.name:
-            assert {"optimum", "best blind policy", "environment steps", "return"} <= set(texts)
+            assert {
+                "optimum",
+                "best random or constant policy",
+                "environment steps",
+                "return",
+            } <= set(texts)
 
 
 def test_labels_with_brackets_stay_as_they_are(tmp_path):

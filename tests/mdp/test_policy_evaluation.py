@@ -9,8 +9,8 @@ import pytest
 from envs.known_models import success_outcomes, transition_model
 from mdp import (
     TransitionModel,
-    best_blind_return,
-    blind_policies,
+    baseline_policies,
+    baseline_return,
     policy_return,
     state_visitation,
     value_iteration,
@@ -85,16 +85,16 @@ def test_different_starts_add_to_the_variance() -> None:
 )
 def test_random_moves_in_the_warehouse(shelf_reward: float, expected: float) -> None:
     model = model_of("Warehouse-v0", shelf_reward=shelf_reward)
-    uniform, *constant = blind_policies(model)
+    uniform, *constant = baseline_policies(model)
     assert policy_return(model, uniform, 1000).expected_return == pytest.approx(expected, abs=0.5)
     returns = [policy_return(model, policy, 1000).expected_return for policy in constant]
     assert returns[1:] == [-1000, -1000, -1000]
-    assert best_blind_return(model, 1000) == pytest.approx(max(-1000, expected), abs=0.5)
+    assert baseline_return(model, 1000) == pytest.approx(max(-1000, expected), abs=0.5)
 
 
-def test_the_blind_policies_are_distributions_over_actions_alone() -> None:
+def test_the_baseline_policies_are_distributions_over_actions_alone() -> None:
     model = coin(0.5)
-    assert [policy.tolist() for policy in blind_policies(model)] == [
+    assert [policy.tolist() for policy in baseline_policies(model)] == [
         [[0.5, 0.5]],
         [[1.0, 0.0]],
         [[0.0, 1.0]],
@@ -131,7 +131,7 @@ def test_the_frozen_lake_without_time_limit() -> None:
 
 def test_large_chains_are_solved_as_small_ones_are(monkeypatch: pytest.MonkeyPatch) -> None:
     model = model_of("FrozenLake-v1", map_name="8x8")
-    uniform = blind_policies(model)[0]
+    uniform = baseline_policies(model)[0]
     dense = policy_return(model, uniform, None, success=model.terminated)
     dense_visits = state_visitation(model, uniform, None)
     monkeypatch.setattr("mdp.chain.LARGEST_DENSE", 0)

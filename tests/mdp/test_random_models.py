@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 
 from mdp import (
     TransitionModel,
-    best_blind_return,
+    baseline_return,
     finite_horizon_optimum,
     policy_iteration,
     policy_return,
@@ -269,7 +269,7 @@ def test_nothing_beats_the_optimum_under_a_time_limit(
     found = finite_horizon_optimum(model, horizon, discount)
     earned = policy_return(model, found.policy, horizon, discount).expected_return
     assert earned == pytest.approx(found.start_value, abs=1e-12)
-    assert best_blind_return(model, horizon, discount) <= found.start_value + 1e-12
+    assert baseline_return(model, horizon, discount) <= found.start_value + 1e-12
     greedy = value_iteration(model, 0.9).policy
     assert policy_return(model, greedy, horizon, discount).expected_return <= earned + 1e-12
 

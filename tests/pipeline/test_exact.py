@@ -202,10 +202,10 @@ def test_what_an_unknown_agent_samples_from_is_not_guessed():
 
 
 @pytest.mark.parametrize(
-    ("env", "optimum", "blind"),
+    ("env", "optimum", "baseline"),
     [("Warehouse-v0", 79.0, -1000.0), ("MineMaze-v0", 91.0, None), ("FrozenLake-v1", 0.7442, None)],
 )
-def test_the_best_policy_scores_1_and_the_best_blind_one_0(env, optimum, blind):
+def test_the_best_policy_scores_1_and_the_baseline_one_0(env, optimum, baseline):
     evaluator = exact_evaluator(spec_of(env))
     n_states, n_actions = evaluator.model.prob.shape[:2]
     best = Lookup(value_iteration(evaluator.model, 1.0).policy, lambda state: state)
@@ -221,16 +221,16 @@ def test_the_best_policy_scores_1_and_the_best_blind_one_0(env, optimum, blind):
     ]
     scores = [evaluator.yardstick.score(value) for value in returns]
     assert max(scores) == pytest.approx(0, abs=1e-12)
-    if blind is not None:
-        assert max(returns) == blind
+    if baseline is not None:
+        assert max(returns) == baseline
 
 
 def test_figures_of_the_yardstick():
-    yardstick = Yardstick(optimum=79.0, blind=-1000.0)
+    yardstick = Yardstick(optimum=79.0, baseline=-1000.0)
     assert yardstick.gap(70.0) == 9.0
     assert yardstick.score(79.0) == 1.0
     assert yardstick.score(-1000.0) == 0.0
     assert yardstick.score(-460.5) == 0.5
     assert yardstick.score(-2079.0) == -1.0
-    flat = Yardstick(optimum=5.0, blind=5.0)
+    flat = Yardstick(optimum=5.0, baseline=5.0)
     assert (flat.score(5.0), flat.score(4.0)) == (1.0, 0.0)

@@ -187,12 +187,12 @@ def test_the_legend_covers_nothing(run, monkeypatch):
     write_evaluations(run, [[1.0], [2.0]])
     with pytest.raises(FileNotFoundError):
         # The picture was not written.
-        draw_learning_curve(run, "title", yardstick=Yardstick(optimum=50, blind=0))
+        draw_learning_curve(run, "title", yardstick=Yardstick(optimum=50, baseline=0))
     (figure,) = drawn
     figure.draw_without_rendering()
     (legend,) = figure.legends
     texts = [text.get_text() for text in legend.get_texts()]
-    assert texts[3:] == ["optimum", "best blind policy"]
+    assert texts[3:] == ["optimum", "best random or constant policy"]
     box, (axes,) = legend.get_window_extent(), figure.axes
     assert not box.overlaps(axes.get_tightbbox())
     assert figure.bbox.x0 <= box.x0 <= box.x1 <= figure.bbox.x1
@@ -210,7 +210,7 @@ def axes_drawn(run, monkeypatch, judged=True, n_episodes=50, **options):
     write_monitor(run.path, 0, [(89.0, 10, i) for i in range(n_episodes)])
     if judged:
         write_evaluations(run, [[70.0], [79.0]])
-    yardstick = Yardstick(optimum=79, blind=0) if judged else None
+    yardstick = Yardstick(optimum=79, baseline=0) if judged else None
     draw_learning_curve(run, "title", yardstick=yardstick, **options)
     return drawn[0].axes
 
@@ -221,7 +221,11 @@ def names_in(axes):
 
 def test_training_on_a_variant_is_drawn_apart(run, monkeypatch):
     upper, lower = axes_drawn(run, monkeypatch, on_variant=True)
-    assert names_in(upper) == ["evaluation, mean return", "optimum", "best blind policy"]
+    assert names_in(upper) == [
+        "evaluation, mean return",
+        "optimum",
+        "best random or constant policy",
+    ]
     assert names_in(lower) == ["training, each episode", "training, mean of 50 episodes"]
     assert lower.get_title(loc="left") == "training, on a variant of the environment"
     assert upper.get_title(loc="left") == "title"
@@ -237,7 +241,7 @@ def test_training_on_the_environment_itself_is_drawn_with_the_evaluations(run, m
         "training, mean of 50 episodes",
         "evaluation, mean return",
         "optimum",
-        "best blind policy",
+        "best random or constant policy",
     ]
 
 

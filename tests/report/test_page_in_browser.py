@@ -190,7 +190,7 @@ def test_the_toggles_change_the_curves(page):
     before = figure(page, "#curves .plot")
     assert before["xTitle"] == "environment steps"
     assert before["yTitle"] == "return of evaluations"
-    assert before["shapes"] == 2  # the optimum and the best blind policy
+    assert before["shapes"] == 2  # the optimum and the best random or constant policy
     choose(page, "by", "episode")
     by_episode = figure(page, "#curves .plot")
     assert by_episode["xTitle"] == "episodes"

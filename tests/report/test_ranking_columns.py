@@ -97,7 +97,7 @@ def test_what_applies_to_no_agent_has_no_column(ranking, made_up):
         steps_to_stay=None,
         episodes_to_stay=None,
     )
-    headings, _ = ranking([agent], optimum=None, best_blind=None, threshold=None)
+    headings, _ = ranking([agent], optimum=None, baseline=None, threshold=None)
     titles = [heading["title"] for heading in headings]
     assert titles == ["Mean", "IQM", "Median", "Training", "Runs"]
 

@@ -80,7 +80,11 @@ def curves_drawn(axes, drawn, made_up):
 
 def test_evaluations_by_step_on_the_left_and_training_by_episode_on_the_right(curves_drawn):
     left, right = curves_drawn()
-    assert left.names == right.names == ["first", "second", "optimum", "best blind policy"]
+    assert (
+        left.names
+        == right.names
+        == ["first", "second", "optimum", "best random or constant policy"]
+    )
     assert (left.line("first")["x"], left.line("first")["y"]) == ([10, 20, 30], [5, 50, 90])
     assert (left.line("second")["x"], left.line("second")["y"]) == ([10, 20], [4, 40])
     assert (right.line("first")["x"], right.line("first")["y"]) == ([1, 2, 3], [7, 8, 9])
@@ -94,7 +98,7 @@ def test_no_optimum_stands_beside_training_on_a_variant(curves_drawn, on_variant
     left, right = curves_drawn(on_variant=on_variant)
     assert right.names == ["first", "second"]
     assert right.title == f"training episodes ({words}: on a variant of the environment)"
-    assert left.names == ["first", "second", "optimum", "best blind policy"]
+    assert left.names == ["first", "second", "optimum", "best random or constant policy"]
     assert left.title == "lake: evaluations"
 
 
@@ -115,11 +119,14 @@ def test_a_curve_of_one_point_is_a_dot(curves_drawn):
     assert {line["marker"] for line in left.lines if line["label"] in MARKS} == {""}
 
 
-def test_the_optimum_and_the_best_blind_policy_are_lines_across(curves_drawn):
+def test_the_optimum_and_the_baseline_policy_are_lines_across(curves_drawn):
     for place in curves_drawn():
         assert place.line("optimum")["y"] == [100, 100]
-        assert place.line("best blind policy")["y"] == [20, 20]
-        assert (place.line("optimum")["style"], place.line("best blind policy")["style"]) == (
+        assert place.line("best random or constant policy")["y"] == [20, 20]
+        assert (
+            place.line("optimum")["style"],
+            place.line("best random or constant policy")["style"],
+        ) == (
             "-",
             ":",
         )
@@ -127,7 +134,7 @@ def test_the_optimum_and_the_best_blind_policy_are_lines_across(curves_drawn):
 
 
 def test_where_the_optimum_is_not_known_no_line_stands_for_it(curves_drawn):
-    left, right = curves_drawn(optimum=None, best_blind=None)
+    left, right = curves_drawn(optimum=None, baseline=None)
     assert left.names == right.names == ["first", "second"]
     assert left.shared_legend == ["first", "second"]
 
@@ -138,7 +145,7 @@ def test_words_around_the_curves(curves_drawn):
     assert right.title == "training episodes"
     assert left.labels == ("environment steps", "return")
     assert right.labels == ("episodes", "return")
-    assert left.shared_legend == ["first", "second", "optimum", "best blind policy"]
+    assert left.shared_legend == ["first", "second", "optimum", "best random or constant policy"]
     assert left.axes.xaxis.get_major_formatter()(20_000) == "20k"
 
 

@@ -121,7 +121,7 @@ def test_a_title_a_table_a_caption_and_sentences(analysis, width, is_terminal):
     _, lines = lines_of(
         lambda console: print_analysis(console, analysis), width, force_terminal=is_terminal
     )
-    assert lines[:2] == ["", "lake: optimum 100, best blind policy 20"]
+    assert lines[:2] == ["", "lake: optimum 100, best random or constant policy 20"]
     origin = "Seeds 0 to 3: nothing was tuned on these."
     if width == 120:
         assert cells(lines) == [HEADINGS, *ROWS]
@@ -246,7 +246,7 @@ def test_an_agent_without_a_figure_has_a_dash(made_up):
 
 def test_what_applies_to_no_agent_has_no_column_and_no_explanation(made_up):
     agent = made_up.agent("alone", 1.0, score=None, steps_to_stay=None, episodes_to_stay=None)
-    place = made_up.environment([agent], optimum=None, best_blind=None, threshold=None)
+    place = made_up.environment([agent], optimum=None, baseline=None, threshold=None)
     _, lines = lines_of(
         lambda console: print_analysis(console, made_up.analysis([place], ["alone"]))
     )

@@ -58,8 +58,8 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost(made_up, pl
         "| `first` | **1.800** (40 s) |",
     ]
     assert legend == (
-        "Score of the median run: 1 is the optimum, 0 the best policy that ignores what it "
-        "observes. Bold: the highest, and what is shown to be equivalent to it in the typical run. "
+        "Score of the median run: 1 is the optimum, 0 the best random or constant policy. Bold: "
+        "the highest, and what is shown to be equivalent to it in the typical run. "
         "?: not told apart from it by 4 seeds. Plain: shown to be worse. In brackets: processor "
         "time of the median run."
     )
@@ -83,7 +83,7 @@ def test_an_agent_without_a_run_has_a_dash_and_missing_runs_are_counted(made_up,
 
 def test_nobody_leads_where_none_has_learnt_or_there_is_no_figure(made_up, place):
     study = made_up.study(NAMES)
-    assert standings(study, replace(place, best_blind=95.0)) == {}
+    assert standings(study, replace(place, baseline=95.0)) == {}
     assert standings(study, made_up.environment([made_up.agent("first", math.nan)])) == {}
     assert set(standings(study, place)) == set(NAMES)
 

@@ -233,7 +233,7 @@ def test_intervals_over_environments_cover():
 
 def test_scores_are_those_of_the_yardstick():
     returns = np.array([[79.0, -1000.0], [-460.5, 80.0]])
-    yardstick = Yardstick(optimum=79.0, blind=-1000.0)
+    yardstick = Yardstick(optimum=79.0, baseline=-1000.0)
     scores = optimum_score(returns, 79.0, -1000.0)
     assert scores[0].tolist() == [1, 0]
     assert scores[1, 0] == 0.5

@@ -89,7 +89,7 @@ def test_failures_have_a_bound_of_clopper_and_pearson():
 
 def test_what_counts_as_a_failure():
     assert failure_threshold(0.2, 1.0) == pytest.approx(0.6)
-    # Where nobody is better than blind nothing sets a failure apart.
+    # Where nobody is better than baseline nothing sets a failure apart.
     assert np.isnan(failure_threshold(0.2, 0.2))
     assert count_failures([0, 1], failure_threshold(1, 0)).n_failed == 0
 

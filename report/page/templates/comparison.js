@@ -1,9 +1,9 @@
 report.section("comparison", (root, data, chosen) => {
   report.figure(root.querySelector("#intervals"), () => {
     const { intervals: rows, linearUpTo: linear } = chosen();
-    const { optimum, blind } = report.page.environments[report.environment];
+    const { optimum, baseline } = report.page.environments[report.environment];
     const values = rows.flatMap((row) => [row.low, row.high, ...row.runs]).filter((v) => v !== null);
-    const drawn = [...values, optimum, blind].filter((v) => v !== null);
+    const drawn = [...values, optimum, baseline].filter((v) => v !== null);
     const symlog = linear === null ? null : report.symlog(linear);
     const height = symlog?.height ?? ((value) => value);
     const middle = (height(Math.min(...drawn)) + height(Math.max(...drawn))) / 2;

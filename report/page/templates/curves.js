@@ -10,7 +10,7 @@ report.section("curves", (root, _, place) => {
 
   const extent = (curves, environment) => {
     const values = curves.flatMap((curve) => [...curve.y, ...curve.low, ...curve.high]);
-    const known = [...values, environment.optimum, environment.blind].filter((v) => v !== null);
+    const known = [...values, environment.optimum, environment.baseline].filter((v) => v !== null);
     return known.length ? [Math.min(...known), Math.max(...known)] : [0, 1];
   };
 
@@ -19,7 +19,7 @@ report.section("curves", (root, _, place) => {
     const { linearUpTo: linear, onVariant } = place()[kind];
     // Nobody is to read returns of a variant against the optimum of the environment itself.
     const judged = report.page.environments[report.environment];
-    const environment = onVariant.length ? { ...judged, optimum: null, blind: null } : judged;
+    const environment = onVariant.length ? { ...judged, optimum: null, baseline: null } : judged;
     const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
     const height = symlog?.height ?? ((value) => value);
     const curves = Object.entries(place()[kind][by]).filter(([label]) => isShown(label));

@@ -138,12 +138,12 @@
     return traces;
   };
 
-  // The optimum and the best blind policy as lines: across, or upright where the middle of the
+  // The optimum and the best random or constant policy as lines: across, or upright where the middle of the
   // horizontal axis is given, so that their names fall inside the figure and on no other name.
   report.references = (environment, height, middle = null) =>
     [
       { name: "optimum", value: environment.optimum, dash: "solid", isUpper: true },
-      { name: "best blind", value: environment.blind, dash: "dot", isUpper: false },
+      { name: "best random or constant policy", value: environment.baseline, dash: "dot", isUpper: false },
     ]
       .filter(({ value }) => value !== null)
       .map(({ name, value, dash, isUpper }) => {

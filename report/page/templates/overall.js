@@ -1,6 +1,6 @@
 report.section("overall", (root, data) => {
   report.figure(root.querySelector("#aggregate"), () => {
-    // A score far below the best blind policy would leave no room for the others.
+    // A score far below the best random or constant policy would leave no room for the others.
     const { traces, yaxis, height } = report.intervals(data.iqm, { least: -0.5 });
     return {
       traces,
