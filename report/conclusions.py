@@ -119,7 +119,8 @@ def _nothing_decided(study: StudySpec, environment: EnvironmentAnalysis) -> str:
 def _alternatives(agents: list[AgentAnalysis]) -> str:
     if len(agents) > MOST_FIGURES:
         return f"one of {enumeration([agent.agent for agent in agents])}"
-    return " or ".join(f"{agent.agent} ({interval(agent.metric.mean)})" for agent in agents)
+    *others, last = [f"{agent.agent} ({interval(agent.metric.mean)})" for agent in agents]
+    return f"{', '.join(others)} or {last}"
 
 
 def _figure(study: StudySpec, environment: EnvironmentAnalysis, agent: AgentAnalysis) -> str:

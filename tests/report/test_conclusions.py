@@ -53,6 +53,10 @@ LEADS = {
         ("worse", "undecided", "better"),
         "b is best: return of the final policy 90 [89.9, 90.2], score 0.9; the optimum is 200.",
     ),
+    "one of three": (
+        ("undecided", "undecided", "equivalent"),
+        f"Best is a ({A}), b ({B}) or c ({C}): that is undecided; the optimum is 200.",
+    ),
     "a circle": (
         ("better", "worse", "better"),
         "No agent is best: for each of them there is another that is better.",
