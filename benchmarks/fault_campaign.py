@@ -204,11 +204,11 @@ def _orphans(session: int) -> int:
 
 def _has_traceback(case: Case) -> int:
     output = case.folder / "output"
-    found = "Traceback" in output.read_text(encoding="utf-8", errors="replace")
+    text = output.read_text(encoding="utf-8", errors="replace")
+    output.write_text("")
+    found = "Traceback" in text
     if found:
-        output.rename(case.folder / f"traceback {time.monotonic_ns()}")
-    else:
-        output.write_text("")
+        print(f"{case.name}:\n{text}", file=sys.stderr)
     return int(found)
 
 
