@@ -64,7 +64,7 @@ def type_command(tmp_path, monkeypatch, capfd):
 
 def figures(folder):
     """What a study has come to, but for times."""
-    table = pd.read_csv(folder / "summary.csv").drop(columns=["seconds", "path"])
+    table = pd.read_csv(folder / "summary.csv").drop(columns=["seconds", "cpu_seconds", "path"])
     looks = json.loads((folder / "looks.json").read_text())
     for environment in looks["environments"].values():
         for look in environment["taken"]:
