@@ -82,6 +82,7 @@ class Training:
         keeping: what becomes of it.
         pulls: keeps every pull, on bandits; else None, and where a compiled loop was asked for.
         refusal: why the model that the environment brings is not believed; None if it is.
+        trained_digest: that of the zip that the agent goes on from; None for a new agent.
     """
 
     spec: TrainSpec
@@ -95,6 +96,7 @@ class Training:
     keeping: StateKeeping
     pulls: PullRecorder | None = None
     refusal: str | None = None
+    trained_digest: str | None = None
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
@@ -167,6 +169,7 @@ def set_up(
         keeping,
         pulls,
         refusal,
+        None if trained is None else trained.digest,
     )
 
 

@@ -10,12 +10,12 @@ from typing import Any
 
 import yaml
 
-from pipeline.file_digests import digest_of
 from pipeline.files import write_text
 from pipeline.module_records import keep_copies
 from pipeline.run_folder import Run
 from pipeline.train_spec import TrainSpec
 
+# The field of ``run.json`` with the digest of the zip that a run goes on with.
 TRAINED_AGENT = "trained_agent_digest"
 RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
 
@@ -32,12 +32,6 @@ def write_arguments(run: Run, spec: TrainSpec, args: Mapping[str, Any]) -> None:
     # Its tools take env_kwargs for the environment's arguments and let them win over config.yml.
     args = {**args, "env_kwargs": spec.saved_hyperparams.get("env_kwargs")}
     write_text(run.params_path / "args.yml", yaml.safe_dump(args))
-
-
-def trained_agent_record(spec: TrainSpec) -> dict[str, str]:
-    """The digest of the zip that a run goes on with, by which it is known again."""
-    path = spec.trained_agent
-    return {} if path is None else {TRAINED_AGENT: digest_of(path)}
 
 
 @cache

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -33,6 +34,11 @@ class ModelFile:
     path: Path
     content: bytes = field(repr=False)
     data: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of the content, as ``run.json`` has those of files."""
+        return hashlib.sha256(self.content).hexdigest()
 
     def stream(self) -> io.BytesIO:
         """The content, for what reads files."""

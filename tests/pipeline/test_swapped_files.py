@@ -1,5 +1,6 @@
 """Files that somebody swaps for others once they have been opened: what was checked is loaded."""
 
+import hashlib
 import io
 import pathlib
 import shutil
@@ -119,8 +120,10 @@ def test_going_on(runs, swapped, tmp_path):
     run, opens = swapped("dqn")
     spec = spec_of(tmp_path / "logs", "dqn", "CartPole-v1", DQN, 2, trained_agent=run.model_path)
     training = prepare(spec, SILENT, {}, "train.py")
-    # The last is for the record of what the run began with, and nothing is loaded of it.
-    assert opens == ["CartPole-v1.zip", "replay_buffer.pkl", "CartPole-v1.zip"]
+    assert opens == ["CartPole-v1.zip", "replay_buffer.pkl"]
+    genuine = runs["dqn"][0].model_path.read_bytes()
+    recorded = training.run.read_info()["trained_agent_digest"]
+    assert recorded == hashlib.sha256(genuine).hexdigest()
     check_is_of(*runs["dqn"], "dqn", training.model)
     training.model.env.close()
     training.eval_env.close()
