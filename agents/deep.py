@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import inspect
+import math
+from typing import ClassVar
+
 import numpy as np
-import stable_baselines3
 import torch as th
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.dqn.policies import QNetwork
 from torch.nn.functional import mse_loss
 from torch.nn.utils import clip_grad_norm_
 
+from agents.common.signatures import full_signature
 from agents.dqn import DQN, NextValues
+from agents.networks.compiled_q_learning import CompiledQLearning
 
 
 def double_q_values(online: NextValues, target: QNetwork, next_obs: th.Tensor) -> th.Tensor:
@@ -35,23 +40,29 @@ class DoubleDQN(DQN):
     Arguments are those of `agents.dqn.DQN`.
     """
 
+    target_kind = "double_q"
+
     def _next_values(self, target: QNetwork) -> NextValues:
         # One column, so that there is nothing left to choose from.
         online: NextValues = lambda next_obs: self._among_allowed(self.q_net(next_obs))  # noqa: E731
         return lambda next_obs: double_q_values(online, target, next_obs)
 
 
-class DeepQLearning(stable_baselines3.DQN):
+class DeepQLearning(CompiledQLearning):
     """Deep Q-learning with experience replay as first published (Mnih et al., 2013).
 
     DQN without what was added to it later: the target comes from the network that learns, as it is
     at that very update, and the loss is the squared error, where Stable-Baselines3's DQN has a
-    lagging copy and Huber's loss. Arguments are those of `stable_baselines3.DQN`;
-    ``target_update_interval`` is without effect.
+    lagging copy and Huber's loss. Arguments are those of `stable_baselines3.DQN` and ``engine`` of
+    `agents.networks.engine_setting.CompiledNetworks`; ``target_update_interval`` is without effect.
     """
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
+    __signature__: ClassVar[inspect.Signature]
+
+    target_kind = "online"
+    largest_error = math.inf
+
+    def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -76,3 +87,6 @@ class DeepQLearning(stable_baselines3.DQN):
             targets = batch.rewards + (1 - batch.dones) * discounts * next_values
         values = self.q_net(batch.observations).gather(dim=1, index=batch.actions.long())
         return mse_loss(values, targets) / 2
+
+
+DeepQLearning.__signature__ = full_signature(DeepQLearning)

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
-import stable_baselines3
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from stable_baselines3.dqn.policies import QNetwork
 
 from agents.common.mask_reading import check_masks_exist, checked_masks, present_masks
 from agents.common.signatures import full_signature
+from agents.networks.compiled_q_learning import CompiledQLearning
 from envs.action_masks import INFO_KEY
 from mdp.array_types import Bools
 
@@ -77,7 +77,7 @@ class MaskedReplayBuffer(ReplayBuffer):
         return samples._replace(actions=samples.actions[:, :1])
 
 
-class DQN(stable_baselines3.DQN):
+class DQN(CompiledQLearning):
     """Stable-Baselines3's DQN; with ``mask_actions`` among the actions that are allowed.
 
     Masks then hold in exploration, in the greedy choice, and in the maximum of the target, for
@@ -183,13 +183,12 @@ class DQN(stable_baselines3.DQN):
             actions = values.argmax(dim=1).cpu().numpy()
         return (actions if is_batch else actions[0]), state
 
-    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
+    def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
         target_network = self.q_net_target
         # The library maximises over the columns of what this returns.
         self.q_net_target = self._next_values(target_network)  # type: ignore[assignment]
         try:
-            super().train(gradient_steps, batch_size)
+            super()._train_in_python(gradient_steps, batch_size)
         finally:
             self.q_net_target = target_network
 

@@ -86,12 +86,12 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         "agents.deep:DeepQLearning", "DQN of 2013: squared loss, no target network"
     ),
     "ppo": _deep(
-        "stable_baselines3:PPO",
+        "agents.policy_gradients:PPO",
         "proximal policy optimisation (Stable-Baselines3)",
         POLICY_GRADIENT_OUTPUTS,
     ),
     "a2c": _deep(
-        "stable_baselines3:A2C",
+        "agents.policy_gradients:A2C",
         "advantage actor-critic (Stable-Baselines3)",
         POLICY_GRADIENT_OUTPUTS,
     ),

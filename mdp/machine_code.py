@@ -32,6 +32,12 @@ OPTIONS: dict[str, Any] = {"error_model": "numpy"}
 BARE_OPTIONS: dict[str, Any] = {**OPTIONS, "_nrt": False}
 
 
+# What arithmetic in single precision may do besides, so that many numbers are worked out at once:
+# take sums in any order, multiply and add in one go, and forget the sign of a zero. Numbers that
+# are not finite stay what they are.
+REORDERED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "fastmath": {"reassoc", "contract", "nsz"}}
+
+
 def compiled(function: Function) -> Function:
     """Compile a function of numbers and arrays on its first call."""
     return _decorated(function, OPTIONS)
@@ -42,6 +48,20 @@ def kernel(function: Function) -> Function:
     return _decorated(function, BARE_OPTIONS)
 
 
+# Nothing that Python could call: what unpacks many arrays takes longer to compile than a loop.
+INTERNAL_OPTIONS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+
+
+def called(function: Function) -> Function:
+    """Compile a function that allocates nothing and that only compiled functions call."""
+    return _decorated(function, {**BARE_OPTIONS, **INTERNAL_OPTIONS})
+
+
+def vectorised(function: Function) -> Function:
+    """As `called`, for loops over single-precision numbers whose sums may be in any order."""
+    return _decorated(function, {**REORDERED_OPTIONS, **INTERNAL_OPTIONS})
+
+
 def inlined(function: Function) -> Function:
     """Compile a small function that allocates nothing, as a part of those that call it."""
     return _decorated(function, {**BARE_OPTIONS, "forceinline": True})
@@ -50,6 +70,14 @@ def inlined(function: Function) -> Function:
 def internal(function: Function) -> Function:
     """As `inlined`, for functions whose arguments or results Python cannot see."""
     return _decorated(function, {**BARE_OPTIONS, "forceinline": True, "no_cpython_wrapper": True})
+
+
+def view(function: Function) -> Function:
+    """Compile a function that returns a part of an array, as a part of those that call it.
+
+    Without reference counts, only the caller's own code may make such a thing.
+    """
+    return _decorated(function, {**BARE_OPTIONS, "inline": "always"})
 
 
 class _CompileTimer(event.Listener):

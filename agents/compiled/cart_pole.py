@@ -1,4 +1,4 @@
-"""CartPole seen through bins, as compiled code."""
+"""CartPole as compiled code, which shows numbers of bins."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def bin_index(world: CartPole, env: Any) -> int:
 
 
 class CartPole(NamedTuple):
-    """CartPole's constants, as Gymnasium names them, and the bins that it is seen through.
+    """CartPole's constants, as Gymnasium names them, and the bins that it is seen through, if any.
 
     Attributes:
         time_limit: steps after which an episode is truncated, or 0 for never.

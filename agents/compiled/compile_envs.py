@@ -27,6 +27,7 @@ from envs.wrappers import (
     DiscretizeObservation,
     FlattenToDiscrete,
     IdleActionMasks,
+    OneHotObservation,
     ScaleReward,
     TerminationReward,
 )
@@ -39,7 +40,7 @@ World = FiniteModel | CartPole
 COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
 CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
 MASK_WRAPPERS = {ActionMasks, IdleActionMasks}
-CHANGE_WRAPPERS = {FlattenToDiscrete, ScaleReward, TerminationReward}
+CHANGE_WRAPPERS = {FlattenToDiscrete, OneHotObservation, ScaleReward, TerminationReward}
 MODEL_WRAPPERS = {*CHANGE_WRAPPERS, *MASK_WRAPPERS, *COMMON_WRAPPERS}
 
 
@@ -119,8 +120,6 @@ def _finite_model(env: Env) -> FiniteModel:
         raise NotCompilable(check.refusal)
     if check is None or model is None or observations is None:
         raise NotCompilable("the environment's transition model is not known")
-    if not np.issubdtype(observations.dtype, np.integer) or observations.ndim != 1:
-        raise NotCompilable("the observations are not single numbers")
     # A wrapper may leave the dynamics alone and yet have to see every step, to film it say.
     watching = {type(layer) for layer in layers(env)[:-1]} - MODEL_WRAPPERS
     if watching:
@@ -137,8 +136,15 @@ def _finite_model(env: Env) -> FiniteModel:
         outcomes=_outcomes(env, model, seen_by_monitor),
         starts=starts,
         start_cumulative=np.cumsum(model.initial)[starts],
-        observation=observations.astype(np.int64),
+        observation=_numbers(observations),
     )
+
+
+def _numbers(observations: NDArray[Any]) -> NDArray[np.int64]:
+    """What is observed in each state, as numbers; the states' own where it is something else."""
+    if np.issubdtype(observations.dtype, np.integer) and observations.ndim == 1:
+        return observations.astype(np.int64)
+    return np.arange(len(observations))
 
 
 def _outcomes(env: Env, model: TransitionModel, seen_by_monitor: TransitionModel) -> NDArray[Any]:
@@ -160,11 +166,15 @@ def _cart_pole(env: Env) -> CartPole:
     wrappers = [layer for layer in chain if isinstance(layer, DiscretizeObservation)]
     base = chain[-1]
     assert isinstance(base, CartPoleEnv)
-    if len(wrappers) != 1 or {type(layer) for layer in chain[:-1]} - CART_POLE_WRAPPERS:
+    if len(wrappers) > 1 or {type(layer) for layer in chain[:-1]} - CART_POLE_WRAPPERS:
         raise NotCompilable("CartPole compiles under DiscretizeObservation and Monitor alone")
     if type(base) is not CartPoleEnv or base._sutton_barto_reward:
         raise NotCompilable("CartPole compiles with its default reward alone")
-    wrapper = wrappers[0]
+    dims, bins = np.empty(0, dtype=np.int64), np.empty((0, 3))
+    if wrappers:
+        wrapper = wrappers[0]
+        dims = np.array(wrapper.dims, dtype=np.int64)
+        bins = np.stack((wrapper.bins, wrapper.low, wrapper.high), axis=1).astype(np.float64)
     return CartPole(
         time_limit=time_limit(env) or 0,
         gravity=float(base.gravity),
@@ -177,6 +187,6 @@ def _cart_pole(env: Env) -> CartPole:
         semi_implicit=base.kinematics_integrator != "euler",
         x_threshold=float(base.x_threshold),
         theta_threshold=float(base.theta_threshold_radians),
-        dims=np.array(wrapper.dims, dtype=np.int64),
-        bins=np.stack((wrapper.bins, wrapper.low, wrapper.high), axis=1).astype(np.float64),
+        dims=dims,
+        bins=bins,
     )

@@ -49,6 +49,8 @@ def by_type(stub: Function) -> Function:
 
 def _class_of(argument: Any) -> type | None:
     """The world's class, or the algorithm's that the agent's settings name."""
+    # A reference has that of what it refers to.
+    argument = getattr(argument, "content", argument)
     if not isinstance(argument, types.BaseNamedTuple):
         return None
     kind: Any = argument

@@ -47,7 +47,7 @@ class CompiledEngine:
         self.log_interval = log_interval
         self.reports_success = ["is_success" in (info or {}) for info in agent.env.reset_infos]
         self.block_steps = max(MAX_BLOCK_STEPS // agent.n_envs, 1)
-        self.states = EnvStates(agent.env, world)
+        self.states = self._make_states()
         self.envs = self.states.records
         # Handles do not keep the generators alive that they stand for.
         self.generators = [env.unwrapped.np_random for env in agent.env.envs]
@@ -61,6 +61,9 @@ class CompiledEngine:
         self.learner: Any = None
         self._read()
 
+    def _make_states(self) -> EnvStates:
+        return EnvStates(self.agent.env, self.world)
+
     def _learner(self) -> Any:
         """The agent as compiled functions see it, also after a callback has changed it."""
         agent, progress = self.agent, self.progress[0]
@@ -70,20 +73,27 @@ class CompiledEngine:
         for name, schedule in agent.schedules().items():
             progress[f"{name}_schedule"] = compiled_schedule(schedule)
             progress[name] = schedule(agent._current_progress_remaining)
-        generators = [env.unwrapped.np_random for env in agent.env.envs]
+        self._take_generators()
+        return self.learner
+
+    def _take_generators(self) -> None:
+        """A callback may have seeded the environments anew."""
+        generators = [env.unwrapped.np_random for env in self.agent.env.envs]
         if any(a is not b for a, b in zip(generators, self.generators, strict=True)):
             self.generators, self.handles = generators, handles_of(generators)
-        return self.learner
 
     def run(self, total_timesteps: int) -> None:
         """Train until ``num_timesteps`` reaches ``total_timesteps`` or a callback stops it."""
         with interrupts_held() as interrupted:
             try:
-                while self.agent.num_timesteps < total_timesteps:
+                while not self._is_over(total_timesteps):
                     if not self._run_block(total_timesteps) or interrupted():
                         break
             finally:
                 self._write()
+
+    def _is_over(self, total_timesteps: int) -> bool:
+        return bool(self.agent.num_timesteps >= total_timesteps)
 
     def _run_block(self, total_timesteps: int) -> bool:
         agent = self.agent

@@ -39,12 +39,18 @@ class EnvStates:
     def __init__(self, vec_env: DummyVecEnv, world: World) -> None:
         self.vec_env = vec_env
         self.is_cart_pole = isinstance(world, CartPole)
-        self.records = np.zeros(
-            vec_env.num_envs, dtype=CART_POLE_ENV if self.is_cart_pole else FINITE_ENV
-        )
+        self.records = np.zeros(vec_env.num_envs, dtype=self.record_type())
         self.monitors = [monitor_of(env) for env in vec_env.envs]
         # Monitor holds the rewards of the episode that is under way: so must we.
         self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]
+
+    def record_type(self) -> np.dtype[np.void]:
+        """What the records hold."""
+        return CART_POLE_ENV if self.is_cart_pole else FINITE_ENV
+
+    def observation(self, i: int) -> Any:
+        """What environment ``i`` shows."""
+        return self.records[i]["obs"]
 
     def read(self) -> None:
         """Copy the state of the environments into the records."""
@@ -76,7 +82,7 @@ class EnvStates:
                     chunks = self._unfinished[i]
                     layer.rewards = np.concatenate(chunks).tolist() if chunks else []
                     layer.needs_reset = False
-            next(iter(self.vec_env.buf_obs.values()))[i] = self.records[i]["obs"]
+            next(iter(self.vec_env.buf_obs.values()))[i] = self.observation(i)
 
     def _write_state(self, base: Any, record: Any) -> None:
         if self.is_cart_pole:

@@ -1,0 +1,1 @@
+"""Multilayer perceptrons as compiled code: how they are evaluated, differentiated and trained."""

@@ -1,0 +1,63 @@
+"""What DQN and its kin share: training on compiled code."""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar, Literal
+
+import stable_baselines3
+from numpy.typing import NDArray
+from stable_baselines3.common.noise import ActionNoise
+
+from agents.networks.coverage import check_q_agent
+from agents.networks.engine_setting import CompiledNetworks
+from agents.networks.library_networks import check_optimizer
+from agents.networks.q_training import QTraining, q_network, q_training
+
+
+class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
+    """`CompiledNetworks` says what the argument ``engine`` does.
+
+    Attributes:
+        target_kind: where the value of the next state is taken from: the lagging copy, the same
+            for the action that the online network prefers, or the online network.
+        largest_error: from where on the loss is no longer a square.
+        collected: steps and episodes since the last training.
+    """
+
+    target_kind: ClassVar[Literal["target", "double_q", "online"]] = "target"
+    largest_error: ClassVar[float] = 1.0
+
+    _training: QTraining | None
+    _own = (*CompiledNetworks._own, "collected")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.collected = (0, 0)
+        super().__init__(*args, **kwargs)
+
+    def _check_compilable(self) -> None:
+        check_q_agent(self)
+        check_optimizer(self.policy.optimizer)
+        q_network(self.q_net, self._seen_in_python())
+
+    def _compiled_training(self, seen: Any) -> AbstractContextManager[QTraining]:
+        return q_training(self, seen)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        if self._training is None:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        actions = self._training.act()
+        return actions, actions
+
+    def train(self, gradient_steps: int, batch_size: int = 100) -> None:
+        """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
+        if self._training is None:
+            self._train_in_python(gradient_steps, batch_size)
+        else:
+            self._training.train(gradient_steps)
+
+    def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
+        """The same in the library's way, or the agent's own."""
+        super().train(gradient_steps, batch_size)

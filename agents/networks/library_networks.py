@@ -1,0 +1,223 @@
+"""From networks of Stable-Baselines3 to perceptrons of compiled code, in the same memory.
+
+While an agent trains, the tensors of its networks and of its optimizer look into flat vectors that
+compiled code works on, so that callbacks see at any time what has been learnt. Afterwards they have
+memory of their own again, laid out as PyTorch does it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from torch import nn
+
+from agents.compiled.compile_envs import NotCompilable
+from agents.networks.activations import ELU, IDENTITY, LEAKY_RELU, RELU, SIGMOID, TANH
+from agents.networks.matrix_products import Singles
+from agents.networks.optimizers import ADAM, RMSPROP, RMSPROP_TENSORFLOW, Optimizer
+from agents.networks.perceptron import Layers, make_layers, n_parameters
+
+# The classes, what they are here, and the attribute that holds their parameter.
+_ACTIVATIONS: dict[type[nn.Module], tuple[int, str | None]] = {
+    nn.Identity: (IDENTITY, None),
+    nn.ReLU: (RELU, None),
+    nn.Tanh: (TANH, None),
+    nn.ELU: (ELU, "alpha"),
+    nn.LeakyReLU: (LEAKY_RELU, "negative_slope"),
+    nn.Sigmoid: (SIGMOID, None),
+}
+
+# Settings of optimizers that compiled steps do not have, as they have to be.
+_PLAIN = {
+    "weight_decay": 0,
+    "amsgrad": False,
+    "maximize": False,
+    "momentum": 0,
+    "centered": False,
+    "decoupled_weight_decay": False,
+}
+
+
+@dataclass(frozen=True)
+class Network:
+    """A perceptron of the library.
+
+    Attributes:
+        linears: its layers, the first one first.
+        layers: the same as compiled code sees them.
+    """
+
+    linears: Sequence[nn.Linear]
+    layers: Layers
+
+
+def network_of(modules: Iterable[nn.Module], start: int, *, one_hot: bool) -> Network:
+    """What linear layers with one activation function in between come to.
+
+    Args:
+        modules: the layers and functions, in order.
+        start: where its parameters begin in the flat vector.
+        one_hot: whether inputs are numbers that stand for one-hot vectors.
+
+    Raises:
+        NotCompilable: if it is anything else.
+    """
+    linears: list[nn.Linear] = []
+    functions: list[tuple[int, float]] = []
+    for module in modules:
+        if type(module) is nn.Linear and module.bias is not None:
+            if len(linears) != len(functions):
+                raise NotCompilable("a network has linear layers without a function in between")
+            linears.append(module)
+        elif len(functions) == len(linears) - 1:
+            functions.append(_activation(module))
+        else:
+            raise NotCompilable(f"a network has a layer of {type(module).__name__}")
+    if len(set(functions)) > 1:
+        raise NotCompilable("a network has several activation functions")
+    if len(functions) != len(linears) - 1:
+        raise NotCompilable("a network ends with an activation function")
+    kind, slope = functions[0] if functions else (IDENTITY, 0.0)
+    sizes = [linears[0].in_features, *(linear.out_features for linear in linears)]
+    return Network(linears, make_layers(sizes, start, kind, slope, one_hot=one_hot))
+
+
+def _activation(module: nn.Module) -> tuple[int, float]:
+    if type(module) not in _ACTIVATIONS:
+        raise NotCompilable(f"a network has a layer of {type(module).__name__}")
+    kind, parameter = _ACTIVATIONS[type(module)]
+    return kind, 0.0 if parameter is None else float(getattr(module, parameter))
+
+
+def check_optimizer(optimizer: th.optim.Optimizer) -> None:
+    """Make sure that compiled steps are those of the optimizer.
+
+    Raises:
+        NotCompilable: if they are not; the message says why.
+    """
+    kind = type(optimizer)
+    if kind not in {th.optim.Adam, th.optim.RMSprop, RMSpropTFLike}:
+        raise NotCompilable(f"its optimizer is {kind.__name__}, not Adam or RMSprop")
+    for name, plain in _PLAIN.items():
+        if optimizer.defaults.get(name, plain) != plain:
+            raise NotCompilable(f"its optimizer has {name} {optimizer.defaults[name]}")
+    if len(optimizer.param_groups) != 1:
+        raise NotCompilable("its optimizer has several groups of parameters")
+
+
+class FlatTensors:
+    """Tensors of linear layers that look into a flat vector.
+
+    Args:
+        networks: whose layers, one network after the other.
+    """
+
+    def __init__(self, networks: Sequence[Network]) -> None:
+        self.linears = [linear for network in networks for linear in network.linears]
+        self.size = sum(n_parameters(network.layers) for network in networks)
+        self.vector: Singles = np.zeros(self.size, np.float32)
+
+    def places(self) -> Iterator[tuple[th.Tensor, th.Tensor]]:
+        """The layers' parameters, each with its part of the vector in the same shape."""
+        begin = 0
+        for linear in self.linears:
+            for parameter in (linear.weight, linear.bias):
+                end = begin + parameter.numel()
+                # Compiled code has weights as (inputs, outputs).
+                turned = self.vector[begin:end].reshape(tuple(parameter.shape)[::-1])
+                yield parameter, th.from_numpy(turned.T)
+                begin = end
+
+
+@contextmanager
+def shared_parameters(networks: Sequence[Network]) -> Iterator[Singles]:
+    """Let the parameters of networks lie in one flat vector for a while.
+
+    Yields:
+        The vector.
+    """
+    tensors = FlatTensors(networks)
+    for parameter, place in tensors.places():
+        place.copy_(parameter.data)
+        parameter.data = place
+    try:
+        yield tensors.vector
+    finally:
+        for parameter, _ in tensors.places():
+            parameter.data = parameter.data.clone(memory_format=th.contiguous_format)
+
+
+@contextmanager
+def shared_optimizer(
+    optimizer: th.optim.Optimizer, networks: Sequence[Network]
+) -> Iterator[Optimizer]:
+    """Let what an optimizer remembers lie in flat vectors for a while.
+
+    Yields:
+        The optimizer as compiled code sees it.
+    """
+    kind, names = _kind(optimizer)
+    vectors = {name: FlatTensors(networks) for name in names}
+    first = vectors[names[-1]]
+    known: Any = optimizer.state
+    begun = any(parameter in known for parameter, _ in first.places())
+    n_steps = np.zeros(1, np.int64)
+    if begun:
+        n_steps[0] = int(known[first.linears[0].weight]["step"])
+    for name, tensors in vectors.items():
+        for parameter, place in tensors.places():
+            # As the library has it: the sum of squares begins with ones there.
+            empty = 1.0 if kind == RMSPROP_TENSORFLOW else 0.0
+            place.copy_(known[parameter][name]) if begun else place.fill_(empty)
+            known[parameter][name] = place
+    mean_square = vectors[names[-1]].vector
+    defaults = optimizer.defaults
+    momentum, smoothing = defaults.get("betas", (0.0, defaults.get("alpha", 0.0)))
+    shared = Optimizer(
+        kind,
+        float(momentum),
+        float(smoothing),
+        float(defaults["eps"]),
+        vectors[names[0]].vector,
+        mean_square,
+        n_steps,
+    )
+    try:
+        yield shared
+    finally:
+        tell_steps(optimizer, first.linears, n_steps)
+        for tensors in vectors.values():
+            for parameter, _ in tensors.places():
+                _own_memory(known, parameter, vectors)
+        if not n_steps[0]:
+            known.clear()
+
+
+def tell_steps(optimizer: th.optim.Optimizer, linears: Sequence[nn.Linear], n_steps: Any) -> None:
+    """Let the library's optimizer know how many steps it has taken."""
+    known: Any = optimizer.state
+    for linear in linears:
+        for parameter in (linear.weight, linear.bias):
+            counts = int(n_steps[0])
+            own = type(optimizer) is RMSpropTFLike
+            known[parameter]["step"] = counts if own else th.tensor(float(counts))
+
+
+def _own_memory(known: Any, parameter: th.Tensor, names: Iterable[str]) -> None:
+    for name in names:
+        known[parameter][name] = known[parameter][name].clone(memory_format=th.contiguous_format)
+
+
+def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:
+    """What the optimizer is here, and what PyTorch calls the means that it keeps."""
+    if type(optimizer) is th.optim.Adam:
+        return ADAM, ("exp_avg", "exp_avg_sq")
+    if type(optimizer) is RMSpropTFLike:
+        return RMSPROP_TENSORFLOW, ("square_avg",)
+    return RMSPROP, ("square_avg",)

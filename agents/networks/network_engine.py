@@ -1,0 +1,150 @@
+"""Trains an agent of the library on the compiled loop, and keeps the rest from noticing."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+
+from agents.common.callback_horizons import (
+    EpisodeBudget,
+    Horizon,
+    horizon,
+    members,
+    wants_position,
+)
+from agents.compiled.engine import CompiledEngine
+from agents.compiled.env_state import COMPENSATED_SUM
+from agents.compiled.episodes import Episodes
+from agents.compiled.learning_algorithm import compiled_schedule
+from agents.compiled.loop import learn_from_last_step, run_block
+from agents.networks.network_worlds import NetworkEnvStates
+from agents.networks.training import NetworkTraining
+
+# Between two blocks signals are seen to, and displays move.
+SECONDS_PER_BLOCK = 0.2
+
+
+class NetworkEngine(CompiledEngine):
+    """One call of ``learn`` on the compiled loop.
+
+    Args:
+        training: the agent, as it and compiled code share it.
+        world: the compiled counterpart of its environments.
+        callback: what is told of the steps.
+        log_interval: episodes between two log records, or rollouts, or None.
+    """
+
+    states: NetworkEnvStates
+
+    def __init__(
+        self,
+        training: NetworkTraining,
+        world: Any,
+        callback: BaseCallback,
+        log_interval: int | None,
+    ) -> None:
+        self.training = training
+        self.steps_at_once = 1
+        self.in_loop = training.in_loop()
+        super().__init__(training.agent, world, callback, log_interval)
+
+    def _make_states(self) -> NetworkEnvStates:
+        return NetworkEnvStates(self.agent.env, self.world, self.training.seen)
+
+    def _learner(self) -> Any:
+        """The agent as compiled functions see it, with what the schedules say now."""
+        agent, progress = self.agent, self.progress[0]
+        for name, schedule in self.training.schedules().items():
+            progress[f"{name}_schedule"] = compiled_schedule(schedule)
+            progress[name] = schedule(agent._current_progress_remaining)
+        self._take_generators()
+        return self.in_loop
+
+    def _is_over(self, total_timesteps: int) -> bool:
+        # As in the library, what is being collected is collected to its end.
+        return self.training.until_end(total_timesteps) <= 0
+
+    def _run_block(self, total_timesteps: int) -> bool:
+        self._begin_rollout()
+        learner, progress = self._learner(), self.progress[0]
+        limit = self._steps_allowed(total_timesteps)
+        began = time.perf_counter()
+        n_steps = run_block(
+            self.world,
+            learner,
+            self.envs,
+            self.handles,
+            progress,
+            self.log,
+            limit.calls,
+            limit.episodes,
+            COMPENSATED_SUM,
+        )
+        self._note_speed(n_steps, time.perf_counter() - began)
+        episodes = Episodes.of(self.log.episodes[: progress["logged_episodes"]])
+        if not self._tell(episodes, n_steps):
+            return False  # as in the library, the last step is not learnt from
+        self.training.before_last_step(self.log_interval)
+        learn_from_last_step(learner, self.envs, progress)
+        last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
+        self._take_over_counts(1, len(episodes.envs) - last_step)
+        self.training.record()
+        self.callback.on_rollout_end()
+        return True
+
+    def _begin_rollout(self) -> None:
+        if wants_position(self.callback):
+            self._write()
+            self.callback.on_rollout_start()
+            self._read()
+        else:
+            self.callback.on_rollout_start()
+
+    def _steps_allowed(self, total_timesteps: int) -> Horizon:
+        """How far to go until somebody has to be asked."""
+        agent = self.agent
+        ahead, log = horizon(self.callback), self.training.until_log(self.log_interval)
+        left = self.training.until_end(total_timesteps)
+        steps = min(ahead.calls, log.calls, left, self.block_steps, self.steps_at_once)
+        self.progress[0]["episodes"] = getattr(agent, "_episode_num", 0)
+        return Horizon(max(steps, 1), min(ahead.episodes, log.episodes))
+
+    def _note_speed(self, n_steps: int, seconds: float) -> None:
+        """Adapt how many steps a block may have; results do not depend on that."""
+        fitting = n_steps * SECONDS_PER_BLOCK / max(seconds, 1e-6)
+        self.steps_at_once = max(1, min(int(fitting), 4 * self.steps_at_once))
+
+    def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
+        self.agent._current_progress_remaining = float(self.progress[0]["remaining"])
+        self._take_over_position()
+        if n_episodes:
+            self.training.count_episodes(n_episodes, self.log_interval)
+
+    def _take_over_position(self) -> None:
+        self.agent._last_obs = self.states.observations(self.envs, "")
+        self.training.write()
+
+    def _read(self) -> None:
+        agent, progress = self.agent, self.progress[0]
+        for budget in members(self.callback):
+            if isinstance(budget, EpisodeBudget):
+                progress["episode_budget"] = budget.n_episodes
+                progress["budget_episodes"] = budget.episodes_seen
+        progress["num_timesteps"] = agent.num_timesteps
+        progress["total_timesteps"] = agent._total_timesteps
+        progress["remaining"] = agent._current_progress_remaining
+        self.training.read()
+        self.states.read()
+        self.states.take_observations(agent._last_obs)
+
+    def _last_step(self, episodes: Episodes, earlier: int, times: list[float]) -> dict[str, Any]:
+        told = super()._last_step(episodes, earlier, times)
+        told["new_obs"] = self.states.observations(self.envs, "new_")
+        ends = self.states.observations(self.envs, "next_")
+        for i, info in enumerate(told["infos"]):
+            if "terminal_observation" in info:
+                info["terminal_observation"] = ends[i]
+        return told

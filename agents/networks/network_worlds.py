@@ -1,0 +1,125 @@
+"""Compiled environments as networks see them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.compiled.cart_pole import STATE, CartPole
+from agents.compiled.compile_envs import NotCompilable, compile_envs
+from agents.compiled.env_state import EnvStates
+from agents.compiled.loop import reset, step
+from agents.compiled.training_records import env_dtype
+from agents.networks.observations import Numbers, OwnVectors, StateVectors
+from envs.known_models import observations_of_states
+from mdp.machine_code import inlined
+
+# What acting leaves for learning.
+_ESTIMATES = (("value", np.float64), ("log_probability", np.float64))
+
+_FINITE_ENV = env_dtype(("state", np.int64), *_ESTIMATES)
+
+_VECTORS: Any = [(name, np.float32, (4,)) for name in ("vector", "next_vector", "new_vector")]
+_CART_POLE_ENV = env_dtype(*((name, np.float64) for name in STATE), *_ESTIMATES, *_VECTORS)
+
+
+class CartPoleInFull(NamedTuple):
+    """CartPole that shows its state.
+
+    Attributes:
+        time_limit: steps after which an episode is truncated, or 0 for never.
+        cart_pole: the dynamics.
+    """
+
+    time_limit: int
+    cart_pole: CartPole
+
+    @inlined
+    def step(self, env: Any, handle: Any) -> None:
+        """Push the cart as ``env.action`` says."""
+        step(self.cart_pole, env, handle)
+        _show_state(env, env.next_vector)
+        _show_state(env, env.new_vector)
+
+    @inlined
+    def reset(self, env: Any, handle: Any) -> None:
+        """Draw a state."""
+        reset(self.cart_pole, env, handle)
+        _show_state(env, env.new_vector)
+
+
+@inlined
+def _show_state(env: Any, vector: Any) -> None:
+    vector[0] = np.float32(env.x)
+    vector[1] = np.float32(env.x_dot)
+    vector[2] = np.float32(env.theta)
+    vector[3] = np.float32(env.theta_dot)
+
+
+def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
+    """The compiled counterpart of environments, and how networks see it.
+
+    Returns:
+        What `agents.compiled.loop` steps, and one of the kinds of `agents.networks.observations`.
+
+    Raises:
+        NotCompilable: where there is none; the message says why.
+    """
+    world = compile_envs(vec_env)
+    space = vec_env.observation_space
+    if isinstance(space, spaces.Discrete):
+        return world, Numbers(int(space.n))
+    if isinstance(world, CartPole):
+        return CartPoleInFull(world.time_limit, world), OwnVectors(len(STATE))
+    observed = observations_of_states(vec_env.envs[0])  # type: ignore[attr-defined]
+    if observed is None or observed.ndim < 2:
+        raise NotCompilable("the observations of the states are not known")
+    return world, StateVectors(np.ascontiguousarray(observed.reshape(len(observed), -1), "f4"))
+
+
+class NetworkEnvStates(EnvStates):
+    """Environments of a training whose observations networks see.
+
+    Args:
+        vec_env: the environments.
+        world: their compiled counterpart.
+        seen: how networks see them.
+    """
+
+    def __init__(self, vec_env: Any, world: Any, seen: Any) -> None:
+        self.seen = seen
+        super().__init__(vec_env, getattr(world, "cart_pole", world))
+
+    def record_type(self) -> np.dtype[np.void]:
+        """With room for what networks expect, and for vectors."""
+        return _CART_POLE_ENV if self.is_cart_pole else _FINITE_ENV
+
+    def observation(self, i: int) -> Any:
+        """What environment ``i`` shows, in the shape that it has in the environment's space."""
+        return self.observations(self.records[i : i + 1], "")[0]
+
+    def observations(self, records: Any, prefix: str) -> Any:
+        """What environments show now (no prefix), before (``next_``) or after a reset (``new_``).
+
+        Returns:
+            Observations of shape (n, ...).
+        """
+        if isinstance(self.seen, Numbers):
+            return records[f"{prefix}obs"].copy()
+        if isinstance(self.seen, OwnVectors):
+            return records[f"{prefix}vector"].copy()
+        shape = self.vec_env.observation_space.shape
+        assert shape is not None
+        return self.seen.table[records[f"{prefix}obs"]].reshape(len(records), *shape)
+
+    def take_observations(self, last_obs: Any) -> None:
+        """Let the records begin with these observations, shape (n, ...)."""
+        if isinstance(self.seen, Numbers):
+            self.records["obs"] = last_obs
+        elif isinstance(self.seen, OwnVectors):
+            self.records["vector"] = last_obs
+        else:
+            self.records["obs"] = self.records["state"]

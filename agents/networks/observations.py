@@ -1,0 +1,111 @@
+"""What networks are shown of compiled environments.
+
+Environments keep numbers of states; CartPole, whose states nobody counts, keeps vectors. Networks
+and their buffers want rows. Which of the kinds applies is looked up by type
+(`agents.compiled.dispatch`).
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from agents.compiled.dispatch import by_type
+from agents.networks.matrix_products import Singles
+from mdp.machine_code import inlined
+
+# Before a step; after it, also where it has ended the episode; and after the reset that followed.
+BEFORE, AFTER, NOW = range(3)
+
+
+@by_type
+def observe(seen: Any, env: Any, moment: int, row: Any) -> None:
+    """Write what the environment showed at that moment of its last step into ``row``."""
+
+
+@by_type
+def move_on(seen: Any, env: Any) -> None:
+    """Let the present observation be the one that the next action is chosen for."""
+
+
+@inlined
+def number_at(env: Any, moment: int) -> int:
+    """The number that stands for the observation."""
+    if moment == BEFORE:
+        return int(env.obs)
+    return int(env.next_obs if moment == AFTER else env.new_obs)
+
+
+@inlined
+def copy_row(rows: Any, i: int, row: Any) -> None:
+    """Copy the i-th of some rows."""
+    for j in range(len(row)):
+        row[j] = rows[i, j]
+
+
+class Numbers(NamedTuple):
+    """Observations are numbers, which networks see as one-hot vectors.
+
+    Attributes:
+        n: how many there are.
+    """
+
+    n: int
+
+    @inlined
+    def observe(self, env: Any, moment: int, row: Any) -> None:
+        """The number itself, shape (1,)."""
+        row[0] = number_at(env, moment)
+
+    @inlined
+    def move_on(self, env: Any) -> None:
+        """Only the number changes."""
+        env.obs = env.new_obs
+
+
+class StateVectors(NamedTuple):
+    """Observations are vectors, one for each state of a known model.
+
+    Attributes:
+        table: what is observed in each state, shape (S, d).
+    """
+
+    table: Singles
+
+    @inlined
+    def observe(self, env: Any, moment: int, row: Any) -> None:
+        """The vector of that state, shape (d,)."""
+        vector = self.table[number_at(env, moment)]
+        for j in range(len(row)):
+            row[j] = vector[j]
+
+    @inlined
+    def move_on(self, env: Any) -> None:
+        """Only the number changes."""
+        env.obs = env.new_obs
+
+
+class OwnVectors(NamedTuple):
+    """Observations are vectors that the environments' records hold.
+
+    Attributes:
+        n: length of the vectors.
+    """
+
+    n: int
+
+    @inlined
+    def observe(self, env: Any, moment: int, row: Any) -> None:
+        """The vector of that moment, shape (n,)."""
+        for j in range(self.n):
+            if moment == BEFORE:
+                row[j] = env.vector[j]
+            elif moment == AFTER:
+                row[j] = env.next_vector[j]
+            else:
+                row[j] = env.new_vector[j]
+
+    @inlined
+    def move_on(self, env: Any) -> None:
+        """All of the vector changes."""
+        for j in range(self.n):
+            env.vector[j] = env.new_vector[j]

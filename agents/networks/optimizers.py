@@ -1,0 +1,111 @@
+"""Steps of gradient descent as PyTorch's optimizers take them, on flat vectors.
+
+Sources: Kingma and Ba (2015) for Adam; Tieleman and Hinton (2012) for RMSprop, with TensorFlow's
+place of epsilon as Stable-Baselines3 has it; Pascanu, Mikolov and Bengio (2013) for clipping.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.networks.matrix_products import Singles
+from mdp.array_types import Ints
+from mdp.machine_code import vectorised
+
+ADAM, RMSPROP, RMSPROP_TENSORFLOW = range(3)
+
+# Moments of units that are dead would come so close to zero that processors take a hundred cycles
+# for each operation on them. What lies below counts as zero.
+_TINY, _TINY_SQUARE = np.float32(1e-17), np.float32(1e-36)
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+
+class Optimizer(NamedTuple):
+    """An optimizer and what it remembers.
+
+    Attributes:
+        kind: `ADAM`, `RMSPROP` or `RMSPROP_TENSORFLOW`.
+        momentum: Adam's beta_1.
+        smoothing: Adam's beta_2, RMSprop's alpha.
+        epsilon: keeps divisors from zero.
+        mean: running mean of gradients, as long as the parameters.
+        mean_square: of their squares.
+        n_steps: steps taken so far, alone in an array.
+    """
+
+    kind: int
+    momentum: float
+    smoothing: float
+    epsilon: float
+    mean: Singles
+    mean_square: Singles
+    n_steps: Ints
+
+
+@vectorised
+def descend(
+    optimizer: Optimizer,
+    flat: Singles,
+    gradient: Singles,
+    learning_rate: float,
+    max_grad_norm: float,
+) -> None:
+    """Take one step against the gradient, whose norm is clipped first."""
+    scale = _clipping(gradient, max_grad_norm)
+    optimizer.n_steps[0] += 1
+    if optimizer.kind == ADAM:
+        _adam(optimizer, flat, gradient, scale, learning_rate)
+    else:
+        _rmsprop(optimizer, flat, gradient, scale, learning_rate)
+
+
+@vectorised
+def _clipping(gradient: Singles, max_grad_norm: float) -> Any:
+    """What gradients are multiplied by, as ``torch.nn.utils.clip_grad_norm_`` has it."""
+    total = _ZERO
+    for i in range(len(gradient)):
+        total += gradient[i] * gradient[i]
+    return np.float32(min(max_grad_norm / (math.sqrt(total) + 1e-6), 1.0))
+
+
+@vectorised
+def _adam(
+    optimizer: Optimizer, flat: Singles, gradient: Singles, scale: Any, learning_rate: float
+) -> None:
+    n_steps = optimizer.n_steps[0]
+    rate = np.float32(1 - optimizer.momentum)
+    kept, square_rate = np.float32(optimizer.smoothing), np.float32(1 - optimizer.smoothing)
+    step_size = np.float32(learning_rate / (1 - optimizer.momentum**n_steps))
+    correction = np.float32(1 / math.sqrt(1 - optimizer.smoothing**n_steps))
+    epsilon = np.float32(optimizer.epsilon)
+    mean, mean_square = optimizer.mean, optimizer.mean_square
+    for i in range(len(flat)):
+        slope = gradient[i] * scale
+        slope = slope if abs(slope) > _TINY else _ZERO
+        first = mean[i] + (slope - mean[i]) * rate
+        first = first if abs(first) > _TINY else _ZERO
+        second = mean_square[i] * kept + slope * slope * square_rate
+        second = second if second > _TINY_SQUARE else _ZERO
+        mean[i], mean_square[i] = first, second
+        flat[i] -= step_size * first / (np.sqrt(second) * correction + epsilon)
+
+
+@vectorised
+def _rmsprop(
+    optimizer: Optimizer, flat: Singles, gradient: Singles, scale: Any, learning_rate: float
+) -> None:
+    kept, square_rate = np.float32(optimizer.smoothing), np.float32(1 - optimizer.smoothing)
+    inside = np.float32(optimizer.epsilon if optimizer.kind == RMSPROP_TENSORFLOW else 0.0)
+    outside = np.float32(0.0 if optimizer.kind == RMSPROP_TENSORFLOW else optimizer.epsilon)
+    step_size = np.float32(learning_rate)
+    mean_square = optimizer.mean_square
+    for i in range(len(flat)):
+        slope = gradient[i] * scale
+        slope = slope if abs(slope) > _TINY else _ZERO
+        second = mean_square[i] * kept + slope * slope * square_rate
+        second = second if second > _TINY_SQUARE else _ZERO
+        mean_square[i] = second
+        flat[i] -= step_size * slope / (np.sqrt(second + inside) + outside)

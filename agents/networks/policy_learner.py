@@ -1,0 +1,342 @@
+"""Policy optimisation as the compiled loop runs it, in the order of events of Stable-Baselines3."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.common.schedules import schedule_value
+from agents.compiled.generators import generator_of
+from agents.compiled.training_records import SCHEDULE
+from agents.networks.categorical import draw, log_probability
+from agents.networks.matrix_products import Singles
+from agents.networks.observations import AFTER, BEFORE, copy_row, move_on, observe
+from agents.networks.optimizers import Optimizer
+from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
+from agents.networks.policy_updates import RolloutMinibatch, learn_from_rollout_minibatch
+from agents.networks.references import call
+from agents.networks.replay import show
+from mdp.array_types import Ints
+from mdp.machine_code import called, inlined, kernel
+
+# Settings, under the library's names where it has one.
+RULES = np.dtype(
+    [
+        ("gamma", np.float64),
+        ("gae_lambda", np.float64),
+        ("ent_coef", np.float64),
+        ("vf_coef", np.float64),
+        ("max_grad_norm", np.float64),
+        ("target_kl", np.float64),  # infinite for none
+        ("normalize_advantage", np.bool_),
+        ("n_epochs", np.int64),
+        ("clip_range", SCHEDULE),
+        ("clip_range_vf", SCHEDULE),
+    ],
+    align=True,
+)
+
+# How far the training is.
+PLACE = np.dtype(
+    [
+        ("step", np.int64),  # of the rollout
+        ("n_rollouts", np.int64),
+        ("n_updates", np.int64),  # epochs, as the library counts them
+        ("policy_gradient", np.float64),  # means over the last training
+        ("value", np.float64),
+        ("entropy", np.float64),
+        ("clipped", np.float64),
+        ("kl", np.float64),  # over its last epoch
+        ("expected", np.float64),  # value of the observation that was looked at last
+        ("log_probability", np.float64),  # of the action that was drawn last
+    ],
+    align=True,
+)
+
+
+class Rollout(NamedTuple):
+    """The library's rollout buffer: T steps of E environments.
+
+    Attributes:
+        observations: shape (T, E, d); numbers of states have d = 1.
+        actions: shape (T, E, 1).
+        rewards: shape (T, E).
+        episode_starts: 1 where an episode began with the observation, shape (T, E).
+        values: of the observations, shape (T, E).
+        log_probs: of the actions, shape (T, E).
+        advantages: shape (T, E).
+        returns: what the values are to be, shape (T, E).
+    """
+
+    observations: Singles
+    actions: Singles
+    rewards: Singles
+    episode_starts: Singles
+    values: Singles
+    log_probs: Singles
+    advantages: Singles
+    returns: Singles
+
+
+class PolicyLearner(NamedTuple):
+    """Networks of action probabilities and of values as compiled functions see them, by reference.
+
+    Attributes:
+        rules: a record of type `RULES`, alone in an array.
+        place: one of type `PLACE`, likewise.
+        losses: one of type `LOSSES`, likewise.
+        policy: the shape of the one network.
+        value: the shape of the other.
+        flat: the parameters of both.
+        gradient: for work, as long.
+        optimizer: what moves the parameters.
+        rollout: what has been done and seen.
+        starts: whether the present observations begin episodes, shape (E,).
+        last_values: values of what the rollout ends with, shape (E,).
+        order: numbers of the rollout's steps, to be shuffled, shape (T * E,).
+        batch: the minibatch.
+        policy_outputs: for what the network puts out for the minibatch.
+        policy_errors: for derivatives.
+        value_outputs: as for the policy.
+        value_errors: as for the policy.
+        single: one observation, to act on.
+        row: the same memory as a row.
+        rng: a handle of the agent's generator, alone in an array.
+    """
+
+    rules: NDArray[np.void]
+    place: NDArray[np.void]
+    losses: NDArray[np.void]
+    policy: Layers
+    value: Layers
+    flat: Singles
+    gradient: Singles
+    optimizer: Optimizer
+    rollout: Rollout
+    starts: Singles
+    last_values: Singles
+    order: Ints
+    batch: RolloutMinibatch
+    policy_outputs: Singles
+    policy_errors: Singles
+    value_outputs: Singles
+    value_errors: Singles
+    single: Inputs
+    row: Any
+    rng: NDArray[np.void]
+
+
+@kernel
+def evaluate(learner: Any, _: float, __: float) -> int:
+    """Put the value of the observation in ``learner.row`` into ``place.expected``."""
+    forward(learner.value, learner.flat, learner.single, 1, learner.value_outputs)
+    values = last_outputs(learner.value, learner.value_outputs, 1)
+    learner.place[0].expected = float(values[0, 0])
+    return 0
+
+
+@kernel
+def choose_randomly(learner: Any, _: float, __: float) -> int:
+    """An action for the observation in ``learner.row``, whose value and chance are noted."""
+    evaluate(learner, 0.0, 0.0)
+    forward(learner.policy, learner.flat, learner.single, 1, learner.policy_outputs)
+    logits = last_outputs(learner.policy, learner.policy_outputs, 1)[0]
+    action = draw(logits, generator_of(learner.rng[0]).random())
+    learner.place[0].log_probability = log_probability(logits, action)
+    return action
+
+
+@kernel
+def train(learner: Any, remaining: float, learning_rate: float) -> int:
+    """Learn from the whole rollout as often as there are epochs.
+
+    Args:
+        learner: with the values of what the rollout ends with.
+        remaining: share of the training that is left.
+        learning_rate: of the optimizer.
+
+    Returns:
+        The number of minibatches.
+    """
+    place, rules = learner.place[0], learner.rules[0]
+    estimate_advantages(learner)
+    place.step = 0
+    place.n_rollouts += 1
+    clip_range = schedule_value(rules.clip_range, remaining)
+    clip_range_vf = schedule_value(rules.clip_range_vf, remaining)
+    place.policy_gradient = place.value = place.entropy = place.clipped = 0.0
+    n_batches, goes_on = 0, True
+    for _ in range(rules.n_epochs):
+        shuffle(learner.order, generator_of(learner.rng[0]))
+        n_in_epoch, goes_on = learn_for_an_epoch(learner, learning_rate, clip_range, clip_range_vf)
+        n_batches += n_in_epoch
+        place.n_updates += 1
+        if not goes_on:
+            break
+    place.policy_gradient /= n_batches
+    place.value /= n_batches
+    place.entropy /= n_batches
+    place.clipped /= n_batches
+    return n_batches
+
+
+@called
+def estimate_advantages(learner: Any) -> None:
+    """Generalised advantage estimation (Schulman et al., 2016), from the last step backwards."""
+    rollout, rules = learner.rollout, learner.rules[0]
+    n_steps, n_envs = rollout.rewards.shape
+    for i in range(n_envs):
+        advantage, next_value = 0.0, float(learner.last_values[i])
+        goes_on = 1.0 - learner.starts[i]
+        for step in range(n_steps - 1, -1, -1):
+            value = float(rollout.values[step, i])
+            error = rollout.rewards[step, i] + rules.gamma * next_value * goes_on - value
+            advantage = error + rules.gamma * rules.gae_lambda * goes_on * advantage
+            rollout.advantages[step, i] = np.float32(advantage)
+            rollout.returns[step, i] = np.float32(advantage + value)
+            next_value, goes_on = value, 1.0 - rollout.episode_starts[step, i]
+
+
+@inlined
+def shuffle(numbers: Ints, generator: Any) -> None:
+    """Put 0, 1, ... into a random order (Fisher and Yates)."""
+    for i in range(len(numbers)):
+        numbers[i] = i
+    for i in range(len(numbers) - 1, 0, -1):
+        j = int(generator.random() * (i + 1))
+        numbers[i], numbers[j] = numbers[j], numbers[i]
+
+
+@inlined
+def learn_for_an_epoch(
+    learner: Any, learning_rate: float, clip_range: float, clip_range_vf: float
+) -> tuple[int, bool]:
+    """Learn from all of the rollout once.
+
+    Returns:
+        The number of minibatches, and False where the policy has moved too far.
+    """
+    place, losses = learner.place[0], learner.losses[0]
+    n_steps, size = len(learner.order), len(learner.batch.actions)
+    place.kl, n_batches, goes_on = 0.0, 0, True
+    for begin in range(0, n_steps, size):
+        n = min(size, n_steps - begin)
+        pick_steps(learner, learner.order[begin : begin + n])
+        goes_on = learn_from_rollout_minibatch(learner, n, learning_rate, clip_range, clip_range_vf)
+        place.policy_gradient += losses.policy_gradient
+        place.value += losses.value
+        place.entropy += losses.entropy
+        place.clipped += losses.clipped
+        place.kl += losses.kl
+        n_batches += 1
+        if not goes_on:
+            break
+    place.kl /= n_batches
+    return n_batches, goes_on
+
+
+@called
+def pick_steps(learner: Any, numbers: Ints) -> None:
+    """Copy these steps of the rollout into the minibatch."""
+    rollout, batch = learner.rollout, learner.batch
+    n_envs = rollout.rewards.shape[1]
+    for k in range(len(numbers)):
+        step, i = numbers[k] // n_envs, numbers[k] % n_envs
+        show(batch.states, k, rollout.observations[step, i], learner.policy.one_hot)
+        batch.actions[k] = int(rollout.actions[step, i, 0])
+        batch.log_probs[k] = rollout.log_probs[step, i]
+        batch.advantages[k] = rollout.advantages[step, i]
+        batch.returns[k] = rollout.returns[step, i]
+        batch.values[k] = rollout.values[step, i]
+
+
+class PolicyAgent(NamedTuple):
+    """What the compiled loop asks.
+
+    Attributes:
+        learner: a reference to a `PolicyLearner`.
+        seen: how observations are read, of `agents.networks.observations`.
+        choose: the address of `choose_randomly`.
+        evaluate: that of `evaluate`.
+        train: that of `train`.
+    """
+
+    learner: Any
+    seen: Any
+    choose: np.uintp
+    evaluate: np.uintp
+    train: np.uintp
+
+    @inlined
+    def act(self, env: Any, progress: Any) -> None:
+        """Draw an action, and note how likely it was and what is expected."""
+        observe(self.seen, env, BEFORE, self.learner.row)
+        env.action = call(self.choose, self.learner, 0.0, 0.0)
+        env.value = self.learner.place[0].expected
+        env.log_probability = self.learner.place[0].log_probability
+
+    @inlined
+    def learn_from_step(self, envs: Any, progress: Any) -> None:
+        """Write the step down, and train at the end of the rollout."""
+        learner = self.learner
+        for i in range(len(envs)):
+            note_step(self, envs[i], i)
+            move_on(self.seen, envs[i])
+        learner.place[0].step += 1
+        if learner.place[0].step == len(learner.rollout.rewards):
+            for i in range(len(envs)):
+                learner.last_values[i] = np.float32(value_at(self, envs[i], BEFORE))
+            call(self.train, learner, progress.remaining, progress.learning_rate)
+
+
+@inlined
+def value_at(agent: PolicyAgent, env: Any, moment: int) -> float:
+    """The value of what an environment showed at that moment."""
+    observe(agent.seen, env, moment, agent.learner.row)
+    call(agent.evaluate, agent.learner, 0.0, 0.0)
+    return float(agent.learner.place[0].expected)
+
+
+@inlined
+def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
+    """Write down the step of environment ``i``."""
+    learner = agent.learner
+    rollout, step = learner.rollout, learner.place[0].step
+    observe(agent.seen, env, BEFORE, rollout.observations[step, i])
+    rollout.actions[step, i, 0] = np.float32(env.action)
+    rollout.values[step, i] = np.float32(env.value)
+    rollout.log_probs[step, i] = np.float32(env.log_probability)
+    rollout.episode_starts[step, i] = learner.starts[i]
+    reward = env.reward
+    if env.done and not env.terminated:
+        # The episode was cut off: what would have come is a part of the reward.
+        reward += learner.rules[0].gamma * value_at(agent, env, AFTER)
+    rollout.rewards[step, i] = np.float32(reward)
+    learner.starts[i] = np.float32(env.done)
+
+
+@kernel
+def act_on_rows(learner: Any, shown: Any, actions: Ints) -> None:
+    """Choose actions, shape (E,), for observations of shape (E, d), and write them down."""
+    rollout, place = learner.rollout, learner.place[0]
+    step = place.step
+    for i in range(len(actions)):
+        copy_row(shown, i, learner.row)
+        actions[i] = choose_randomly(learner, 0.0, 0.0)
+        rollout.values[step, i] = np.float32(place.expected)
+        rollout.log_probs[step, i] = np.float32(place.log_probability)
+        rollout.actions[step, i, 0] = np.float32(actions[i])
+        rollout.episode_starts[step, i] = learner.starts[i]
+        for j in range(shown.shape[1]):
+            rollout.observations[step, i, j] = np.float32(shown[i, j])
+
+
+@kernel
+def evaluate_rows(learner: Any, shown: Any, values: Singles) -> None:
+    """Work out the values, shape (n,), of observations of shape (n, d)."""
+    for i in range(len(values)):
+        copy_row(shown, i, learner.row)
+        evaluate(learner, 0.0, 0.0)
+        values[i] = np.float32(learner.place[0].expected)

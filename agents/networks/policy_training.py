@@ -1,0 +1,309 @@
+"""PPO and A2C on compiled code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from itertools import chain
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.common.callback_horizons import NEVER, Horizon
+from agents.compiled.generators import handles_of
+from agents.compiled.learning_algorithm import compiled_schedule
+from agents.networks.library_networks import (
+    Network,
+    network_of,
+    shared_optimizer,
+    shared_parameters,
+)
+from agents.networks.matrix_products import Singles
+from agents.networks.observations import Numbers
+from agents.networks.optimizers import Optimizer
+from agents.networks.perceptron import make_inputs, make_outputs, n_parameters
+from agents.networks.policy_learner import (
+    PLACE,
+    RULES,
+    PolicyAgent,
+    PolicyLearner,
+    Rollout,
+    act_on_rows,
+    choose_randomly,
+    evaluate,
+    evaluate_rows,
+    train,
+)
+from agents.networks.policy_updates import LOSSES, RolloutMinibatch
+from agents.networks.references import Reference, address_of
+from agents.networks.training import NetworkTraining, record_of, room_for_rows, row_of
+from mdp.array_types import Bools
+
+# How far a number may move that nothing bounds.
+UNBOUNDED = 1e30
+
+# Rollouts that a block may hold where nothing is logged.
+_MOST_ROLLOUTS = 10_000
+
+
+def policy_networks(policy: Any, seen: Any) -> tuple[Network, Network]:
+    """The networks of action probabilities and of values, in the order of the flat vector.
+
+    Raises:
+        NotCompilable: if one is no multilayer perceptron.
+    """
+    one_hot, extractor = isinstance(seen, Numbers), policy.mlp_extractor
+    actor = network_of(chain(extractor.policy_net, [policy.action_net]), 0, one_hot=one_hot)
+    critic = network_of(
+        chain(extractor.value_net, [policy.value_net]),
+        n_parameters(actor.layers),
+        one_hot=one_hot,
+    )
+    return actor, critic
+
+
+@contextmanager
+def policy_training(agent: Any, seen: Any) -> Iterator[PolicyTraining]:
+    """Let the agent's networks and its optimizer lie in the memory of compiled code for a while."""
+    networks = policy_networks(agent.policy, seen)
+    with (
+        shared_parameters(networks) as flat,
+        shared_optimizer(agent.policy.optimizer, networks) as optimizer,
+    ):
+        yield PolicyTraining(agent, seen, networks, flat, optimizer)
+
+
+class PolicyTraining(NetworkTraining):
+    """PPO or A2C in training.
+
+    Args:
+        agent: the agent.
+        seen: how its networks see compiled environments.
+        networks: that of action probabilities and that of values.
+        flat: their parameters.
+        optimizer: what moves them.
+    """
+
+    def __init__(
+        self,
+        agent: Any,
+        seen: Any,
+        networks: tuple[Network, Network],
+        flat: Singles,
+        optimizer: Optimizer,
+    ) -> None:
+        super().__init__(agent, seen, networks, optimizer)
+        actor, critic = (network.layers for network in networks)
+        n_steps = agent.n_steps * agent.n_envs
+        size = min(agent.minibatch_size or n_steps, n_steps)
+        rows = max(size, agent.n_envs)
+        single = make_inputs(actor, 1)
+        self.recorded = 0
+        self.held = PolicyLearner(
+            self._rules(),
+            record_of(PLACE),
+            record_of(LOSSES),
+            actor,
+            critic,
+            flat,
+            np.zeros_like(flat),
+            optimizer,
+            self._rollout(),
+            np.zeros(agent.n_envs, np.float32),
+            np.zeros(agent.n_envs, np.float32),
+            np.arange(n_steps),
+            RolloutMinibatch(
+                make_inputs(actor, size),
+                np.zeros(size, np.int64),
+                *(np.zeros(size, np.float32) for _ in range(4)),
+            ),
+            make_outputs(actor, rows),
+            make_outputs(actor, size),
+            make_outputs(critic, rows),
+            make_outputs(critic, size),
+            single,
+            row_of(single, seen),
+            handles_of([agent.rng]),
+        )
+        self.learner = Reference(self.held)
+        self.shown = room_for_rows(single, seen, agent.n_envs)
+        self.place = self.held.place
+
+    def _rules(self) -> Any:
+        agent = self.agent
+        target_kl = getattr(agent, "target_kl", None)
+        return record_of(
+            RULES,
+            gamma=agent.gamma,
+            gae_lambda=agent.gae_lambda,
+            ent_coef=agent.ent_coef,
+            vf_coef=agent.vf_coef,
+            max_grad_norm=agent.max_grad_norm,
+            target_kl=np.inf if target_kl is None else target_kl,
+            normalize_advantage=agent.normalize_advantage,
+            n_epochs=getattr(agent, "n_epochs", 1),
+            clip_range=_bound(getattr(agent, "clip_range", None)),
+            clip_range_vf=_bound(getattr(agent, "clip_range_vf", None)),
+        )
+
+    def _rollout(self) -> Rollout:
+        buffer = self.agent.rollout_buffer
+        if buffer.generator_ready:
+            # The library has flattened it for its own minibatches.
+            buffer.reset()
+        n_steps, n_envs = buffer.rewards.shape
+        return Rollout(
+            buffer.observations.reshape(n_steps, n_envs, -1),
+            buffer.actions,
+            buffer.rewards,
+            buffer.episode_starts,
+            buffer.values,
+            buffer.log_probs,
+            buffer.advantages,
+            buffer.returns,
+        )
+
+    def in_loop(self) -> PolicyAgent:
+        functions = (choose_randomly, evaluate, train)
+        addresses = (address_of(function, self.learner) for function in functions)
+        return PolicyAgent(self.learner, self.seen, *addresses)
+
+    def schedules(self) -> dict[str, Schedule]:
+        return {"learning_rate": self.agent.lr_schedule}
+
+    def read(self) -> None:
+        agent, place = self.agent, self.place
+        place["step"] = 0 if agent.rollout_buffer.full else agent.rollout_buffer.pos
+        place["n_updates"] = agent._n_updates
+        self.held.starts[:] = agent._last_episode_starts
+
+    def write(self) -> None:
+        super().write()
+        agent, place = self.agent, self.place[0]
+        agent._n_updates = int(place["n_updates"])
+        agent._last_episode_starts = self.held.starts.astype(bool)
+        buffer = agent.rollout_buffer
+        buffer.full = bool(place["n_rollouts"]) and place["step"] == 0
+        buffer.pos = len(buffer.rewards) if buffer.full else int(place["step"])
+
+    def until_end(self, total_timesteps: int) -> int:
+        """As everywhere, but to the end of the last rollout."""
+        begun, whole = int(self.place["step"][0]), int(self.agent.n_steps)
+        return -(-(begun + super().until_end(total_timesteps)) // whole) * whole - begun
+
+    def until_log(self, log_interval: int | None) -> Horizon:
+        in_rollout = self.agent.n_steps - int(self.place["step"][0])
+        if log_interval is None:
+            return Horizon(NEVER, NEVER)
+        iteration = int(self.place["n_rollouts"][0]) + 1
+        # By asking, as a training that was resumed has an interval that counts on.
+        for n_more in range(_MOST_ROLLOUTS):
+            if (iteration + n_more) % log_interval == 0:
+                break
+        return Horizon(in_rollout + n_more * self.agent.n_steps, NEVER)
+
+    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
+        """Nothing: it logs by rollouts."""
+
+    def before_last_step(self, log_interval: int | None) -> None:
+        """Log as the library does, at the end of a rollout and before what is learnt from it."""
+        iteration = int(self.place["n_rollouts"][0]) + 1
+        ends = self.place["step"][0] == self.agent.n_steps - 1
+        if ends and log_interval is not None and iteration % log_interval == 0:
+            self.agent.dump_logs(iteration)
+
+    def collect(self, env: VecEnv, callback: BaseCallback) -> bool:
+        """Fill the rollout buffer from environments in Python, in the library's order of events.
+
+        Returns:
+            False once a callback asks to stop.
+        """
+        agent, held, place = self.agent, self.held, self.place
+        place["step"] = 0
+        actions = np.zeros(env.num_envs, np.int64)
+        callback.on_rollout_start()
+        for step in range(agent.n_steps):
+            place["step"] = step
+            self._show(agent._last_obs)
+            act_on_rows(self.learner, self.shown, actions)
+            new_obs, rewards, dones, infos = env.step(actions.copy())
+            agent.num_timesteps += env.num_envs
+            callback.update_locals(
+                {
+                    "actions": actions,
+                    "new_obs": new_obs,
+                    "rewards": rewards,
+                    "dones": dones,
+                    "infos": infos,
+                }
+            )
+            if not callback.on_step():
+                return False
+            agent._update_info_buffer(infos, dones)
+            held.rollout.rewards[step] = rewards + self._cut_off(dones, infos)
+            agent._last_obs, held.starts[:] = new_obs, dones
+        self._show(agent._last_obs)
+        evaluate_rows(self.learner, self.shown, held.last_values)
+        callback.on_rollout_end()
+        return True
+
+    def _show(self, observations: Any) -> None:
+        self.shown[:] = observations.reshape(self.shown.shape)
+
+    def _cut_off(self, dones: Bools, infos: list[dict[str, Any]]) -> Singles:
+        """What would have come after episodes that ran out of time, shape (E,)."""
+        lost = np.zeros(len(dones), np.float32)
+        values = np.zeros(len(dones), np.float32)
+        for i in np.flatnonzero(dones):
+            if infos[i].get("TimeLimit.truncated", False):
+                self.shown[:] = np.reshape(infos[i]["terminal_observation"], -1)
+                evaluate_rows(self.learner, self.shown[:1], values[:1])
+                lost[i] = self.agent.gamma * values[0]
+        return lost
+
+    def train(self) -> None:
+        """Learn from the rollout, where environments are Python's."""
+        agent = self.agent
+        self.place["n_updates"] = agent._n_updates
+        remaining = agent._current_progress_remaining
+        train(self.learner, remaining, float(agent.lr_schedule(remaining)))
+        self.write()
+        self.record()
+
+    def record(self) -> None:
+        agent, place = self.agent, self.place[0]
+        if place["n_rollouts"] == self.recorded:
+            return
+        self.recorded = place["n_rollouts"]
+        buffer, log = agent.rollout_buffer, agent.logger
+        explained = explained_variance(buffer.values.ravel(), buffer.returns.ravel())
+        remaining = agent._current_progress_remaining
+        log.record("train/learning_rate", agent.lr_schedule(remaining))
+        log.record("train/explained_variance", explained)
+        log.record("train/entropy_loss", place["entropy"])
+        log.record("train/value_loss", place["value"])
+        log.record("train/n_updates", agent._n_updates, exclude="tensorboard")
+        losses = self.held.losses[0]
+        if not hasattr(agent, "clip_range"):
+            log.record("train/policy_loss", losses["likelihood"])
+            return
+        log.record("train/policy_gradient_loss", place["policy_gradient"])
+        log.record("train/approx_kl", place["kl"])
+        log.record("train/clip_fraction", place["clipped"])
+        log.record("train/loss", losses["total"])
+        log.record("train/clip_range", agent.clip_range(remaining))
+        if agent.clip_range_vf is not None:
+            log.record("train/clip_range_vf", agent.clip_range_vf(remaining))
+
+
+def _bound(schedule: Schedule | None) -> tuple[float, ...]:
+    """The schedule of a bound as compiled code reads it.
+
+    Raises:
+        NotCompilable: if it is a Python function.
+    """
+    return tuple(compiled_schedule(UNBOUNDED if schedule is None else schedule))  # type: ignore[arg-type]

@@ -1,0 +1,222 @@
+"""DQN and its kin on compiled code."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.buffers import NStepReplayBuffer
+from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
+
+from agents.common.callback_horizons import NEVER, Horizon
+from agents.compiled.generators import handles_of
+from agents.networks.library_networks import (
+    Network,
+    network_of,
+    shared_optimizer,
+    shared_parameters,
+)
+from agents.networks.matrix_products import Singles
+from agents.networks.observations import Numbers
+from agents.networks.optimizers import Optimizer
+from agents.networks.perceptron import make_inputs, make_outputs
+from agents.networks.q_learner import (
+    PLACE,
+    RULES,
+    QAgent,
+    QLearner,
+    act_on_rows,
+    choose_greedily,
+    train,
+)
+from agents.networks.q_updates import DOUBLE, ONLINE_NETWORK, TARGET_NETWORK
+from agents.networks.references import Reference, address_of
+from agents.networks.replay import Minibatch, Replay
+from agents.networks.training import NetworkTraining, record_of, room_for_rows, row_of
+from mdp.array_types import Ints
+
+_TARGETS = {"double_q": DOUBLE, "online": ONLINE_NETWORK, "target": TARGET_NETWORK}
+
+
+def q_network(network: Any, seen: Any) -> Network:
+    """A network of action values.
+
+    Raises:
+        NotCompilable: if it is no multilayer perceptron.
+    """
+    return network_of(network.q_net, 0, one_hot=isinstance(seen, Numbers))
+
+
+@contextmanager
+def q_training(agent: Any, seen: Any) -> Iterator[QTraining]:
+    """Let the agent's networks and its optimizer lie in the memory of compiled code for a while."""
+    online, lagging = q_network(agent.q_net, seen), q_network(agent.q_net_target, seen)
+    with (
+        shared_parameters([online]) as flat,
+        shared_parameters([lagging]) as target,
+        shared_optimizer(agent.policy.optimizer, [online]) as optimizer,
+    ):
+        yield QTraining(agent, seen, online, flat, target, optimizer)
+
+
+class QTraining(NetworkTraining):
+    """DQN, double DQN or deep Q-learning in training.
+
+    Args:
+        agent: the agent.
+        seen: how its network sees compiled environments.
+        network: the network.
+        flat: its parameters.
+        target: those of its lagging copy.
+        optimizer: what moves them.
+    """
+
+    def __init__(
+        self,
+        agent: Any,
+        seen: Any,
+        network: Network,
+        flat: Singles,
+        target: Singles,
+        optimizer: Optimizer,
+    ) -> None:
+        super().__init__(agent, seen, (network,), optimizer)
+        layers, n = network.layers, agent.batch_size
+        single = make_inputs(layers, 1)
+        self.held = QLearner(
+            self._rules(),
+            record_of(PLACE, decided_at=-1),
+            layers,
+            flat,
+            target,
+            np.zeros_like(flat),
+            optimizer,
+            self._replay(),
+            Minibatch(
+                make_inputs(layers, n),
+                make_inputs(layers, n),
+                np.zeros(n, np.int64),
+                np.zeros(n, np.float32),
+                np.zeros(n, np.float32),
+            ),
+            make_outputs(layers, n),
+            make_outputs(layers, n),
+            make_outputs(layers, n),
+            single,
+            row_of(single, seen),
+            make_outputs(layers, 1),
+            handles_of([agent.rng]),
+        )
+        self.learner = Reference(self.held)
+        self.shown = room_for_rows(single, seen, agent.n_envs)
+        self.place = self.held.place
+
+    def _rules(self) -> Any:
+        agent = self.agent
+        buffer = agent.replay_buffer
+        n_steps = buffer.n_steps if type(buffer) is NStepReplayBuffer else 1
+        return record_of(
+            RULES,
+            gamma=agent.gamma,
+            tau=agent.tau,
+            max_grad_norm=agent.max_grad_norm,
+            largest_error=agent.largest_error,
+            target_kind=_TARGETS[agent.target_kind],
+            n_steps=n_steps,
+            learning_starts=agent.learning_starts,
+            train_freq=agent.train_freq.frequency,
+            counts_episodes=agent.train_freq.unit == TrainFrequencyUnit.EPISODE,
+            gradient_steps=agent.gradient_steps,
+            target_interval=max(agent.target_update_interval // agent.n_envs, 1),
+        )
+
+    def _replay(self) -> Replay:
+        buffer = self.agent.replay_buffer
+        n_places, n_envs = buffer.rewards.shape
+        return Replay(
+            buffer.observations.reshape(n_places, n_envs, -1),
+            buffer.next_observations.reshape(n_places, n_envs, -1),
+            buffer.actions,
+            buffer.rewards,
+            buffer.dones,
+            buffer.timeouts,
+        )
+
+    def in_loop(self) -> QAgent:
+        learner = self.learner
+        return QAgent(
+            learner, self.seen, address_of(choose_greedily, learner), address_of(train, learner)
+        )
+
+    def schedules(self) -> dict[str, Schedule]:
+        return {
+            "exploration": self.agent.exploration_schedule,
+            "learning_rate": self.agent.lr_schedule,
+        }
+
+    def read(self) -> None:
+        agent, place = self.agent, self.place
+        place["position"], place["full"] = agent.replay_buffer.pos, agent.replay_buffer.full
+        place["n_calls"], place["n_updates"] = agent._n_calls, agent._n_updates
+        place["exploration_rate"] = agent.exploration_rate
+        place["collected"], place["collected_episodes"] = agent.collected
+
+    def write(self) -> None:
+        super().write()
+        agent, place = self.agent, self.place[0]
+        buffer = agent.replay_buffer
+        buffer.pos, buffer.full = int(place["position"]), bool(place["full"])
+        agent._n_calls, agent._n_updates = int(place["n_calls"]), int(place["n_updates"])
+        agent.exploration_rate = float(place["exploration_rate"])
+        agent.collected = (int(place["collected"]), int(place["collected_episodes"]))
+
+    def until_end(self, total_timesteps: int) -> int:
+        """As everywhere, but until it would be time to train."""
+        left, place, rules = super().until_end(total_timesteps), self.place[0], self.held.rules[0]
+        begun, whole = int(place["collected"]), int(rules["train_freq"])
+        if rules["counts_episodes"]:
+            return max(left, min(begun, 1))
+        return -(-(begun + left) // whole) * whole - begun
+
+    def until_log(self, log_interval: int | None) -> Horizon:
+        if log_interval is None:
+            return Horizon(NEVER, NEVER)
+        return Horizon(NEVER, log_interval - self.agent._episode_num % log_interval)
+
+    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
+        agent = self.agent
+        before = agent._episode_num
+        agent._episode_num += n_episodes
+        if log_interval is not None and agent._episode_num // log_interval > before // log_interval:
+            agent.dump_logs()
+
+    def act(self) -> Ints:
+        """Actions for the agent's present observations, where environments are Python's."""
+        self.read()
+        self.shown[:] = self.agent._last_obs.reshape(self.shown.shape)
+        actions = np.zeros(len(self.shown), np.int64)
+        act_on_rows(self.learner, self.shown, self.agent.num_timesteps, actions)
+        return actions
+
+    def train(self, n_updates: int) -> None:
+        """Learn from minibatches of the replay buffer, where environments are Python's."""
+        self.read()
+        train(self.learner, float(n_updates), self._learning_rate())
+        self.agent._n_updates += n_updates
+        self.record()
+
+    def before_last_step(self, log_interval: int | None) -> None:
+        """Nothing: it logs by episodes."""
+
+    def record(self) -> None:
+        agent, place = self.agent, self.place[0]
+        agent.logger.record("rollout/exploration_rate", agent.exploration_rate)
+        if place["n_losses"]:
+            agent.logger.record("train/n_updates", agent._n_updates, exclude="tensorboard")
+            agent.logger.record("train/loss", place["losses"] / place["n_losses"])
+            agent.logger.record("train/learning_rate", self._learning_rate())
+
+    def _learning_rate(self) -> float:
+        return float(self.agent.lr_schedule(self.agent._current_progress_remaining))

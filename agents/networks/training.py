@@ -1,0 +1,95 @@
+"""What an agent of the library and compiled code hand to each other while it trains."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.type_aliases import Schedule
+
+from agents.common.callback_horizons import NEVER, Horizon
+from agents.networks.library_networks import Network, tell_steps
+from agents.networks.observations import Numbers
+from agents.networks.optimizers import Optimizer
+from agents.networks.perceptron import Inputs
+
+
+class NetworkTraining(ABC):
+    """An agent of the library in training.
+
+    Args:
+        agent: the agent.
+        seen: how its networks see compiled environments.
+        networks: those that are trained, in the order of the flat vector.
+        optimizer: what moves them.
+
+    Attributes:
+        learner: the agent as compiled functions see it.
+    """
+
+    learner: Any
+
+    def __init__(
+        self, agent: Any, seen: Any, networks: tuple[Network, ...], optimizer: Optimizer
+    ) -> None:
+        self.agent = agent
+        self.seen = seen
+        self.networks = networks
+        self.optimizer = optimizer
+
+    @abstractmethod
+    def in_loop(self) -> Any:
+        """What the compiled loop asks."""
+
+    @abstractmethod
+    def schedules(self) -> dict[str, Schedule]:
+        """What compiled code works out after each step, by the names in its record."""
+
+    @abstractmethod
+    def read(self) -> None:
+        """Begin where the agent is."""
+
+    def write(self) -> None:
+        """Let the agent know where compiled code is."""
+        tell_steps(self.agent.policy.optimizer, self.networks[0].linears, self.optimizer.n_steps)
+
+    def until_end(self, total_timesteps: int) -> int:
+        """Steps of every environment until the training is over."""
+        left: int = total_timesteps - self.agent.num_timesteps
+        return -(-left // int(self.agent.n_envs))
+
+    def until_log(self, log_interval: int | None) -> Horizon:
+        """When something is logged next."""
+        return Horizon(NEVER, NEVER)
+
+    @abstractmethod
+    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
+        """Let the agent know of episodes that have ended, and log where it is time to."""
+
+    @abstractmethod
+    def before_last_step(self, log_interval: int | None) -> None:
+        """What comes between the callbacks and learning from the last step of a block."""
+
+    @abstractmethod
+    def record(self) -> None:
+        """Hand what the last training has given to the agent's logger."""
+
+
+def row_of(inputs: Inputs, seen: Any) -> Any:
+    """The memory of a single observation, as the row that it is written to."""
+    return inputs.indices if isinstance(seen, Numbers) else inputs.vectors[0]
+
+
+def room_for_rows(inputs: Inputs, seen: Any, n: int) -> Any:
+    """Room for ``n`` observations of environments in Python, shape (n, d)."""
+    row = row_of(inputs, seen)
+    return np.zeros((n, len(row)), row.dtype)
+
+
+def record_of(kind: np.dtype[np.void], **values: Any) -> Any:
+    """A record, alone in an array."""
+    records = np.zeros(1, dtype=kind)
+    for name, value in values.items():
+        records[name] = value
+    return records

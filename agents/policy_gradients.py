@@ -1,0 +1,73 @@
+"""Stable-Baselines3's PPO and A2C, which can train on compiled code."""
+
+from __future__ import annotations
+
+import inspect
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar
+
+import stable_baselines3
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.common.signatures import full_signature
+from agents.networks.coverage import check_policy_agent
+from agents.networks.engine_setting import CompiledNetworks
+from agents.networks.library_networks import check_optimizer
+from agents.networks.policy_training import PolicyTraining, policy_networks, policy_training
+
+
+class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
+    """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does."""
+
+    _training: PolicyTraining | None
+
+    @property
+    def minibatch_size(self) -> int | None:
+        """Steps that are learnt from at once; None for all of a rollout."""
+        return getattr(self, "batch_size", None)
+
+    def _check_compilable(self) -> None:
+        check_policy_agent(self)
+        check_optimizer(self.policy.optimizer)
+        policy_networks(self.policy, self._seen_in_python())
+
+    def _compiled_training(self, seen: Any) -> AbstractContextManager[PolicyTraining]:
+        return policy_training(self, seen)
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fill the rollout buffer; False once a callback asks to stop."""
+        if self._training is None:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        return self._training.collect(env, callback)
+
+    def train(self) -> None:
+        """Learn from the rollout buffer."""
+        if self._training is None:
+            super().train()
+        else:
+            self._training.train()
+
+
+class PPO(CompiledPolicyGradient, stable_baselines3.PPO):
+    """Stable-Baselines3's PPO (Schulman et al., 2017), with the argument ``engine``."""
+
+    __signature__: ClassVar[inspect.Signature]
+
+
+class A2C(CompiledPolicyGradient, stable_baselines3.A2C):
+    """Stable-Baselines3's A2C (Mnih et al., 2016), with the argument ``engine``."""
+
+    __signature__: ClassVar[inspect.Signature]
+
+
+for _algorithm in (PPO, A2C):
+    _algorithm.__signature__ = full_signature(_algorithm)
