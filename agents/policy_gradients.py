@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
     """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does."""
 
     _training: PolicyTraining | None
+    _shared_training: Callable[[], PolicyTraining]
 
     @property
     def minibatch_size(self) -> int | None:
@@ -45,9 +47,10 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         n_rollout_steps: int,
     ) -> bool:
         """Fill the rollout buffer; False once a callback asks to stop."""
-        if self._training is None:
+        if self._sharing is None:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-        return self._training.collect(env, callback)
+        callback.on_rollout_start()
+        return self._shared_training().collect(env, callback)
 
     def train(self) -> None:
         """Learn from the rollout buffer."""

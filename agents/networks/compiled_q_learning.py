@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar, Literal
 
@@ -29,6 +30,7 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
     largest_error: ClassVar[float] = 1.0
 
     _training: QTraining | None
+    _shared_training: Callable[[], QTraining]
     _own = (*CompiledNetworks._own, "collected")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -46,9 +48,9 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        if self._training is None:
+        if self._sharing is None:
             return super()._sample_action(learning_starts, action_noise, n_envs)
-        actions = self._training.act()
+        actions = self._shared_training().act()
         return actions, actions
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from abc import abstractmethod
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -44,14 +44,15 @@ class CompiledNetworks(BaseAlgorithm):
     rng: np.random.Generator
 
     # Of the training under way.
-    not_in_snapshots = ("_training",)
-    _own: ClassVar[tuple[str, ...]] = ("engine", "engine_in_use", "rng", "_training")
+    not_in_snapshots = ("_training", "_sharing")
+    _own: ClassVar[tuple[str, ...]] = ("engine", "engine_in_use", "rng", "_training", "_sharing")
 
     def __init__(self, *args: Any, engine: NetworkEngineChoice = "library", **kwargs: Any) -> None:
         check_option("engine", engine, NetworkEngineChoice)
         self.engine = engine
         self.engine_in_use = ""
         self._training: Any = None
+        self._sharing: ExitStack | None = None
         super().__init__(*args, **kwargs)
 
     def set_random_seed(self, seed: int | None = None) -> None:
@@ -89,12 +90,24 @@ class CompiledNetworks(BaseAlgorithm):
     @contextmanager
     def _learning_compiled(self) -> Iterator[None]:
         """Let the library's loop act and learn by compiled code."""
-        with one_thread(), self._compiled_training(self._seen_in_python()) as training:
-            self._training = training
+        with one_thread(), ExitStack() as sharing:
+            self._sharing = sharing
             try:
                 yield
             finally:
-                self._training = None
+                self._sharing = self._training = None
+
+    def _shared_training(self) -> NetworkTraining:
+        """The training under way, which begins with the first rollout.
+
+        Not before: a run that was cut off goes back to its last state there.
+        """
+        if self._training is None:
+            assert self._sharing is not None
+            training = self._compiled_training(self._seen_in_python())
+            self._training = self._sharing.enter_context(training)
+        training_now: NetworkTraining = self._training
+        return training_now
 
     def _takes_compiled(self) -> bool:
         if self.engine == "library":
@@ -148,6 +161,8 @@ class CompiledNetworks(BaseAlgorithm):
         )
         callback.on_training_start(locals(), globals())
         if self.num_timesteps < total_timesteps:
+            # A run that was cut off goes back to its last state here.
+            callback.on_rollout_start()
             with one_thread(), self._compiled_training(seen) as training:
                 NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
         callback.on_training_end()

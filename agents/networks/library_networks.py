@@ -163,55 +163,40 @@ def shared_optimizer(
         The optimizer as compiled code sees it.
     """
     kind, names = _kind(optimizer)
-    vectors = {name: FlatTensors(networks) for name in names}
-    first = vectors[names[-1]]
     known: Any = optimizer.state
-    begun = any(parameter in known for parameter, _ in first.places())
-    n_steps = np.zeros(1, np.int64)
-    if begun:
-        n_steps[0] = int(known[first.linears[0].weight]["step"])
-    for name, tensors in vectors.items():
+    means = {name: FlatTensors(networks) for name in names}
+    parameters = [parameter for parameter, _ in means[names[0]].places()]
+    n_steps = np.zeros(1, np.float32)
+    if parameters[0] in known:
+        n_steps[0] = float(known[parameters[0]]["step"])
+    for name, tensors in means.items():
         for parameter, place in tensors.places():
-            # As the library has it: the sum of squares begins with ones there.
-            empty = 1.0 if kind == RMSPROP_TENSORFLOW else 0.0
-            place.copy_(known[parameter][name]) if begun else place.fill_(empty)
+            # As the library has it: the mean of squares begins with ones there.
+            begins = 1.0 if kind == RMSPROP_TENSORFLOW else 0.0
+            place.copy_(known[parameter].get(name, th.tensor(begins)))
             known[parameter][name] = place
-    mean_square = vectors[names[-1]].vector
-    defaults = optimizer.defaults
-    momentum, smoothing = defaults.get("betas", (0.0, defaults.get("alpha", 0.0)))
-    shared = Optimizer(
-        kind,
-        float(momentum),
-        float(smoothing),
-        float(defaults["eps"]),
-        vectors[names[0]].vector,
-        mean_square,
-        n_steps,
-    )
+    for parameter in parameters:
+        known[parameter]["step"] = th.from_numpy(n_steps)[0]
+    vectors = [tensors.vector for tensors in means.values()]
+    momentum, smoothing = optimizer.defaults.get("betas", (0.0, optimizer.defaults.get("alpha")))
+    epsilon = optimizer.defaults["eps"]
     try:
-        yield shared
+        yield Optimizer(kind, momentum, smoothing, epsilon, vectors[0], vectors[-1], n_steps)
     finally:
-        tell_steps(optimizer, first.linears, n_steps)
-        for tensors in vectors.values():
-            for parameter, _ in tensors.places():
-                _own_memory(known, parameter, vectors)
+        for parameter in parameters:
+            known[parameter] = _own_memory(known[parameter], kind)
         if not n_steps[0]:
             known.clear()
 
 
-def tell_steps(optimizer: th.optim.Optimizer, linears: Sequence[nn.Linear], n_steps: Any) -> None:
-    """Let the library's optimizer know how many steps it has taken."""
-    known: Any = optimizer.state
-    for linear in linears:
-        for parameter in (linear.weight, linear.bias):
-            counts = int(n_steps[0])
-            own = type(optimizer) is RMSpropTFLike
-            known[parameter]["step"] = counts if own else th.tensor(float(counts))
-
-
-def _own_memory(known: Any, parameter: th.Tensor, names: Iterable[str]) -> None:
-    for name in names:
-        known[parameter][name] = known[parameter][name].clone(memory_format=th.contiguous_format)
+def _own_memory(state: dict[str, Any], kind: int) -> dict[str, Any]:
+    """What an optimizer knows of a parameter, as PyTorch would have it in memory."""
+    copied = {
+        name: tensor.clone(memory_format=th.contiguous_format) for name, tensor in state.items()
+    }
+    if kind == RMSPROP_TENSORFLOW:
+        copied["step"] = int(copied["step"])
+    return copied
 
 
 def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:

@@ -48,6 +48,7 @@ class NetworkEngine(CompiledEngine):
     ) -> None:
         self.training = training
         self.steps_at_once = 1
+        self.has_begun = False
         self.in_loop = training.in_loop()
         super().__init__(training.agent, world, callback, log_interval)
 
@@ -96,7 +97,10 @@ class NetworkEngine(CompiledEngine):
         return True
 
     def _begin_rollout(self) -> None:
-        if wants_position(self.callback):
+        if not self.has_begun:
+            # Callbacks have been told already.
+            self.has_begun = True
+        elif wants_position(self.callback):
             self._write()
             self.callback.on_rollout_start()
             self._read()

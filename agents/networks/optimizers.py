@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.networks.matrix_products import Singles
-from mdp.array_types import Ints
 from mdp.machine_code import vectorised
 
 ADAM, RMSPROP, RMSPROP_TENSORFLOW = range(3)
@@ -33,7 +32,7 @@ class Optimizer(NamedTuple):
         epsilon: keeps divisors from zero.
         mean: running mean of gradients, as long as the parameters.
         mean_square: of their squares.
-        n_steps: steps taken so far, alone in an array.
+        n_steps: steps taken so far, alone in an array, in single precision as PyTorch has it.
     """
 
     kind: int
@@ -42,7 +41,7 @@ class Optimizer(NamedTuple):
     epsilon: float
     mean: Singles
     mean_square: Singles
-    n_steps: Ints
+    n_steps: Singles
 
 
 @vectorised
@@ -55,7 +54,7 @@ def descend(
 ) -> None:
     """Take one step against the gradient, whose norm is clipped first."""
     scale = _clipping(gradient, max_grad_norm)
-    optimizer.n_steps[0] += 1
+    optimizer.n_steps[0] += np.float32(1)
     if optimizer.kind == ADAM:
         _adam(optimizer, flat, gradient, scale, learning_rate)
     else:
@@ -75,7 +74,7 @@ def _clipping(gradient: Singles, max_grad_norm: float) -> Any:
 def _adam(
     optimizer: Optimizer, flat: Singles, gradient: Singles, scale: Any, learning_rate: float
 ) -> None:
-    n_steps = optimizer.n_steps[0]
+    n_steps = float(optimizer.n_steps[0])
     rate = np.float32(1 - optimizer.momentum)
     kept, square_rate = np.float32(optimizer.smoothing), np.float32(1 - optimizer.smoothing)
     step_size = np.float32(learning_rate / (1 - optimizer.momentum**n_steps))

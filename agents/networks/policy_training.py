@@ -96,7 +96,7 @@ class PolicyTraining(NetworkTraining):
         flat: Singles,
         optimizer: Optimizer,
     ) -> None:
-        super().__init__(agent, seen, networks, optimizer)
+        super().__init__(agent, seen)
         actor, critic = (network.layers for network in networks)
         n_steps = agent.n_steps * agent.n_envs
         size = min(agent.minibatch_size or n_steps, n_steps)
@@ -182,7 +182,6 @@ class PolicyTraining(NetworkTraining):
         self.held.starts[:] = agent._last_episode_starts
 
     def write(self) -> None:
-        super().write()
         agent, place = self.agent, self.place[0]
         agent._n_updates = int(place["n_updates"])
         agent._last_episode_starts = self.held.starts.astype(bool)
@@ -219,13 +218,14 @@ class PolicyTraining(NetworkTraining):
     def collect(self, env: VecEnv, callback: BaseCallback) -> bool:
         """Fill the rollout buffer from environments in Python, in the library's order of events.
 
+        It has begun: callbacks have been told.
+
         Returns:
             False once a callback asks to stop.
         """
         agent, held, place = self.agent, self.held, self.place
         place["step"] = 0
         actions = np.zeros(env.num_envs, np.int64)
-        callback.on_rollout_start()
         for step in range(agent.n_steps):
             place["step"] = step
             self._show(agent._last_obs)

@@ -82,7 +82,7 @@ class QTraining(NetworkTraining):
         target: Singles,
         optimizer: Optimizer,
     ) -> None:
-        super().__init__(agent, seen, (network,), optimizer)
+        super().__init__(agent, seen)
         layers, n = network.layers, agent.batch_size
         single = make_inputs(layers, 1)
         self.held = QLearner(
@@ -164,7 +164,6 @@ class QTraining(NetworkTraining):
         place["collected"], place["collected_episodes"] = agent.collected
 
     def write(self) -> None:
-        super().write()
         agent, place = self.agent, self.place[0]
         buffer = agent.replay_buffer
         buffer.pos, buffer.full = int(place["position"]), bool(place["full"])

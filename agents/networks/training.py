@@ -9,9 +9,7 @@ import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.callback_horizons import NEVER, Horizon
-from agents.networks.library_networks import Network, tell_steps
 from agents.networks.observations import Numbers
-from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs
 
 
@@ -21,8 +19,6 @@ class NetworkTraining(ABC):
     Args:
         agent: the agent.
         seen: how its networks see compiled environments.
-        networks: those that are trained, in the order of the flat vector.
-        optimizer: what moves them.
 
     Attributes:
         learner: the agent as compiled functions see it.
@@ -30,13 +26,9 @@ class NetworkTraining(ABC):
 
     learner: Any
 
-    def __init__(
-        self, agent: Any, seen: Any, networks: tuple[Network, ...], optimizer: Optimizer
-    ) -> None:
+    def __init__(self, agent: Any, seen: Any) -> None:
         self.agent = agent
         self.seen = seen
-        self.networks = networks
-        self.optimizer = optimizer
 
     @abstractmethod
     def in_loop(self) -> Any:
@@ -50,9 +42,9 @@ class NetworkTraining(ABC):
     def read(self) -> None:
         """Begin where the agent is."""
 
+    @abstractmethod
     def write(self) -> None:
         """Let the agent know where compiled code is."""
-        tell_steps(self.agent.policy.optimizer, self.networks[0].linears, self.optimizer.n_steps)
 
     def until_end(self, total_timesteps: int) -> int:
         """Steps of every environment until the training is over."""
