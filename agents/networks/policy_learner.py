@@ -49,6 +49,7 @@ PLACE = np.dtype(
         ("entropy", np.float64),
         ("clipped", np.float64),
         ("kl", np.float64),  # over its last epoch
+        ("learning_rate", np.float64),
         ("expected", np.float64),  # value of the observation that was looked at last
         ("log_probability", np.float64),  # of the action that was drawn last
     ],
@@ -164,6 +165,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     estimate_advantages(learner)
     place.step = 0
     place.n_rollouts += 1
+    place.learning_rate = learning_rate
     clip_range = schedule_value(rules.clip_range, remaining)
     clip_range_vf = schedule_value(rules.clip_range_vf, remaining)
     place.policy_gradient = place.value = place.entropy = place.clipped = 0.0

@@ -182,6 +182,7 @@ class PolicyTraining(NetworkTraining):
         self.held.starts[:] = agent._last_episode_starts
 
     def write(self) -> None:
+        super().write()
         agent, place = self.agent, self.place[0]
         agent._n_updates = int(place["n_updates"])
         agent._last_episode_starts = self.held.starts.astype(bool)
@@ -282,7 +283,7 @@ class PolicyTraining(NetworkTraining):
         buffer, log = agent.rollout_buffer, agent.logger
         explained = explained_variance(buffer.values.ravel(), buffer.returns.ravel())
         remaining = agent._current_progress_remaining
-        log.record("train/learning_rate", agent.lr_schedule(remaining))
+        log.record("train/learning_rate", place["learning_rate"])
         log.record("train/explained_variance", explained)
         log.record("train/entropy_loss", place["entropy"])
         log.record("train/value_loss", place["value"])

@@ -50,6 +50,7 @@ PLACE = np.dtype(
         ("explores", np.bool_),
         ("losses", np.float64),  # sum over the last training
         ("n_losses", np.int64),
+        ("learning_rate", np.float64),  # of the last training
     ],
     align=True,
 )
@@ -106,7 +107,7 @@ def choose_greedily(learner: Any, _: float, __: float) -> int:
 def train(learner: Any, n_updates: float, learning_rate: float) -> int:
     """Learn from ``n_updates`` minibatches, whose number is returned."""
     place, generator = learner.place[0], generator_of(learner.rng[0])
-    place.losses, place.n_losses = 0.0, int(n_updates)
+    place.losses, place.n_losses, place.learning_rate = 0.0, int(n_updates), learning_rate
     for _ in range(int(n_updates)):
         draw_minibatch(
             learner.replay,

@@ -164,6 +164,7 @@ class QTraining(NetworkTraining):
         place["collected"], place["collected_episodes"] = agent.collected
 
     def write(self) -> None:
+        super().write()
         agent, place = self.agent, self.place[0]
         buffer = agent.replay_buffer
         buffer.pos, buffer.full = int(place["position"]), bool(place["full"])
@@ -203,7 +204,7 @@ class QTraining(NetworkTraining):
         """Learn from minibatches of the replay buffer, where environments are Python's."""
         self.read()
         train(self.learner, float(n_updates), self._learning_rate())
-        self.agent._n_updates += n_updates
+        self.write()
         self.record()
 
     def before_last_step(self, log_interval: int | None) -> None:
@@ -215,7 +216,7 @@ class QTraining(NetworkTraining):
         if place["n_losses"]:
             agent.logger.record("train/n_updates", agent._n_updates, exclude="tensorboard")
             agent.logger.record("train/loss", place["losses"] / place["n_losses"])
-            agent.logger.record("train/learning_rate", self._learning_rate())
+            agent.logger.record("train/learning_rate", place["learning_rate"])
 
     def _learning_rate(self) -> float:
         return float(self.agent.lr_schedule(self.agent._current_progress_remaining))

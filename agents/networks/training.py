@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import update_learning_rate
 
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.networks.observations import Numbers
@@ -22,9 +23,11 @@ class NetworkTraining(ABC):
 
     Attributes:
         learner: the agent as compiled functions see it.
+        place: how far the training is, a record alone in an array.
     """
 
     learner: Any
+    place: Any
 
     def __init__(self, agent: Any, seen: Any) -> None:
         self.agent = agent
@@ -42,9 +45,11 @@ class NetworkTraining(ABC):
     def read(self) -> None:
         """Begin where the agent is."""
 
-    @abstractmethod
     def write(self) -> None:
         """Let the agent know where compiled code is."""
+        learning_rate = float(self.place["learning_rate"][0])
+        if learning_rate > 0:
+            update_learning_rate(self.agent.policy.optimizer, learning_rate)
 
     def until_end(self, total_timesteps: int) -> int:
         """Steps of every environment until the training is over."""
