@@ -108,7 +108,9 @@ def run_command(main: Callable[[], int]) -> NoReturn:
         code = _exit_code(main)
         if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
             code = code or MISTAKE
-    default_for_signals()  # what is left to do would tell of one in a traceback
+    # What is left to do would tell of one in a traceback. Not now: who calls this in a process of
+    # their own, as tests do, have it for longer.
+    atexit.register(default_for_signals)
     if n_stops() > before:
         codes.append(code)
     sys.exit(code)
