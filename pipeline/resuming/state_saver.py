@@ -21,6 +21,7 @@ from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
 from pipeline.resuming.log_positions import log_positions
+from pipeline.resuming.monitor_rows import held_in, lists_in_files, read_back
 from pipeline.resuming.saved_states import SavedState, save_state
 from pipeline.resuming.state_folder import settings_digest
 from pipeline.resuming.state_keeping import SaveInterval
@@ -182,13 +183,17 @@ class StateSaver(StopAtSafeMoment):
         environment = self.training_env.unwrapped
         if isinstance(environment, SubprocVecEnv):
             raise NotRecordableError("--vec-env subproc", "environments are in other processes")
-        snapshot = record(self._roots(), _CONSTANTS)
+        positions = log_positions(self.run.path, _log_folder(self.model))
+        in_files = lists_in_files(self.training_env, self.run.path, positions)
+        episodes = held_in(self.training_env, self.run.path, in_files)
+        snapshot = record(self._roots(), _CONSTANTS, episodes)
         for lost in snapshot.lost:
             self._tell_once(f"{lost} is not kept: a run that goes by it may differ after --resume")
         note = {
             "folder": self._folder_names(),
             "log_folder": _log_folder(self.model),
-            "files": log_positions(self.run.path, _log_folder(self.model)),
+            "files": positions,
+            "episodes": in_files,
             "steps": self.model.num_timesteps,
             "rollouts": self.n_rollouts,
             **self.taken.as_data(),
@@ -214,6 +219,7 @@ class StateSaver(StopAtSafeMoment):
         moved = dict(zip(state.note["folder"], self._folder_names(), strict=True))
         try:
             restore(state.snapshot, roots, moved)
+            read_back(self.training_env, self.run.path, state.note.get("episodes", {}))
         except NotRestorableError as error:
             raise UserError(
                 f"{self.run.state_path} does not fit what the run's settings make today: {error}; "
