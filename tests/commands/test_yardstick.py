@@ -185,3 +185,13 @@ def test_ctrl_c_while_the_command_itself_is_imported(monkeypatch, capsys, progra
         (script if program.endswith(".py") else yardstick.main)()
     assert getattr(stop.value, "code", None) == 130
     assert "Traceback" not in capsys.readouterr().err
+
+
+def test_ctrl_c_while_the_last_word_is_being_said(monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("commands.parsing.print", interrupted, raising=False)
+    with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
+        run_command(interrupted)
+    assert getattr(stop.value, "code", None) == 130
