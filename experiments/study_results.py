@@ -195,6 +195,8 @@ def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
         files.check(path)
     if planned.seed == study.first_seed:
         files.check(run.model_path)
+        if not run.model_path.exists():  # of a run that recorded no digests
+            raise DamagedFileError(run.model_path, "is missing")
 
 
 def _curve(planned: PlannedRun, kind: str, columns: dict[str, Floats]) -> pd.DataFrame:

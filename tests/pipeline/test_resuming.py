@@ -283,6 +283,14 @@ def test_a_state_beside_other_settings_is_refused(tmp_path, monkeypatch):
         go_on(run, StateKeeping(), pytest.fail)
 
 
+def test_a_run_under_way_cannot_be_taken_for_one_of_an_earlier_version(tmp_path, monkeypatch):
+    run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
+    record = json.loads(run.info_path.read_text())
+    run.info_path.write_text(json.dumps({**record, "state": "finished"}))
+    with pytest.raises(UserError, match="it has lost the digests"):
+        run.read_info()
+
+
 def test_what_has_changed_since_the_run_began_is_told(tmp_path, monkeypatch):
     begun = undisturbed(spec_of(tmp_path / "first", GRID, "qlearning", 300, {}))
     agent, module = tmp_path / "agent.zip", tmp_path / "things_of_mine.py"
