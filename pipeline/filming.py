@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,6 +30,8 @@ def check_film_path(path: Path) -> None:
         raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
     if not path.absolute().parent.is_dir():
         raise UserError(f"--record: there is no folder {path.parent}")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise UserError(f"--record: nothing can be written in {path.parent}")
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise UserError("--record to .mp4 needs: pip install 'rl-yardstick[video]'")
 

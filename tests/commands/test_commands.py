@@ -21,7 +21,8 @@ from commands.parsing import run_command
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
-from pipeline.filming import FRAMES_PER_SECOND, write_film
+from pipeline.errors import UserError
+from pipeline.filming import FRAMES_PER_SECOND, check_film_path, write_film
 from pipeline.settings import hyperparam_entries
 
 ROOT = Path(train.__file__).parent
@@ -155,6 +156,12 @@ def test_filming(type_command, tmp_path, suffix):
         assert sum(durations) == 8 * 1000 // FRAMES_PER_SECOND
     else:
         assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_where_no_film_can_be_written_nothing_is_played(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *_: False)  # as on a read-only disk, also for root
+    with pytest.raises(UserError, match="--record: nothing can be written in "):
+        check_film_path(tmp_path / "film.gif")
 
 
 @pytest.mark.parametrize("suffix", ["gif", "mp4"])
