@@ -184,6 +184,24 @@ def test_every_agent_is_tried():
     assert {algo for _, algo, _, _ in TRAININGS} == set(ALGORITHMS)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "algo", "settings"),
+    [
+        (GRID, "qlearning", {"engine": "compiled"}),
+        (GRID, "sarsa", {"engine": "interpreted", "n_envs": 3}),
+        (ARMS, "thompson", {}),
+        (LINEAR, "linucb", {}),
+    ],
+)
+def test_so_it_is_where_a_trained_agent_goes_on(tmp_path, monkeypatch, env_id, algo, settings):
+    begun = undisturbed(spec_of(tmp_path / "first", env_id, algo, 200, settings))
+    trained = {"trained_agent": begun.run.model_path}
+    whole = undisturbed(spec_of(tmp_path / "whole", env_id, algo, 600, settings, **trained))
+    run = cut_off(spec_of(tmp_path / "parts", env_id, algo, 600, settings, **trained), monkeypatch)
+    assert gone_on(run).n_steps == whole.n_steps > 600
+    assert_same(whole.run, run)
+
+
 def test_a_state_makes_the_difference(tmp_path, monkeypatch):
     """Of generators that are not put back, the weights tell."""
     spec = spec_of(tmp_path / "whole", LEFT_RIGHT, "dqn", 300, EAGER)
