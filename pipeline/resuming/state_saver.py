@@ -18,6 +18,7 @@ from agents.common.callback_horizons import Horizon
 from mdp.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.files import sync_file
 from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
 from pipeline.resuming.log_positions import log_positions
@@ -200,6 +201,8 @@ class StateSaver(StopAtSafeMoment):
             "pause": self.pause,
             "spec": settings_digest(self.run.recorded_spec()),
         }
+        for name in positions:  # a state is of no use without what it is held against
+            sync_file(self.run.path / name)
         save_state(self.run.state_path, self.n_saved + 1, snapshot, note)
         self.n_saved += 1
 

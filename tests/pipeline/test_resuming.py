@@ -387,6 +387,20 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
     assert told[0].startswith(said.format(folder=outcome.run.state_path))
 
 
+def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeypatch):
+    """After a power cut a state would be there whose rows of Monitor are not."""
+    order = []
+    saver, save = "pipeline.resuming.state_saver", saved_states.save_state
+    monkeypatch.setattr(f"{saver}.sync_file", lambda path: order.append(path.name))
+    monkeypatch.setattr(f"{saver}.save_state", lambda *args: (order.append("state"), save(*args)))
+    log = {"tensorboard_log": tmp_path / "log", "log_interval": 1}
+    cut_off(spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL, **log), monkeypatch)
+    *rows, events, state = order[: order.index("state") + 1]
+    assert rows == ["0.monitor.csv", "1.monitor.csv"]
+    assert events.startswith("events.out.tfevents")
+    assert state == "state"
+
+
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     """However long a state takes, the next is saved fifty times as long after it."""
     clock = [0.0]
