@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.errors import UserError
+from pipeline.file_digests import STATE_FOLDER
 
 EVENT_FILES = "events.out.tfevents.*"
 # By the numbers of the environments: a wrapper that the settings name begins its file anew.
@@ -43,7 +44,10 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, P
     for name, position in positions.items():
         path = run_folder / name  # or the name itself, where that begins at the root
         if not path.is_file() or _position(path, position[0])[:2] != tuple(position)[:2]:
-            raise UserError(f"{path} is not as the run left it: it cannot go on from its state")
+            raise UserError(
+                f"{path} is not as the run left it: it cannot go on from its state; remove "
+                f"{run_folder / STATE_FOLDER} to begin the run anew"
+            )
     for path in [*_monitor_files(run_folder), *_event_files(log_folder)]:
         name = path.name if path.parent == run_folder else str(path)
         if name in positions:

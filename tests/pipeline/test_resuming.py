@@ -399,6 +399,10 @@ def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeyp
     assert rows == ["0.monitor.csv", "1.monitor.csv"]
     assert events.startswith("events.out.tfevents")
     assert state == "state"
+    order.clear()
+    monkeypatch.setattr(f"{saver}.MOST_SYNCED", 0)  # what would take long is left out
+    cut_off(spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL), monkeypatch)
+    assert set(order) == {"state"}
 
 
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
@@ -434,6 +438,24 @@ def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
     saver.save()
     assert seen == [False]
     assert gc.isenabled()
+
+
+def test_no_search_for_garbage_follows_a_state(tmp_path, monkeypatch):
+    kept, generations, thresholds = [], [], gc.get_threshold()
+    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    monkeypatch.setattr(StateSaver, "_write", lambda _: kept.extend([[] for _ in range(5000)]))
+    saver.model = type("Model", (), {"num_timesteps": 0})()
+    for _ in range(4):
+        gc.collect(0)
+    gc.set_threshold(700, 2, 1000)  # so that the next search by itself goes beyond what is young
+    gc.callbacks.append(lambda phase, info: generations.append(info["generation"]))
+    try:
+        saver.save()
+        kept.extend([[] for _ in range(100)])
+    finally:
+        gc.callbacks.pop()
+        gc.set_threshold(*thresholds)
+    assert set(generations) == {0}
 
 
 def test_what_was_cut_off_is_saved_sooner(tmp_path, monkeypatch):
