@@ -65,7 +65,10 @@ def _disturb(case: Case, process: subprocess.Popen[str], draw: random.Random) ->
     target = draw.choice(TARGETS) if case.is_study else "driver"
     pids = [process.pid] if target == "driver" else _group(process.pid)
     if target == "worker":
-        pids, how = draw.sample([pid for pid in pids if pid != process.pid] or pids, 1), "SIGKILL"
+        pids, how = (
+            draw.sample([pid for pid in pids if pid != process.pid] or [process.pid], 1),
+            "SIGKILL",
+        )
     case.counts[how] += 1
     for pid in pids:
         _send(pid, getattr(signal, how.partition(" ")[0]))
