@@ -1,7 +1,10 @@
 """Compare agents over seeds: ``python compare.py --env FrozenLake-v1 --algos qlearning dqn``."""
 
-from commands.compare_agents import main
-from commands.parsing import run_command
+try:
+    from commands.compare_agents import main
+    from commands.parsing import run_command
+except KeyboardInterrupt:  # before there is anything to be stopped
+    raise SystemExit(130) from None
 
 if __name__ == "__main__":
     run_command(main)

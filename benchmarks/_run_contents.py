@@ -6,6 +6,7 @@ import csv
 import gzip
 import io
 import json
+import re
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,16 @@ TIMES = ("seconds", "cpu_seconds")
 
 
 def contents(logs: Path) -> dict[str, Any]:
-    """What the files of a run or a study say, but for moments and durations; by relative name."""
+    """What the files of a run or a study say, but for moments and durations; by relative name.
+
+    Into how many folders runs were moved that a study has replaced, is left out.
+    """
     files = sorted(path for path in logs.rglob("*") if path.is_file())
-    return {path.relative_to(logs).as_posix(): _content(path) for path in files}
+    return {_name(path.relative_to(logs)): _content(path) for path in files}
+
+
+def _name(path: Path) -> str:
+    return re.sub(r"/replaced/\d+/", "/replaced/", path.as_posix())
 
 
 def _content(path: Path) -> Any:
@@ -40,6 +48,8 @@ def _content(path: Path) -> Any:
         with opened(path, "rt", encoding="utf-8", newline="") as file:
             rows = list(csv.DictReader(file))
         return [{k: v for k, v in row.items() if k not in (*TIMES, "path")} for row in rows]
+    if path.suffix == ".gif":
+        return path.read_bytes()
     # In what is left stand commands, durations and folders.
     return path.suffix
 

@@ -158,11 +158,11 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
 def main() -> int:
     """Parse the arguments and do what they ask for; the exit code."""
     args = build_parser().parse_args()
-    if args.logged or args.policy:
-        from commands.compare_on_log import compare_on_log
-
-        return compare_on_log(args)
     with stops_noticed(), exits_as_mistakes():
+        if args.logged or args.policy:
+            from commands.compare_on_log import compare_on_log
+
+            return compare_on_log(args)
         return _compare(args)
 
 

@@ -104,14 +104,24 @@ def run_command(main: Callable[[], int]) -> NoReturn:
     codes: list[int] = []
     before = n_stops()
     atexit.register(_leave, codes)  # before the libraries', so that it is called after them
+    try:
+        code = _code_and_output(main)
+    except KeyboardInterrupt:  # one more, while the last word was being said
+        code = exit_code(SIGINT)
+    # What is left to do would tell of one in a traceback. Not now: who calls this in a process of
+    # their own, as tests do, have it for longer.
+    atexit.register(default_for_signals)
+    if n_stops() > before:
+        codes.append(code)
+    sys.exit(code)
+
+
+def _code_and_output(main: Callable[[], int]) -> int:
     with standard_streams() as output:
         code = _exit_code(main)
         if output.failure is not None and not isinstance(output.failure, BrokenPipeError):
             code = code or MISTAKE
-    default_for_signals()  # what is left to do would tell of one in a traceback
-    if n_stops() > before:
-        codes.append(code)
-    sys.exit(code)
+    return code
 
 
 def _leave(codes: list[int]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from functools import partial
 from typing import NoReturn
 
 from commands.parsing import COMMANDS, NAME, OneLineParser, run_command
@@ -18,26 +18,26 @@ def main() -> NoReturn:
         _explain()
     # From here on it is as if the command had been called by a name of its own.
     sys.argv = [f"{NAME} {command}", *sys.argv[2:]]
-    run_command(_main_of(command))
+    run_command(partial(_carry_out, command))
 
 
-def _main_of(command: str) -> Callable[[], int]:
-    """What carries the command out; the others' flags are not even looked at."""
+def _carry_out(command: str) -> int:
+    """Do what the command does; the others' flags are not even looked at."""
     if command == "train":
         from commands import train_agent
 
-        return train_agent.main
+        return train_agent.main()
     if command == "enjoy":
         from commands import enjoy_agent
 
-        return enjoy_agent.main
+        return enjoy_agent.main()
     if command == "inspect":
         from commands import inspect_model
 
-        return inspect_model.main
+        return inspect_model.main()
     from commands import compare_agents
 
-    return compare_agents.main
+    return compare_agents.main()
 
 
 def _explain() -> NoReturn:

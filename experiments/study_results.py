@@ -187,14 +187,15 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
 
 def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
     """Make sure of the files that the page opens later: maps, and the agent that is filmed."""
-    run = planned.run
-    files = run.files
+    run, files = planned.run, planned.run.files
     for path in files.matching(run.value_maps_path.name):
+        files.check(path)
         if files.digests is None:
             read_value_maps(run)
-        files.check(path)
     if planned.seed == study.first_seed:
         files.check(run.model_path)
+        if not run.model_path.exists():
+            raise DamagedFileError(run.model_path, "is missing")
 
 
 def _curve(planned: PlannedRun, kind: str, columns: dict[str, Floats]) -> pd.DataFrame:
@@ -259,8 +260,7 @@ def _summary_row(
     )
     final = info["final"]
     threshold = threshold_of(study, planned.spec.env_id, final)
-    steps = evaluations["step"].to_numpy()
-    values = evaluations["value"].to_numpy()
+    steps, values = evaluations["step"].to_numpy(), evaluations["value"].to_numpy()
     reached = stayed = float("nan")
     if threshold is not None and len(steps):
         reached = steps_to_threshold(steps, values, threshold)

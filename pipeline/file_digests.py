@@ -3,7 +3,7 @@
 The entry of ``run.json`` itself is the digest of all else in it, as JSON without spaces and with
 sorted keys. A file that is not listed is the user's own, and nothing is said of it. Runs of earlier
 versions have no such field: their files are taken as they are. What tells them from a run that has
-lost it is ``record_version``, which is written with it: either without the other is damage.
+lost it, or never came to its end, is ``record_version``, which is written when a run begins.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ LOCK = ".lock"  # of the process at work
 STATE_FOLDER = "state"  # of what a run goes on from, which is no part of what it leaves
 VERSION_FIELD = "record_version"
 VERSION = 2  # of records with digests; those before had no such field
+# What a run may say of itself before it has digests.
+_UNDER_WAY = ("running", "failed")
 LARGEST_RECORD = 64 << 20  # bytes
 LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
 _PIECE = 1 << 20  # bytes
@@ -149,7 +151,8 @@ def read_record(path: Path) -> dict[str, Any]:
         raise DamagedFileError(path, "is damaged: it must map names to values")
     if _is_too_deep(record):
         raise DamagedFileError(path, "is damaged: it is nested too deeply")
-    if VERSION_FIELD in record and FIELD not in record:
+    has_ended = record.get("state") not in _UNDER_WAY
+    if VERSION_FIELD in record and FIELD not in record and has_ended:
         raise DamagedFileError(path, "is damaged: it has lost the digests of the run's files")
     if FIELD in record and not _is_whole(record):
         raise DamagedFileError(path, "is damaged: it is not as the run left it")

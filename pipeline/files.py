@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import os
@@ -98,8 +99,13 @@ def replacing(path: Path) -> Iterator[Path]:
         try:
             yield draft
             put_in_place(draft, path)
+        except OSError as error:
+            if error.filename == str(draft):  # of which nobody knows
+                error.filename = str(path)
+            raise
         finally:
-            draft.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):  # a disk that has become read-only refuses that too
+                draft.unlink()
 
 
 @contextmanager

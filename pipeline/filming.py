@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import io
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError
+from pipeline.files import replacing
 from pipeline.playing import FrameTaker, play_episodes
 
 if TYPE_CHECKING:
@@ -27,6 +30,8 @@ def check_film_path(path: Path) -> None:
         raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
     if not path.absolute().parent.is_dir():
         raise UserError(f"--record: there is no folder {path.parent}")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise UserError(f"--record: nothing can be written in {path.parent}")
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise UserError("--record to .mp4 needs: pip install 'rl-yardstick[video]'")
 
@@ -63,19 +68,27 @@ def film_episode(
 
 def write_film(path: Path, frames: list[Any]) -> None:
     """Write pictures, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
-    if path.suffix == ".mp4":
-        _write_mp4(path, frames)
-        return
+    film = _as_mp4(frames) if path.suffix == ".mp4" else as_gif(frames)
+    with replacing(path) as draft:
+        draft.write_bytes(film)
+
+
+def as_gif(frames: list[Any]) -> bytes:
+    """Pictures, uint8 of shape (height, width, 3), as the content of a GIF file."""
     from PIL import Image
 
     first, *others = [Image.fromarray(frame) for frame in frames]
-    duration = 1000 // FRAMES_PER_SECOND
-    first.save(path, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    duration, film = 1000 // FRAMES_PER_SECOND, io.BytesIO()
+    first.save(film, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    return film.getvalue()
 
 
-def _write_mp4(path: Path, frames: list[Any]) -> None:
+def _as_mp4(frames: list[Any]) -> bytes:
     import imageio.v2 as imageio
 
     # Encoders want even sides.
     even = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]
-    imageio.mimwrite(path, even, fps=FRAMES_PER_SECOND, macro_block_size=1)
+    film: bytes = imageio.mimwrite(
+        "<bytes>", even, format="mp4", fps=FRAMES_PER_SECOND, macro_block_size=1
+    )
+    return film

@@ -103,12 +103,17 @@ def _appears(path: Path, content: str) -> bool:
                 file.write(content)
         except FileExistsError:
             return False
-        except OSError:  # the disk is full
-            path.unlink(missing_ok=True)
+        except OSError:  # the disk is full, or read-only
+            _unlink(path)
             raise
     finally:
-        draft.unlink(missing_ok=True)
+        _unlink(draft)
     return True
+
+
+def _unlink(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        path.unlink()
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -56,7 +56,6 @@ OUTCOME = (
     "regret",
     "pulls",
     FIELD,
-    VERSION_FIELD,
 )
 # The field of ``run.json`` with the folder of TensorBoard's log, where there is one.
 TENSORBOARD = "tensorboard"

@@ -18,6 +18,7 @@ from mdp.work_time import WorkTime
 from pipeline.broken_runs import close, give_up, has_begun
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation
+from pipeline.file_digests import VERSION, VERSION_FIELD
 from pipeline.files import naming
 from pipeline.finishing import draw, judge, save
 from pipeline.foreign_exits import exits_as_mistakes
@@ -145,6 +146,7 @@ def _record_beginning(training: Training, args: dict[str, Any], command: str) ->
     write_arguments(run, spec, args)
     run.update_info(
         state=RUNNING,
+        **{VERSION_FIELD: VERSION},
         env_name=run.env_name,
         spec=spec.as_data(),
         versions=recorded_versions(),

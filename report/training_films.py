@@ -13,7 +13,6 @@ from experiments.study_spec import file_name
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import evaluation_seed
-from pipeline.files import replacing
 from pipeline.filming import film_episode, write_film
 from pipeline.models.model_choice import ChosenModel, model_of_run
 from pipeline.models.model_loading import load_model
@@ -53,8 +52,7 @@ def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
             chosen = model_of_run(checkpoint, planned.spec, planned.run)
             frames = episode_in_training(chosen, evaluation_seed(planned.seed, 4), MAX_STEPS)
             folder.mkdir(exist_ok=True)
-            with replacing(path) as draft:
-                write_film(draft, frames)
+            write_film(path, frames)
         yield path
 
 

@@ -64,7 +64,9 @@ class Snapshot:
     lost: list[str] = field(default_factory=list)
 
 
-def record(roots: dict[str, Any], constants: tuple[type, ...] = ()) -> Snapshot:
+def record(
+    roots: dict[str, Any], constants: tuple[type, ...] = (), elsewhere: Iterable[list[Any]] = ()
+) -> Snapshot:
     """Write down what objects hold, without changing them.
 
     Arrays of the snapshot may share memory with the objects: write it out before they go on.
@@ -72,11 +74,12 @@ def record(roots: dict[str, Any], constants: tuple[type, ...] = ()) -> Snapshot:
     Args:
         roots: the objects, by name.
         constants: types whose objects stay as they are in what is built anew.
+        elsewhere: lists whose content the caller keeps, and fills in again afterwards.
 
     Raises:
         NotRecordableError: if one holds what cannot be written down, naming its place.
     """
-    recorder = _Recorder(constants)
+    recorder = _Recorder(constants, elsewhere)
     try:
         for name, value in roots.items():
             with recorder.at(name):
@@ -92,9 +95,10 @@ def record(roots: dict[str, Any], constants: tuple[type, ...] = ()) -> Snapshot:
 
 
 class _Recorder(LeafRecorder):
-    def __init__(self, constants: tuple[type, ...]) -> None:
+    def __init__(self, constants: tuple[type, ...], elsewhere: Iterable[list[Any]]) -> None:
         self.snapshot = Snapshot()
         self._constants = constants
+        self._elsewhere = {id(value) for value in elsewhere}
         self._numbers: dict[int, int] = {}
         # An object that goes would leave its id to another.
         self._alive: list[Any] = []
@@ -128,6 +132,8 @@ class _Recorder(LeafRecorder):
         return [REFERENCE, number]
 
     def _node(self, value: Any) -> dict[str, Any]:
+        if id(value) in self._elsewhere:
+            return {"kind": "elsewhere"}
         for types, describe in _DESCRIPTIONS:
             if isinstance(value, types):
                 described: dict[str, Any] = describe(self, value)

@@ -173,6 +173,9 @@ class _Restorer(LeafFiller):
         result[:] = self.values(node["items"], before)
         return result
 
+    def _elsewhere(self, number: int, node: dict[str, Any], existing: Any) -> Any:
+        return existing if isinstance(existing, list) else []
+
     def _numbers(self, number: int, node: dict[str, Any], existing: Any) -> Any:
         result = existing if isinstance(existing, list) else []
         result[:] = self.held(node).tolist()
@@ -263,6 +266,7 @@ _FILLERS: dict[str, _Filler] = {
     "object": _Restorer._object,
     "dict": _Restorer._dict,
     "list": _Restorer._list,
+    "elsewhere": _Restorer._elsewhere,
     "numbers": _Restorer._numbers,
     "tuple": _Restorer._tuple,
     "set": _Restorer._set,

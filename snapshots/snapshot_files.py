@@ -92,7 +92,9 @@ def read_snapshot(path: Path, key: bytes) -> tuple[Snapshot, dict[str, Any]]:
         code = file.read(_CODE_BYTES)
         begin = file.tell()
         if not hmac.compare_digest(code, _code_of(file, key)):
-            raise BadSnapshotError("it is damaged, or another user or machine made it")
+            raise BadSnapshotError(
+                "it is damaged, or another user or machine made it, or the key was replaced"
+            )
         file.seek(begin)
         tree = json.loads(file.read(int.from_bytes(file.read(8), "little")))
         arrays = [_array(file, entry) for entry in tree["arrays"]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import secrets
+import stat
 import sys
 from pathlib import Path
 
@@ -34,16 +35,25 @@ def user_key(application: str) -> bytes:
         OSError: if there is none and none can be made, or others may read or change it.
     """
     path = configuration_folder(application) / "snapshots.key"
-    if not path.exists():
+    if not os.path.lexists(path):
         _make(path)
-    key = path.read_bytes()
+    # Without waiting, as for a pipe; what is checked is what is read.
+    number = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    try:
+        _check(os.fstat(number), path)
+        key = os.read(number, KEY_BYTES + 1)
+    finally:
+        os.close(number)
     if len(key) != KEY_BYTES:
         raise OSError(f"{path} is damaged: remove it")
-    if sys.platform != "win32":
-        status = path.stat()
-        if status.st_uid != os.geteuid() or status.st_mode & 0o077:
-            raise OSError(f"{path} must be the user's own, and of mode 600")
     return key
+
+
+def _check(status: os.stat_result, path: Path) -> None:
+    if not stat.S_ISREG(status.st_mode):
+        raise OSError(f"{path} is no regular file: remove it")
+    if sys.platform != "win32" and (status.st_uid != os.geteuid() or status.st_mode & 0o077):
+        raise OSError(f"{path} must be the user's own, and of mode 600")
 
 
 def _make(path: Path) -> None:

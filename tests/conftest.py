@@ -2,12 +2,15 @@
 
 import dataclasses
 import os
+import signal
 import sys
 import tempfile
 from types import SimpleNamespace
 
 import hypothesis
 import pytest
+
+from pipeline.stopping import SIGNALS
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -23,6 +26,19 @@ os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
 # are the same every time, so that a failure there can be repeated.
 hypothesis.settings.register_profile("yardstick", deadline=None, derandomize="CI" in os.environ)
 hypothesis.settings.load_profile("yardstick")
+
+
+@pytest.fixture(autouse=True)
+def signals_are_left_as_they_were():
+    """A handler that a test leaves behind would decide what Ctrl-C is to the tests after it."""
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    yield
+    after = {number: signal.getsignal(number) for number in SIGNALS}
+    for number in SIGNALS:
+        if after[number] != before[number]:
+            signal.signal(number, before[number])
+    assert after == before
+
 
 HOSTILE = "</script><script>document.title='taken'</script>"
 

@@ -9,11 +9,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from pipeline.errors import UserError
+from pipeline.file_digests import STATE_FOLDER
 
 EVENT_FILES = "events.out.tfevents.*"
+# By the numbers of the environments: a wrapper that the settings name begins its file anew.
+MONITOR_FILES = "[0-9]*.monitor.csv"
 _PIECE = 1 << 20  # bytes
 
-Position = tuple[int, int]  # a file's length in bytes, and the checksum of them
+# A file's length in bytes, the checksum of them, and the lines that they are.
+Position = tuple[int, int, int]
 
 
 def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Position]:
@@ -39,8 +43,11 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, P
     """
     for name, position in positions.items():
         path = run_folder / name  # or the name itself, where that begins at the root
-        if not path.is_file() or _position(path, position[0]) != tuple(position):
-            raise UserError(f"{path} is not as the run left it: it cannot go on from its state")
+        if not path.is_file() or _position(path, position[0])[:2] != tuple(position)[:2]:
+            raise UserError(
+                f"{path} is not as the run left it: it cannot go on from its state; remove "
+                f"{run_folder / STATE_FOLDER} to begin the run anew"
+            )
     for path in [*_monitor_files(run_folder), *_event_files(log_folder)]:
         name = path.name if path.parent == run_folder else str(path)
         if name in positions:
@@ -59,16 +66,16 @@ def remove_events(log_folder: str) -> None:
 
 def _position(path: Path, length: int) -> Position:
     """Where a file is after so many bytes, or at its end if that comes before."""
-    n_read = checksum = 0
+    n_read = checksum = n_lines = 0
     with path.open("rb") as file:
         while piece := file.read(min(_PIECE, length - n_read)):
             n_read, checksum = n_read + len(piece), zlib.crc32(piece, checksum)
-    return n_read, checksum
+            n_lines += piece.count(b"\n")
+    return n_read, checksum, n_lines
 
 
 def _monitor_files(run_folder: Path) -> list[Path]:
-    # By the numbers of the environments: a wrapper that the settings name begins its file anew.
-    return sorted(run_folder.glob("[0-9]*.monitor.csv"))
+    return sorted(run_folder.glob(MONITOR_FILES))
 
 
 def _event_files(log_folder: str | None) -> list[Path]:

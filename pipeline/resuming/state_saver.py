@@ -18,9 +18,11 @@ from agents.common.callback_horizons import Horizon
 from mdp.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.files import sync_file
 from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
-from pipeline.resuming.log_positions import log_positions
+from pipeline.resuming.log_positions import Position, log_positions
+from pipeline.resuming.monitor_rows import held_in, lists_in_files, read_back
 from pipeline.resuming.saved_states import SavedState, save_state
 from pipeline.resuming.state_folder import settings_digest
 from pipeline.resuming.state_keeping import SaveInterval
@@ -41,6 +43,10 @@ FIRST_COST = 0.05  # seconds; of states of which nothing is known
 # What was cut off may be so again soon, and has to get ahead each time: its pauses begin short, and
 # double, so that half of what was done since is kept.
 SHORTEST_PAUSE = 0.1
+
+# Bytes of a file since the last state. A fast table writes many times that in a second, and waiting
+# until the disk has it would take more than all else.
+MOST_SYNCED = 1 << 20
 
 
 class StateSaver(StopAtSafeMoment):
@@ -82,6 +88,7 @@ class StateSaver(StopAtSafeMoment):
             float(note.get("seconds", 0.0)), float(note.get("cpu_seconds", 0.0))
         )
         self.started = WorkTime.now()
+        self.n_synced: dict[str, int] = {}  # bytes, by the names of files
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
         self.was_cut_off = was_cut_off
@@ -182,21 +189,33 @@ class StateSaver(StopAtSafeMoment):
         environment = self.training_env.unwrapped
         if isinstance(environment, SubprocVecEnv):
             raise NotRecordableError("--vec-env subproc", "environments are in other processes")
-        snapshot = record(self._roots(), _CONSTANTS)
+        positions = log_positions(self.run.path, _log_folder(self.model))
+        in_files = lists_in_files(self.training_env, self.run.path, positions)
+        episodes = held_in(self.training_env, self.run.path, in_files)
+        snapshot = record(self._roots(), _CONSTANTS, episodes)
         for lost in snapshot.lost:
             self._tell_once(f"{lost} is not kept: a run that goes by it may differ after --resume")
         note = {
             "folder": self._folder_names(),
             "log_folder": _log_folder(self.model),
-            "files": log_positions(self.run.path, _log_folder(self.model)),
+            "files": positions,
+            "episodes": in_files,
             "steps": self.model.num_timesteps,
             "rollouts": self.n_rollouts,
             **self.taken.as_data(),
             "pause": self.pause,
             "spec": settings_digest(self.run.recorded_spec()),
         }
+        self._sync(positions)
         save_state(self.run.state_path, self.n_saved + 1, snapshot, note)
         self.n_saved += 1
+
+    def _sync(self, positions: Mapping[str, Position]) -> None:
+        """Let the disk have what the state is held against, as far as that takes no time."""
+        for name, (length, *_) in positions.items():
+            if length - self.n_synced.get(name, 0) <= MOST_SYNCED:
+                sync_file(self.run.path / name)
+            self.n_synced[name] = length
 
     def _roots(self) -> dict[str, Any]:
         logger = self.model.logger
@@ -214,6 +233,7 @@ class StateSaver(StopAtSafeMoment):
         moved = dict(zip(state.note["folder"], self._folder_names(), strict=True))
         try:
             restore(state.snapshot, roots, moved)
+            read_back(self.training_env, self.run.path, state.note.get("episodes", {}))
         except NotRestorableError as error:
             raise UserError(
                 f"{self.run.state_path} does not fit what the run's settings make today: {error}; "
@@ -241,6 +261,7 @@ def _garbage_left() -> Iterator[None]:
         yield
     finally:
         if was_on:
+            gc.collect(0)  # else what was made meanwhile would set off the search as soon as it can
             gc.enable()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 import os
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from pipeline.environments import MISTAKES
 from pipeline.errors import UserError
 from pipeline.evaluation.sampled import evaluation_seed
 from pipeline.files import replacing, write_json
-from pipeline.filming import film_episode, write_film
+from pipeline.filming import as_gif, film_episode
 from pipeline.models.model_choice import model_of_run
 from pipeline.models.model_loading import load_model
 from pipeline.playing import playing_env
@@ -118,10 +117,10 @@ def film_of(planned: PlannedRun) -> Path | None:
             frames, episode = _play(planned)
         except (UserError, *MISTAKES):
             return None
-        film = _encoded(frames)
+        film = as_gif(frames)
         kept = min(len(frames), max(len(frames) * MAX_BYTES // len(film), 1))
         if kept < len(frames):
-            film = _encoded(frames[:kept])
+            film = as_gif(frames[:kept])
         with replacing(path) as draft:
             draft.write_bytes(film)
         write_json(path.with_suffix(".json"), {**episode, "frames": kept})
@@ -175,13 +174,6 @@ def _shrunk(frames: list[Any]) -> list[Any]:
     palette = Image.fromarray(np.hstack([np.asarray(p) for p in samples])).quantize(COLOURS)
     few = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
     return [np.asarray(picture.convert("RGB")) for picture in few]
-
-
-def _encoded(frames: list[Any]) -> bytes:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "film.gif"
-        write_film(path, frames)
-        return path.read_bytes()
 
 
 def _film(agent: str, path: Path, place: int) -> Film:

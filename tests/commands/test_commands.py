@@ -21,7 +21,8 @@ from commands.parsing import run_command
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
-from pipeline.filming import FRAMES_PER_SECOND
+from pipeline.errors import UserError
+from pipeline.filming import FRAMES_PER_SECOND, check_film_path, write_film
 from pipeline.settings import hyperparam_entries
 
 ROOT = Path(train.__file__).parent
@@ -155,6 +156,28 @@ def test_filming(type_command, tmp_path, suffix):
         assert sum(durations) == 8 * 1000 // FRAMES_PER_SECOND
     else:
         assert film.read_bytes()[4:8] == b"ftyp"
+
+
+def test_where_no_film_can_be_written_nothing_is_played(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.access", lambda *_: False)  # as on a read-only disk, also for root
+    with pytest.raises(UserError, match="--record: nothing can be written in "):
+        check_film_path(tmp_path / "film.gif")
+
+
+@pytest.mark.parametrize("suffix", ["gif", "mp4"])
+def test_a_film_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, monkeypatch, suffix):
+    def half_written(path, content):
+        with path.open("wb") as file:
+            file.write(content[: len(content) // 2])
+        raise OSError(28, "No space left on device")
+
+    film = tmp_path / f"film.{suffix}"
+    film.write_bytes(b"an earlier one")
+    monkeypatch.setattr(Path, "write_bytes", half_written)
+    with pytest.raises(OSError, match="No space"):
+        write_film(film, [np.zeros((8, 8, 3), np.uint8)])
+    assert [path.name for path in tmp_path.iterdir()] == [film.name]
+    assert film.read_bytes() == b"an earlier one"
 
 
 def test_going_on_with_a_trained_agent(type_command, tmp_path):

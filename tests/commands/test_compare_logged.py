@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+import signal
 import sys
 from pathlib import Path
 
@@ -247,3 +248,13 @@ def test_the_python_of_the_page_runs(tmp_path, monkeypatch, capsys):
     assert printed.startswith("always arm 1 Estimate(point=0.036")
     estimate = difference_in_value(names["linucb"].terms, names["best"].terms, n_comparisons=4)
     assert (estimate.low, estimate.high) == pytest.approx((0.016, 0.056), abs=6e-4)
+
+
+def test_sigterm_ends_it_with_its_code_and_a_line(type_command, monkeypatch):
+    def stopped(*_):
+        if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # else it would end the tests
+            signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("experiments.off_policy.policy_files.read_logged", stopped)
+    code, _, err = type_command("--logged", "second.csv", "--policy", RUN)
+    assert (code, err) == (143, "compare.py: ended by SIGTERM\n")

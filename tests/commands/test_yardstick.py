@@ -1,6 +1,8 @@
 """The installed command: what it runs, and how messages name it."""
 
+import builtins
 import os
+import runpy
 import shlex
 import subprocess
 import sys
@@ -163,3 +165,33 @@ def test_a_study_of_ours_is_found_by_its_name(type_command, tmp_path):
     (tmp_path / "mine-maze.yml").write_text("agents: [sarsaa]\nenvironments: [Taxi-v4]\n")
     code, _, err = type_command("yardstick", "compare", "mine-maze.yml")
     assert err.startswith("yardstick compare: error: mine-maze.yml:1: unknown agent 'sarsaa'")
+
+
+@pytest.mark.parametrize("program", ["train.py", "enjoy.py", "compare.py", "yardstick compare"])
+def test_ctrl_c_while_the_command_itself_is_imported(monkeypatch, capsys, program):
+    """Which takes a tenth of a second, in which a traceback would be all that there is to say."""
+    wanted = f"{program.removesuffix('.py').split()[-1]}_agent"
+    imported = builtins.__import__
+
+    def interrupted(name, variables=None, local=None, names=(), level=0):
+        if wanted in name or any(wanted in one for one in names or ()):
+            raise KeyboardInterrupt
+        return imported(name, variables, local, names, level)
+
+    monkeypatch.setattr(sys, "argv", program.split())
+    monkeypatch.setattr(builtins, "__import__", interrupted)
+    script = partial(runpy.run_path, str(ROOT / program), run_name="__main__")
+    with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
+        (script if program.endswith(".py") else yardstick.main)()
+    assert getattr(stop.value, "code", None) == 130
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_ctrl_c_while_the_last_word_is_being_said(monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("commands.parsing.print", interrupted, raising=False)
+    with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
+        run_command(interrupted)
+    assert getattr(stop.value, "code", None) == 130

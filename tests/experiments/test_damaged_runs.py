@@ -103,6 +103,27 @@ def test_a_damaged_run_is_left_out_and_said_to_be(copied, kind, name, damage):
     assert len(results.pulls) == 0
 
 
+def test_a_run_that_only_says_that_it_has_finished_is_left_out(copied):
+    """As one whose record was edited while it was under way."""
+    study, planned, root = copied("grid")
+    record = json.loads(planned[1].run.info_path.read_text())
+    assert record.pop("files")
+    planned[1].run.info_path.write_text(json.dumps({**record, "state": "running"}))
+    assert read_results(study, planned, root).left_out == ()
+    planned[1].run.info_path.write_text(json.dumps(record))
+    (left_out,) = read_results(study, planned, root).left_out
+    assert left_out.planned is planned[1]
+    assert "it has lost the digests" in left_out.reason
+
+
+def test_a_run_of_an_earlier_version_without_its_agent_is_left_out(copied):
+    study, planned, root = copied("grid")
+    forget_digests(planned[0])
+    planned[0].run.model_path.unlink()
+    (left_out,) = read_results(study, planned, root).left_out
+    assert left_out.reason == f"{planned[0].run.model_path} is missing"
+
+
 def test_what_a_comparison_does_not_read_is_not_held_against_it(copied):
     study, planned, root = copied("grid")
     (planned[0].path / "notes.txt").write_text("mine")

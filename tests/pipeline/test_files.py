@@ -21,6 +21,7 @@ from pipeline.files import (
     write_json,
     write_text,
 )
+from pipeline.folder_lock import folder_lock
 
 
 def names(folder):
@@ -75,6 +76,25 @@ def test_a_writer_that_fails_changes_nothing(tmp_path, error, old):
         raise error
     assert names(tmp_path) == ([] if old is None else ["model.zip"])
     assert old is None or path.read_text() == old
+
+
+def test_where_nothing_can_be_written_the_file_itself_is_named(tmp_path, monkeypatch):
+    """Of its draft nobody knows, and a read-only disk refuses to remove that as well."""
+
+    def refuse(path, *_, **__):
+        raise OSError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(Path, "write_text", refuse)
+    monkeypatch.setattr(Path, "unlink", refuse)
+    monkeypatch.setattr(Path, "open", refuse)
+    monkeypatch.setattr(os, "link", refuse)
+    path = tmp_path / "model.zip"
+    with pytest.raises(OSError, match="Read-only") as caught:
+        write_text(path, "new")
+    assert caught.value.filename == str(path)
+    with pytest.raises(OSError, match="Read-only") as caught, folder_lock(tmp_path, list, list):
+        pass
+    assert caught.value.filename == str(tmp_path / ".lock")
 
 
 def test_a_disk_that_fails_changes_nothing(tmp_path, monkeypatch):

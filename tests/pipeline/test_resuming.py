@@ -184,6 +184,24 @@ def test_every_agent_is_tried():
     assert {algo for _, algo, _, _ in TRAININGS} == set(ALGORITHMS)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "algo", "settings"),
+    [
+        (GRID, "qlearning", {"engine": "compiled"}),
+        (GRID, "sarsa", {"engine": "interpreted", "n_envs": 3}),
+        (ARMS, "thompson", {}),
+        (LINEAR, "linucb", {}),
+    ],
+)
+def test_so_it_is_where_a_trained_agent_goes_on(tmp_path, monkeypatch, env_id, algo, settings):
+    begun = undisturbed(spec_of(tmp_path / "first", env_id, algo, 200, settings))
+    trained = {"trained_agent": begun.run.model_path}
+    whole = undisturbed(spec_of(tmp_path / "whole", env_id, algo, 600, settings, **trained))
+    run = cut_off(spec_of(tmp_path / "parts", env_id, algo, 600, settings, **trained), monkeypatch)
+    assert gone_on(run).n_steps == whole.n_steps > 600
+    assert_same(whole.run, run)
+
+
 def test_a_state_makes_the_difference(tmp_path, monkeypatch):
     """Of generators that are not put back, the weights tell."""
     spec = spec_of(tmp_path / "whole", LEFT_RIGHT, "dqn", 300, EAGER)
@@ -283,6 +301,14 @@ def test_a_state_beside_other_settings_is_refused(tmp_path, monkeypatch):
         go_on(run, StateKeeping(), pytest.fail)
 
 
+def test_a_run_under_way_cannot_be_taken_for_one_of_an_earlier_version(tmp_path, monkeypatch):
+    run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
+    record = json.loads(run.info_path.read_text())
+    run.info_path.write_text(json.dumps({**record, "state": "finished"}))
+    with pytest.raises(UserError, match="it has lost the digests"):
+        run.read_info()
+
+
 def test_what_has_changed_since_the_run_began_is_told(tmp_path, monkeypatch):
     begun = undisturbed(spec_of(tmp_path / "first", GRID, "qlearning", 300, {}))
     agent, module = tmp_path / "agent.zip", tmp_path / "things_of_mine.py"
@@ -361,6 +387,24 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
     assert told[0].startswith(said.format(folder=outcome.run.state_path))
 
 
+def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeypatch):
+    """After a power cut a state would be there whose rows of Monitor are not."""
+    order = []
+    saver, save = "pipeline.resuming.state_saver", saved_states.save_state
+    monkeypatch.setattr(f"{saver}.sync_file", lambda path: order.append(path.name))
+    monkeypatch.setattr(f"{saver}.save_state", lambda *args: (order.append("state"), save(*args)))
+    log = {"tensorboard_log": tmp_path / "log", "log_interval": 1}
+    cut_off(spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL, **log), monkeypatch)
+    *rows, events, state = order[: order.index("state") + 1]
+    assert rows == ["0.monitor.csv", "1.monitor.csv"]
+    assert events.startswith("events.out.tfevents")
+    assert state == "state"
+    order.clear()
+    monkeypatch.setattr(f"{saver}.MOST_SYNCED", 0)  # what would take long is left out
+    cut_off(spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL), monkeypatch)
+    assert set(order) == {"state"}
+
+
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     """However long a state takes, the next is saved fifty times as long after it."""
     clock = [0.0]
@@ -394,6 +438,24 @@ def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
     saver.save()
     assert seen == [False]
     assert gc.isenabled()
+
+
+def test_no_search_for_garbage_follows_a_state(tmp_path, monkeypatch):
+    kept, generations, thresholds = [], [], gc.get_threshold()
+    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    monkeypatch.setattr(StateSaver, "_write", lambda _: kept.extend([[] for _ in range(5000)]))
+    saver.model = type("Model", (), {"num_timesteps": 0})()
+    for _ in range(4):
+        gc.collect(0)
+    gc.set_threshold(700, 2, 1000)  # so that the next search by itself goes beyond what is young
+    gc.callbacks.append(lambda phase, info: generations.append(info["generation"]))
+    try:
+        saver.save()
+        kept.extend([[] for _ in range(100)])
+    finally:
+        gc.callbacks.pop()
+        gc.set_threshold(*thresholds)
+    assert set(generations) == {0}
 
 
 def test_what_was_cut_off_is_saved_sooner(tmp_path, monkeypatch):

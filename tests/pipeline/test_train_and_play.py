@@ -3,7 +3,6 @@
 import io
 import pickle
 import re
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -69,8 +68,6 @@ def test_the_librarys_tables_are_for_those_who_ask(tmp_path, capsys, verbose, sh
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("thin ice")])
 def test_a_bar_lets_go_of_the_terminal_whatever_happens(tmp_path, monkeypatch, error):
     monkeypatch.setattr("pipeline.settings.components.callbacks", lambda *args: [Trouble(error)])
-    # As where nobody listens for signals: else a bare KeyboardInterrupt is somebody's mistake.
-    monkeypatch.setattr("signal.getsignal", lambda number: signal.default_int_handler)
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, color_system=None)
     try:

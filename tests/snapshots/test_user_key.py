@@ -1,5 +1,6 @@
 """The user's key: one for all processes, and for nobody else."""
 
+import os
 import stat
 from concurrent.futures import ThreadPoolExecutor
 
@@ -40,3 +41,29 @@ def test_a_damaged_one_is_refused(home):
     (home / "a" / "snapshots.key").write_bytes(b"short")
     with pytest.raises(OSError, match="damaged"):
         user_key("a")
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder", "device"])
+def test_what_is_no_file_is_refused_at_once(home, kind):
+    """A pipe would be waited for, and a device has no end."""
+    path = home / "a" / "snapshots.key"
+    path.parent.mkdir(parents=True)
+    if kind == "pipe":
+        os.mkfifo(path, 0o600)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("/dev/null")
+    with pytest.raises(OSError, match="no regular file"):
+        user_key("a")
+
+
+def test_a_link_to_a_key_is_followed_and_one_to_nowhere_makes_none(home):
+    key, path = user_key("a"), home / "a" / "snapshots.key"
+    elsewhere = path.rename(home / "elsewhere")
+    path.symlink_to(elsewhere)
+    assert user_key("a") == key
+    elsewhere.unlink()
+    with pytest.raises(FileNotFoundError):
+        user_key("a")
+    assert list(path.parent.iterdir()) == [path]

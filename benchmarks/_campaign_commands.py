@@ -1,0 +1,210 @@
+"""The commands that `fault_campaign` disturbs, each with what it needs beforehand."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from _run_contents import contents
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = "n_steps:64 batch_size:32 n_envs:2 n_epochs:2"
+EAGER = "learning_starts:50 buffer_size:2000 batch_size:16 n_envs:1"
+TRAININGS = (
+    ("Warehouse-v0", "qlearning", 6_000_000, "engine:compiled"),
+    ("FrozenLake-v1", "sarsa", 40_000, "engine:interpreted"),
+    ("FrozenLake-v1", "expected_sarsa", 8_000_000, "engine:compiled n_envs:3"),
+    ("CartPole-v1", "double_qlearning", 40_000, "engine:interpreted"),
+    ("Warehouse-v0", "value_iteration", 40_000, ""),
+    ("Warehouse-v0", "optimal", 40_000, ""),
+    ("CartPole-v1", "random", 40_000, ""),
+    ("CartPole-v1", "angle", 40_000, ""),
+    ("CartPole-v1", "dqn", 2500, EAGER),
+    ("Warehouse-v0", "double_dqn", 2000, EAGER),
+    ("Warehouse-v0", "deep_qlearning", 2000, ""),
+    ("CartPole-v1", "ppo", 5000, SMALL),
+    ("Pendulum-v1", "ppo", 4000, f"{SMALL} use_sde:True normalize:True frame_stack:2"),
+    ("CartPole-v1", "a2c", 5000, ""),
+    ("Pendulum-v1", "sac", 600, EAGER),
+    ("Pendulum-v1", "td3", 600, f"{EAGER} noise_type:normal noise_std:0.1"),
+    ("Pendulum-v1", "ddpg", 600, EAGER),
+    ("CartPole-v1", "qrdqn", 2500, EAGER),
+    ("Pendulum-v1", "tqc", 400, EAGER),
+    ("Pendulum-v1", "crossq", 400, EAGER),
+    ("CartPole-v1", "trpo", 4000, "n_steps:128 batch_size:32 n_envs:1"),
+    ("Pendulum-v1", "ars", 20_000, "n_delta:4 n_top:2"),
+    ("CartPole-v1", "ppo_lstm", 2000, SMALL),
+    ("Warehouse-v0", "ppo_mask", 3000, SMALL),
+    ("BernoulliBandit-v0", "thompson", 20_000, ""),
+    ("LinearBandit-v0", "linucb", 10_000, ""),
+    ("BernoulliBandit-v0", "mabwiser_ucb1", 3000, ""),
+)
+# With -i, from an agent that was trained with the same settings for a tenth of that.
+CONTINUATIONS = (
+    ("Warehouse-v0", "qlearning", 6_000_000, "engine:compiled"),
+    ("FrozenLake-v1", "sarsa", 40_000, "engine:interpreted n_envs:3"),
+    ("FrozenLake-v1", "double_qlearning", 6_000_000, "engine:compiled"),
+    ("BernoulliBandit-v0", "thompson", 20_000, ""),
+    ("BernoulliBandit-v0", "ucb", 20_000, ""),
+    ("LinearBandit-v0", "linucb", 10_000, ""),
+)
+STUDY = "--env CartPole-v1 FrozenLake-v1 --algos dqn qlearning --seeds 3 -j 2 --no-report"
+FILMS = "--env FrozenLake-v1 --algos qlearning sarsa --seeds 1 -j 2 --name films --no-report"
+LAKE = "--env FrozenLake-v1 --algo qlearning"
+LOG = """
+import sys, gymnasium, envs.bandits
+for seed in range(2):
+    with gymnasium.make("SegmentBandit-v0") as env:
+        envs.bandits.log_uniformly(env, 3000, seed=seed, path=f"{sys.argv[1]}-{seed}.csv")
+"""
+
+
+@dataclass
+class Case:
+    """One command, in peace and disturbed.
+
+    In its words ``{logs}`` stands for the folder that it writes to, ``{before}`` for that of the
+    commands before it.
+
+    Attributes:
+        name: what is shown.
+        folder: of all that belongs to it.
+        words: the command's.
+        before: those of commands that are run once, in peace.
+        begins_with_them: whether it finds in its folder what they have left.
+        is_told: whether it prints what comes out.
+        whole: the files of the undisturbed one.
+        seconds: what that took.
+        counts: what became of the disturbed ones.
+    """
+
+    name: str
+    folder: Path
+    words: list[str]
+    before: tuple[list[str], ...] = ()
+    begins_with_them: bool = False
+    is_told: bool = False
+    whole: dict[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    counts: Counter[str] = field(default_factory=Counter)
+    said: str = ""
+
+    @property
+    def is_study(self) -> bool:
+        """Whether it has workers."""
+        return self.words[0] == "compare.py" and not self.is_told
+
+    def prepare(self) -> None:
+        """Run what comes before it."""
+        for words in self.before:
+            self._must(self._started(words, self.folder / "before"))
+
+    def run_in_peace(self) -> None:
+        """Run the command undisturbed; the second time counts, when all is compiled."""
+        for name in ("warm", "whole"):
+            logs = self.folder_of(name)
+            begun = time.monotonic()
+            self._must(self.start(logs))
+            self.seconds = time.monotonic() - begun
+            self.read_said()
+        self.whole = self.result(self.folder / "whole")
+
+    def _must(self, process: subprocess.Popen[str]) -> None:
+        if process.wait():
+            raise SystemExit(f"{self.name}: {self.read_said()}")
+
+    def folder_of(self, name: str) -> Path:
+        """A folder for the command to write to, with what it is to find there."""
+        if self.begins_with_them:
+            shutil.copytree(self.folder / "before", self.folder / name)
+        return self.folder / name
+
+    def start(self, logs: Path) -> subprocess.Popen[str]:
+        """Start the command in a session of its own, so that what it leaves can be found."""
+        return self._started(self.words, logs)
+
+    def _started(self, words: list[str], logs: Path) -> subprocess.Popen[str]:
+        before = self.folder / "before"
+        filled = [
+            word.replace("{logs}", str(logs)).replace("{before}", str(before)) for word in words
+        ]
+        if filled[0].endswith(".py"):
+            filled = [str(ROOT / filled[0]), *filled[1:], "-f", str(logs)]
+        with (self.folder / "output").open("a") as output:
+            return subprocess.Popen(
+                [sys.executable, *filled],
+                cwd=self.folder,
+                env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)},
+                stdout=output,
+                stderr=output,
+                text=True,
+                start_new_session=True,
+            )
+
+    def read_said(self) -> str:
+        """What was printed since the last look."""
+        output = self.folder / "output"
+        self.said = output.read_text(encoding="utf-8", errors="replace")
+        output.write_text("")
+        return self.said
+
+    def result(self, logs: Path) -> dict[str, Any]:
+        """What came out, by the names of files."""
+        found = contents(logs) if logs.exists() else {}
+        # What takes long is told of before the table.
+        table = self.said[self.said.find("┏") :]
+        return {**found, "what it said": table} if self.is_told else found
+
+
+def cases(folder: Path) -> list[Case]:
+    """All of them."""
+    found = [
+        Case(f"{one[1]} on {one[0]}", folder / f"train-{number}", _training(*one))
+        for number, one in enumerate(TRAININGS)
+    ]
+    for number, (env_id, algo, steps, settings) in enumerate(CONTINUATIONS):
+        words = [*_training(env_id, algo, steps, settings), "-i", f"{{before}}/{algo}/{env_id}_1"]
+        before = (_training(env_id, algo, steps // 10, settings),)
+        found.append(Case(f"{algo} -i on {env_id}", folder / f"go-on-{number}", words, before))
+    found += _others(folder)
+    for case in found:
+        case.folder.mkdir(parents=True)
+    return found
+
+
+def _training(env_id: str, algo: str, steps: int, settings: str) -> list[str]:
+    words = f"train.py --env {env_id} --algo {algo} -n {steps} --seed 1 --resume-or-start".split()
+    return [*words, "--verbose", "0", *(["-params", *settings.split()] if settings else [])]
+
+
+def _others(folder: Path) -> list[Case]:
+    study = f"compare.py {STUDY} --name study -n 1500".split()
+    older = f"compare.py {STUDY} --name study -n 1000".split()
+    films = f"compare.py {FILMS} --n-episodes 200 --render-every 20".split()
+    agent = f"train.py {LAKE} -n 20000 --seed 1 --verbose 0".split()
+    film = f"enjoy.py {LAKE} --record {{logs}}/film.gif --reward-log {{logs}}/returns".split()
+    judged = ("linucb", "thompson")
+    learning = "--env-kwargs log:{before}-0.csv -n 3000 --eval-freq -1 --seed 1 --verbose 0"
+    policies = [f"train.py --env ReplayBandit-v0 --algo {a} {learning}".split() for a in judged]
+    names = [f"{{before}}/{algo}/ReplayBandit-v0_1" for algo in judged]
+    logged = ["compare.py", "--logged", "{before}-1.csv", "--policy", *names]
+    return [
+        Case("a study of 12 runs", folder / "study", study),
+        Case("a study --replace", folder / "replace", [*study, "--replace"], (older,), True),
+        Case("a study with films", folder / "films", films),
+        Case("enjoy --record", folder / "record", film, (agent,), begins_with_them=True),
+        Case(
+            "compare --logged",
+            folder / "logged",
+            logged,
+            (["-c", LOG, "{before}"], *policies),
+            is_told=True,
+        ),
+    ]
