@@ -15,8 +15,11 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from experiments.analysis import analyse
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from report.latex import LATEX
+from report.markdown import MARKDOWN
 from report.page import write_report
 from report.series.study_series import study_series
+from report.verdict_table import verdicts_as
 
 BROWSER, DRIVER = (
     shutil.which("chromium") or shutil.which("google-chrome"),
@@ -530,6 +533,26 @@ def test_a_picture_to_take_along_has_title_legend_and_name(page):
     assert "Learning curves · FrozenLake-v1" in picture
     assert "sarsa" in picture
     assert "<script" not in picture
+
+
+def test_verdicts_to_take_along_are_those_beside_the_page(page, report_study):
+    saved = page.execute_async_script(
+        """
+        const done = arguments[0];
+        const files = [];
+        report.download = async (name, blob) => {
+          files.push([name, await blob.text()]);
+          if (files.length === 2) done(files);
+        };
+        document.querySelectorAll("#verdict [data-suffix]").forEach((button) => button.click());
+        """
+    )
+    assert [name for name, _ in saved] == [
+        "small-b-bold-b-verdict.md",
+        "small-b-bold-b-verdict.tex",
+    ]
+    for (_, text), markup in zip(saved, (MARKDOWN, LATEX), strict=True):
+        assert text == verdicts_as(markup, report_study.analysis, "python compare.py 'a & b.yml'")
 
 
 def test_a_table_to_take_along(page):

@@ -9,12 +9,13 @@
     const place = title.querySelector(".where:not([hidden])");
     return [title.firstChild.textContent.trim(), ...(place ? [visible(place)] : [])].join(" · ");
   };
-  const fileName = (element, number) => slug([document.title, heading(element), ...number].join(" ")).slice(0, 120);
+  const fileName = (element, number = []) => slug([document.title, heading(element), ...number].join(" ")).slice(0, 120);
   const placeOf = (element, css) => {
     const all = [...element.closest("section").querySelectorAll(css)].filter((one) => one.closest("[hidden]") === null);
     return all.length > 1 ? [all.indexOf(element) + 1] : [];
   };
 
+  report.fileName = fileName;
   report.download = (name, blob) => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(blob);
