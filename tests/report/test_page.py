@@ -18,7 +18,7 @@ from report.page import film_section, overview_section, policy_section, write_re
 from report.page.assembly import SECTIONS
 from report.page.comparison_section import improvement_matrix
 from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
-from report.page.markup import inline_script, p_value, packed, plain, setting
+from report.page.markup import breakable, inline_script, p_value, packed, plain, setting
 from report.page.sections import Report
 from report.series.agent_marks import COLOURS, agent_marks
 from report.series.study_series import study_series
@@ -408,3 +408,9 @@ def test_small_figures_keep_the_lines_within(page, report_study):
         assert corners[:, 1].max() <= overview_section.HEIGHT
         # Nothing lies above the optimum.
         assert corners[:, 1].min() >= figure.optimum - 0.1
+
+
+def test_labels_break_where_their_words_end():
+    assert breakable("FrozenLake8x8-v1") == "Frozen<wbr>Lake8x8-<wbr>v1"
+    assert breakable("ALE/Pong-v5") == "ALE/<wbr>Pong-<wbr>v5"
+    assert breakable("<b>-x") == "&lt;b&gt;-<wbr>x"

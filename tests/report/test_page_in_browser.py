@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 from selenium import webdriver
@@ -18,8 +19,12 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from report.latex import LATEX
 from report.markdown import MARKDOWN
 from report.page import write_report
+from report.page.assembly import STYLES
+from report.page.markup import package_file, templates
+from report.series.agent_marks import agent_marks
 from report.series.study_series import study_series
 from report.verdict_table import verdicts_as
+from verdicts import Estimate
 
 BROWSER, DRIVER = (
     shutil.which("chromium") or shutil.which("google-chrome"),
@@ -564,6 +569,12 @@ def test_a_table_to_take_along(page):
     assert sorted(line[:5] for line in lines[1:]) == ["</scr", "Q-lea", "sarsa"]
     mean = float(lines[1].split(",")[1])
     assert 0 <= mean <= 1
+    matrix = page.execute_script(
+        "return report.csv(document.querySelector('#comparison .square'))"
+    ).splitlines()
+    assert matrix[0].startswith("Agent,")
+    assert matrix[0].count(",") == 3
+    assert len(matrix) == 4
     # A label that a spreadsheet would run.
     guarded = page.execute_script(
         """
@@ -584,6 +595,47 @@ def test_the_ranking_needs_no_sideways_scrolling_on_a_laptop(page):
             css,
         )
         assert reach <= width
+
+
+@pytest.fixture(scope="module")
+def wide_tables(tmp_path_factory):
+    """The tables over all environments of ten agents on ten environments, without their figures."""
+    names = [f"double_qlearning alpha=0.{i}" for i in range(10)]
+    places = [f"FrozenLake8x{i}-v1" for i in range(10)]
+    study = StudySpec("w", "Wide", tuple(AgentSpec(n, "dqn", tuned=False) for n in names), ())
+    body = (
+        templates()
+        .get_template("overall.html")
+        .render(
+            agents=names,
+            marks=agent_marks(study),
+            environments=[SimpleNamespace(environment=place) for place in places],
+            scores=[{name: Estimate(-0.1234, -10.25, 0.9876, 9) for name in names} for _ in places],
+            improvement=[[None if i == k else 0.75 for k in range(10)] for i in range(10)],
+        )
+    )
+    style = "".join(package_file(name) for name in STYLES)
+    path = tmp_path_factory.mktemp("wide") / "wide.html"
+    text = f"<!DOCTYPE html><meta charset=utf-8><style>{style}</style><main><section>{body}"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("width", [1280, 1024])
+def test_ten_agents_on_ten_environments_need_no_sideways_scrolling(browser, wide_tables, width):
+    resize(browser, width)
+    browser.get(wide_tables.as_uri())
+    reaches = browser.execute_script(
+        "return [...document.querySelectorAll('.scroll')]"
+        ".map((e) => [e.scrollWidth, e.clientWidth])"
+    )
+    assert len(reaches) == 2
+    assert all(reach <= room for reach, room in reaches), reaches
+    # Names break where their words end, and nowhere else.
+    heights = browser.execute_script(
+        "return [...document.querySelectorAll('thead button')].map((e) => e.offsetHeight)"
+    )
+    assert max(heights) <= 80  # three lines
 
 
 def test_no_tick_is_printed_over_another(page):
