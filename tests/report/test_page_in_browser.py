@@ -234,6 +234,37 @@ def test_an_axis_for_returns_that_dwarf_the_others(page):
     assert min(v for y in compressed["y"] for v in y) > -10
 
 
+def test_training_on_a_variant_is_marked_at_the_curve_and_in_the_legend(page):
+    # Data of an environment are parsed when it is first chosen.
+    page.execute_script(
+        """
+        const element = document.getElementById("data-curves-1");
+        const data = JSON.parse(element.textContent);
+        data.training.onVariant = ["sarsa"];
+        element.textContent = JSON.stringify(data);
+        """
+    )
+    Select(find(page, "#environment")).select_by_index(1)
+
+    def legend():
+        return [button.text for button in find_all(page, "#curves .legend button")]
+
+    assert sum("on a variant" in text for text in legend()) == 0
+    choose(page, "kind", "training")
+    assert [text for text in legend() if "on a variant" in text] == ["sarsa\non a variant"]
+    training = figure(page, "#curves .plot")
+    assert "sarsa (on a variant)" in training["names"]
+    assert not training["shapes"]
+    circled = page.execute_script(
+        "return document.querySelector('#curves .plot').data"
+        ".filter((t) => t.marker?.symbol === 'circle-open').map((t) => t.name)"
+    )
+    assert circled == ["sarsa (on a variant)"]
+    assert "Circles: trained on a variant" in find(page, "#curves figcaption").text
+    choose(page, "kind", "evaluation")
+    assert sum("on a variant" in text for text in legend()) == 0
+
+
 def test_hiding_an_agent_in_the_legend(page):
     names = figure(page, "#curves .plot")["names"]
     button = find_all(page, "#curves .legend button")[0]
