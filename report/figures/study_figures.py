@@ -61,8 +61,9 @@ def draw_learning_curves(
 
 def _mark_variant(axes: Axes, curve: Curve, mark: Mark) -> None:
     """Circles along a curve, which tell it from the others without colour."""
-    style = {"color": colour_of(mark), "markerfacecolor": "white"}
-    axes.plot(curve.x, curve.y, "o", markersize=5, markevery=CIRCLES_APART, **style)
+    colour = colour_of(mark)
+    hollow = axes.plot(curve.x, curve.y, "o", color=colour, markerfacecolor="white", markersize=5)
+    hollow[0].set_markevery(CIRCLES_APART)
 
 
 def _training_title(on_variant: Sequence[str]) -> str:
