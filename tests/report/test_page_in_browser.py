@@ -618,7 +618,10 @@ def test_a_table_to_take_along(page):
     assert guarded == "a,b\n'=1+1,-2\n"
 
 
-def test_the_ranking_needs_no_sideways_scrolling_on_a_laptop(page):
+@pytest.mark.parametrize("width", [1280, 1024, 720])
+def test_tables_need_no_sideways_scrolling_on_a_laptop_or_enlarged_to_twice(page, width):
+    resize(page, width)
+    assert page.execute_script("return document.documentElement.scrollWidth") <= width
     for css in ("#ranking", "#comparison"):
         reach, width = page.execute_script(
             "const e = document.querySelector(arguments[0] + ' figure:not([hidden]) .scroll');"
