@@ -93,13 +93,13 @@ def page(text):
 
 
 def data_names(page):
-    return [a["id"] for a, _ in page.all("script") if a.get("type") == "application/json"]
+    return [a["id"] for a, _ in page.all("script") if "data-packed" in a]
 
 
 def data_of(page, name):
     found = [text for attributes, text in page.all("script") if attributes.get("id") == name]
     assert len(found) == 1
-    return json.loads(found[0])
+    return json.loads(gzip.decompress(base64.b64decode(found[0])))
 
 
 # --- structure -----------------------------------------------------------------------------------
