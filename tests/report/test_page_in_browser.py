@@ -21,6 +21,7 @@ from report.markdown import MARKDOWN
 from report.page import write_report
 from report.page.assembly import STYLES
 from report.page.markup import package_file, templates
+from report.page.settings_section import SettingsTable
 from report.series.agent_marks import agent_marks
 from report.series.study_series import study_series
 from report.verdict_table import verdicts_as
@@ -648,9 +649,23 @@ def wide_tables(tmp_path_factory):
             improvement=[[None if i == k else 0.75 for k in range(10)] for i in range(10)],
         )
     )
+    settings = (
+        templates()
+        .get_template("settings.html")
+        .render(
+            study=study,
+            marks=agent_marks(study),
+            environments=[SimpleNamespace(environment=places[0])],
+            tables=[SettingsTable(names, {"learning_rate": (["exp_0.5_0.003"] * 10, False)})],
+            **dict.fromkeys(("command", "seeds", "absent", "mixed"), ""),
+            **dict.fromkeys(("missing", "looks", "machine"), ()),
+            versions={},
+        )
+    )
     style = "".join(package_file(name) for name in STYLES)
     path = tmp_path_factory.mktemp("wide") / "wide.html"
-    text = f"<!DOCTYPE html><meta charset=utf-8><style>{style}</style><main><section>{body}"
+    text = f"<!DOCTYPE html><meta charset=utf-8><style>{style}</style><main>"
+    text += f"<section id=wide>{body}</section><section id=settings>{settings}</section>"
     path.write_text(text, encoding="utf-8")
     return path
 
@@ -660,16 +675,31 @@ def test_ten_agents_on_ten_environments_need_no_sideways_scrolling(browser, wide
     resize(browser, width)
     browser.get(wide_tables.as_uri())
     reaches = browser.execute_script(
-        "return [...document.querySelectorAll('.scroll')]"
+        "return [...document.querySelectorAll('#wide .scroll')]"
         ".map((e) => [e.scrollWidth, e.clientWidth])"
     )
     assert len(reaches) == 2
     assert all(reach <= room for reach, room in reaches), reaches
     # Names break where their words end, and nowhere else.
     heights = browser.execute_script(
-        "return [...document.querySelectorAll('thead button')].map((e) => e.offsetHeight)"
+        "return [...document.querySelectorAll('#wide thead button')].map((e) => e.offsetHeight)"
     )
     assert max(heights) <= 80  # three lines
+
+
+def test_ten_agents_fit_on_paper(browser, wide_tables):
+    resize(browser, PAPER)
+    browser.get(wide_tables.as_uri())
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print", "features": []})
+    try:
+        rights = browser.execute_script(
+            "return [...document.querySelectorAll('table')]"
+            ".map((e) => e.getBoundingClientRect().right)"
+        )
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": []})
+    assert len(rights) == 3
+    assert max(rights) <= PAPER  # else a browser makes all that is printed smaller
 
 
 def test_no_tick_is_printed_over_another(page):
