@@ -6,7 +6,7 @@
 Nothing is trained: learning curves rise to an end that each agent has on each environment, with
 noise, and runs that fail. Seconds are processor time of this process, and in the end of a headless
 Chromium's for the page, where there is one with its driver. Maps and films are not in it: on a page
-they take up to 2.2 MB more.
+they take up to 2 MB more.
 """
 
 from __future__ import annotations

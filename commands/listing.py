@@ -9,7 +9,7 @@ from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
 from agents.algorithm_entries import is_bandit
-from commands.terminal import TextConsole
+from commands.terminal import TextConsole, print_rows
 from envs.action_masks import has_masks
 from pipeline.environments import make_env
 from pipeline.settings.hyperparam_entries import entry_names
@@ -30,7 +30,7 @@ def _print_agents(console: Console) -> None:
     for name, entry in ALGORITHMS.items():
         missing = "" if entry.is_installed else f"  needs: {entry.install_command}"
         table.add_row(escape(name), escape(entry.summary + missing))
-    console.print(table)
+    print_rows(console, table)
 
 
 def _print_environments(console: Console) -> None:
@@ -49,7 +49,7 @@ def _print_environments(console: Console) -> None:
         others = [name for name in fitting if name not in with_entry]
         env.close()
         table.add_row(env_id, " ".join(with_entry), " ".join(others))
-    console.print(table)
+    print_rows(console, table)
     console.print(
         "\nAny other environment registered with Gymnasium works where the spaces fit; "
         "--gym-packages imports modules that register more, and agents of your own."

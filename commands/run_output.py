@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from commands.parsing import called_as
+from commands.terminal import print_rows
 from pipeline.errors import UserError
 from pipeline.module_records import as_flag
 from pipeline.run_folder import FINISHED, Run, numbered_runs
@@ -111,7 +112,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     table = Table.grid(padding=(0, 2))
     for row in rows:
         table.add_row(*map(escape, row))
-    console.print(table, highlight=False)
+    print_rows(console, table)
     # On one line, however long: it is there to be copied.
     width = max(len(label) for label, _ in rows) + 2
     command = f"{'watch':<{width}}{watch_command(spec, outcome.run)}"

@@ -204,7 +204,7 @@ def _judge(
         from report.result_files import write_tables, write_verdicts
         from report.series.episode_blocks import episodes_table
 
-        files = [*write_tables(results), write_verdicts(analysis, command)]
+        files = [*write_tables(results), *write_verdicts(analysis, command)]
         blocks = episodes_table(results, width) if width else None
         if blocks is not None:
             print_episodes_table(console, blocks, width)

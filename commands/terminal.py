@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from io import StringIO
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
+from rich.table import Table
 from rich.text import Text
 
 from pipeline.errors import visible
 
 WIDTH_WITHOUT_TERMINAL = 120
+UNBOUNDED = 10_000  # columns
 
 
 class TextConsole(Console):
@@ -19,6 +22,12 @@ class TextConsole(Console):
 
     Labels, titles and names come from files; what moves the cursor or sets a colour is Rich's own.
     """
+
+    def print(self, *objects: Any, **options: Any) -> None:
+        """As Rich does; into a file or a pipe no line is broken, so that `grep` finds it whole."""
+        if not self.is_terminal and all(isinstance(item, str) for item in objects):
+            options.setdefault("soft_wrap", True)
+        super().print(*objects, **options)
 
     def render_str(self, text: str, **options: Any) -> Text:
         """As Rich does, of the text made visible, so that it is measured as it is shown."""
@@ -39,3 +48,14 @@ def table_console(*, highlight: bool = True) -> Console:
     if console.is_terminal:
         return console
     return TextConsole(highlight=highlight, width=WIDTH_WITHOUT_TERMINAL)
+
+
+def print_rows(console: Console, table: Table) -> None:
+    """Print a table without lines: into a file or a pipe each row as a line, however long."""
+    if console.is_terminal:
+        console.print(table, highlight=False)
+        return
+    wide = TextConsole(file=StringIO(), width=UNBOUNDED)
+    wide.print(table, highlight=False)
+    for line in wide.file.getvalue().splitlines():  # type: ignore[attr-defined]  # it is ours
+        console.print(line.rstrip(), markup=False, highlight=False, soft_wrap=True)

@@ -25,7 +25,7 @@ from pipeline.finite_numbers import NotFiniteError, is_finite
 from pipeline.preparation import algorithm_kwargs
 from pipeline.pull_recording import PULLS_FILE
 from pipeline.run_folder import FINISHED, Run
-from pipeline.run_record import recorded_versions, write_settings
+from pipeline.run_record import recorded_machine, recorded_versions, write_settings
 from pipeline.train_spec import TrainSpec
 
 STATISTICS_FILE = "pull_statistics.npz"
@@ -52,6 +52,7 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
         n_runs=n_runs,
         n_timesteps=len(result.arms[0]),
         versions=recorded_versions(),
+        machine=recorded_machine(),
         engine=engine,
         **(WorkTime.now() - started - time_compiling()).as_data(),
     )

@@ -142,12 +142,12 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _check_texts(run: Run, info: Mapping[str, Any]) -> None:
-    versions = info.get("versions", {})
     texts = [info.get("engine") or "", info.get("model_refused") or ""]
-    if isinstance(versions, dict):
-        texts += versions.values()
-    if not isinstance(versions, dict) or not all(isinstance(text, str) for text in texts):
-        raise DamagedFileError(run.info_path, "is damaged: engine or versions are no text")
+    for name in ("versions", "machine"):
+        named = info.get(name, {})
+        texts += named.values() if isinstance(named, dict) else [None]
+    if not all(isinstance(text, str) for text in texts):
+        raise DamagedFileError(run.info_path, "is damaged: engine, versions or machine are no text")
 
 
 def _is_figure(value: object) -> bool:

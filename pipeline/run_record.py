@@ -1,11 +1,13 @@
-"""What a run folder says of the run before it begins: what was asked for, with which versions."""
+"""What a run folder says of the run before it begins: what was asked for, and what it runs on."""
 
 from __future__ import annotations
 
+import os
 import platform
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -17,6 +19,7 @@ from pipeline.train_spec import TrainSpec
 
 # The field of ``run.json`` with the digest of the zip that a run goes on with.
 TRAINED_AGENT = "trained_agent_digest"
+_PROCESSORS = Path("/proc/cpuinfo")
 RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
 
 
@@ -39,3 +42,23 @@ def recorded_versions() -> dict[str, str]:
     """The versions that a run's results may depend on."""
     packages = {package: version(package) for package in RECORDED_PACKAGES}
     return {"python": platform.python_version(), **packages}
+
+
+@cache
+def recorded_machine() -> dict[str, str]:
+    """What times may depend on, and the bits of networks; nothing that names this very machine."""
+    return {
+        "processor": _processor(),
+        "cores": str(os.cpu_count() or "unknown"),
+        "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
+    }
+
+
+def _processor() -> str:
+    """The model, as Linux tells it; Python itself knows the family alone."""
+    try:
+        lines = _PROCESSORS.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, "") or platform.processor() or platform.machine() or "unknown"

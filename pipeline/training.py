@@ -32,6 +32,7 @@ from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_folder import FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.run_record import (
     TRAINED_AGENT,
+    recorded_machine,
     recorded_versions,
     write_arguments,
     write_settings,
@@ -150,6 +151,7 @@ def _record_beginning(training: Training, args: dict[str, Any], command: str) ->
         env_name=run.env_name,
         spec=spec.as_data(),
         versions=recorded_versions(),
+        machine=recorded_machine(),
         **({} if training.trained_digest is None else {TRAINED_AGENT: training.trained_digest}),
         **({} if training.refusal is None else {"model_refused": training.refusal}),
     )

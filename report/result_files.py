@@ -1,4 +1,4 @@
-"""A study as files of comma-separated values."""
+"""A study as files: comma-separated values, and verdicts for a page or a paper."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from pathlib import Path
 from experiments.analysis import StudyAnalysis
 from experiments.study_results import StudyResults
 from pipeline.files import replacing, write_text
-from report.verdict_table import verdicts_as_markdown
+from report.latex import LATEX
+from report.markdown import MARKDOWN
+from report.verdict_table import verdicts_as
 
 
 def write_tables(results: StudyResults) -> list[Path]:
@@ -22,8 +24,10 @@ def write_tables(results: StudyResults) -> list[Path]:
     return [summary, curves]
 
 
-def write_verdicts(analysis: StudyAnalysis, command: str) -> Path:
-    """Write ``verdicts.md``: what the study has shown, to be pasted where it is told of."""
-    path = analysis.results.root / "verdicts.md"
-    write_text(path, verdicts_as_markdown(analysis, command))
-    return path
+def write_verdicts(analysis: StudyAnalysis, command: str) -> list[Path]:
+    """Write ``verdicts.md`` and ``verdicts.tex``: what the study has shown, to be pasted."""
+    written = []
+    for suffix, markup in ((".md", MARKDOWN), (".tex", LATEX)):
+        written.append((analysis.results.root / "verdicts").with_suffix(suffix))
+        write_text(written[-1], verdicts_as(markup, analysis, command))
+    return written

@@ -1,4 +1,4 @@
-"""A study as Markdown, to stand in a page or a paper as it is: verdicts, failures and cost."""
+"""A study as Markdown or LaTeX, to stand in a page or a paper: verdicts, failures and cost."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
 from experiments.tuning_seeds import tuning_seeds
 from report.conclusions import conclusion, none_has_learnt
-from report.markdown import escaped, markdown_table, name_of
+from report.markdown import MARKDOWN
+from report.markup_language import MarkupLanguage
 from report.seed_sentence import seed_sentence
 from report.wording import interval, number, seeds
 from verdicts import Verdict
@@ -26,35 +27,36 @@ _SEEN_BY_THE_LEADER: dict[Verdict, Standing] = {
 }
 
 
-def verdicts_as_markdown(analysis: StudyAnalysis, command: str) -> str:
+def verdicts_as(markup: MarkupLanguage, analysis: StudyAnalysis, command: str) -> str:
     """The whole study: what seeds it has, the headline, and for each environment the verdicts."""
     study = analysis.study
     parts = [
-        f"# {escaped(study.title)}",
-        f"`{command.replace('`', ' ')}`",
-        escaped(seed_sentence(study.seeds, tuning_seeds(study))),
-        headline(analysis),
+        markup.title(study.title),
+        markup.command(command),
+        markup.text(seed_sentence(study.seeds, tuning_seeds(study))),
+        headline(analysis, markup),
     ]
     for environment in analysis.environments:
-        said = [f"- {escaped(text)}" for text in conclusion(study, environment).everything]
         parts += [
-            f"## {escaped(environment.environment)}",
-            ranking(analysis.results, environment),
-            "\n".join(said),
+            markup.heading(environment.environment),
+            ranking(analysis.results, environment, markup),
+            markup.items(conclusion(study, environment).everything),
         ]
-    return "\n\n".join(parts) + "\n"
+    content = "\n\n".join(parts) + "\n"
+    preamble = markup.preamble(content)
+    return f"{preamble}\n\n{content}" if preamble else content
 
 
-def headline(analysis: StudyAnalysis) -> str:
+def headline(analysis: StudyAnalysis, markup: MarkupLanguage = MARKDOWN) -> str:
     """A table of agents by environments, and what its marks mean."""
     study, environments = analysis.study, analysis.environments
-    found = [_cells(analysis, environment) for environment in environments]
+    found = [_cells(analysis, environment, markup) for environment in environments]
     rows = [
-        [name_of(agent.label), *(cells.get(agent.label, "-") for cells in found)]
+        [markup.name(agent.label), *(cells.get(agent.label, "-") for cells in found)]
         for agent in study.agents
     ]
-    table = markdown_table(["", *(escaped(e.environment) for e in environments)], rows)
-    return f"{table}\n\n{_legend(study, analysis)}"
+    headings = ["", *(markup.text(one.environment) for one in environments)]
+    return markup.table(headings, rows, markup.text(_legend(study, analysis)))
 
 
 def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
@@ -73,14 +75,17 @@ def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
     return text
 
 
-def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, str]:
+def _cells(
+    analysis: StudyAnalysis, environment: EnvironmentAnalysis, markup: MarkupLanguage
+) -> dict[str, str]:
     """The cell of each agent that has a run."""
     study, places = analysis.study, standings(analysis.study, environment)
     costs = processor_seconds(analysis.results)
     cells = {}
     for agent in environment.agents:
         value = _typical(study, agent)
-        text = f"**{value}**" if places.get(agent.agent) == "best" else value
+        is_best = places.get(agent.agent) == "best"
+        text = markup.bold(value) if is_best else markup.figure(value)
         text += " ?" if places.get(agent.agent) == "open" else ""
         cost = costs.get((agent.agent, environment.environment))
         text += "" if cost is None else f" ({duration(cost)})"
@@ -128,26 +133,28 @@ def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, S
     return found
 
 
-def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> str:
+def ranking(
+    results: StudyResults, environment: EnvironmentAnalysis, markup: MarkupLanguage = MARKDOWN
+) -> str:
     """The agents of an environment with their figures, the best first."""
     costs = processor_seconds(results)
     rows = []
     for agent in environment.agents:
         count, stays = environment.failures.get(agent.agent), agent.steps_to_stay
         cost = costs.get((agent.agent, environment.environment))
-        rows.append(
-            [
-                name_of(agent.agent),
-                interval(agent.metric.median),
-                interval(agent.metric.mean),
-                "-" if agent.score is None else number(agent.score.median.point),
-                "-" if count is None else f"{count.n_failed} of {count.n}",
-                "-" if stays is None else number(stays.median.point),
-                "-" if cost is None else duration(cost),
-            ]
-        )
+        figures = [
+            interval(agent.metric.median),
+            interval(agent.metric.mean),
+            "-" if agent.score is None else number(agent.score.median.point),
+            "-" if count is None else f"{count.n_failed} of {count.n}",
+            "-" if stays is None else number(stays.median.point),
+            "-" if cost is None else duration(cost),
+        ]
+        rows.append([markup.name(agent.agent), *map(markup.figure, figures)])
     headings = ["", "median", "mean", "score", "failed", "stays from", "processor time"]
-    return markdown_table(headings, rows)
+    metric = METRIC_WORDS[results.study.metric]
+    caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
+    return markup.table(headings, rows, markup.text(caption))
 
 
 def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:

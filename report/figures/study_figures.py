@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 _AXES = {"step": "environment steps", "episode": "episodes"}
 
+ON_VARIANT = "trained on a variant of the environment"
+CIRCLES_APART = 0.12  # of the length of the diagonal
+
 Marks = Mapping[str, Mark]
 
 
@@ -42,13 +45,25 @@ def draw_learning_curves(
         _set_scale(place, curves[kind].linear_up_to)
         for agent, curve in curves[kind].by_axis[by].items():
             _draw_curve(place, curve, marks[agent])
+            if agent in curves[kind].on_variant:
+                _mark_variant(place, curve, marks[agent])
         if not curves[kind].on_variant:
             _draw_references(place, environment)
         place.set(xlabel=_AXES[by], ylabel="return")
         place.xaxis.set_major_formatter(EngFormatter(sep=""))
     places[0].set_title(f"{environment.environment}: evaluations", loc="left")
     places[1].set_title(_training_title(curves["training"].on_variant), loc="left")
+    if curves["training"].on_variant:
+        # The legend below is of these axes: it tells what the circles on the others are.
+        places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
     shared_legend(places[0])
+
+
+def _mark_variant(axes: Axes, curve: Curve, mark: Mark) -> None:
+    """Circles along a curve, which tell it from the others without colour."""
+    colour = colour_of(mark)
+    hollow = axes.plot(curve.x, curve.y, "o", color=colour, markerfacecolor="white", markersize=5)
+    hollow[0].set_markevery(CIRCLES_APART)
 
 
 def _training_title(on_variant: Sequence[str]) -> str:

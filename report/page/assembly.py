@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
@@ -23,10 +22,10 @@ from report.page import (
     verdict_section,
 )
 from report.page.markup import (
+    as_json,
     inline_script,
     package_file,
     packed,
-    plain,
     script_hash,
     template_file,
     templates,
@@ -115,8 +114,8 @@ def _own_script(sections: list[Section]) -> str:
     return "\n".join(text for name in names if (text := template_file(name)) is not None)
 
 
-def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
-    """What the scripts work with, by the name of its element."""
+def _data(report: Report, sections: list[Section]) -> dict[str, str]:
+    """What the scripts work with, by the name of its element: packed JSON."""
     page = {
         "agents": [vars(mark) for mark in report.series.marks.values()],
         "environments": [
@@ -132,4 +131,4 @@ def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
     data = {"page": page, **{section.name: section.data for section in sections}}
     for section in sections:
         data |= {f"{section.name}-{place}": item for place, item in enumerate(section.places)}
-    return {name: plain(item) for name, item in data.items() if item is not None}
+    return {name: packed(as_json(item)) for name, item in data.items() if item is not None}

@@ -7,6 +7,7 @@ import gzip
 import hashlib
 import json
 import math
+import re
 from importlib.resources import files
 from typing import Any
 
@@ -16,6 +17,8 @@ from markupsafe import Markup
 
 from report.ranking_cells import bar
 from report.wording import interval_alone, number
+
+_WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
 
 SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
 
@@ -29,9 +32,9 @@ def templates() -> Environment:
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    # Agents stay in their order.
-    environment.policies["json.dumps_kwargs"] = {"sort_keys": False, "separators": (",", ":")}
-    environment.filters.update(number=number, interval=interval_alone, p_value=p_value, bar=bar)
+    environment.filters.update(
+        number=number, interval=interval_alone, p_value=p_value, bar=bar, breakable=breakable
+    )
     return environment
 
 
@@ -57,6 +60,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
     return value
+
+
+def as_json(value: Any) -> str:
+    """The value as `plain` makes it, in as few letters as can be."""
+    return json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
 
 
 def data_uri(kind: str, content: bytes) -> str:
@@ -96,6 +104,11 @@ def p_value(value: float) -> str:
     if math.isnan(value):
         return "-"
     return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def breakable(label: str) -> Markup:
+    """A label that may go over several lines where its words end: "Frozen|Lake8x8-|v1"."""
+    return Markup("<wbr>").join(_WORD_ENDS.split(label))
 
 
 def setting(value: Any) -> str:

@@ -1,4 +1,4 @@
-"""What a reader needs to do the study again: settings as run, seeds, versions, and failures."""
+"""What a reader needs to do the study again: settings as run, seeds, looks, versions, failures."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from experiments.execution import failure_log
+from experiments.looks_file import read_looks
 from experiments.planned_runs import PlannedRun
 from experiments.run_versions import mixed_versions
 from experiments.study_results import StudyResults
 from experiments.tuning_seeds import tuning_seeds
+from report.look_sentences import look_sentences
 from report.page.markup import setting
 from report.page.sections import Report, Section
 from report.seed_sentence import seed_sentence
@@ -63,7 +65,9 @@ def section(report: Report) -> Section | None:
             _settings_table([(r, info) for r, info in done if r.environment == e.environment])
             for e in report.analysis.environments
         ],
-        "versions": _versions(info for _, info in done),
+        "versions": _recorded("versions", [info for _, info in done]),
+        "machine": _recorded("machine", [info for _, info in done]),
+        "looks": _looks(report),
         "mixed": mixed_versions(info for _, info in done),
         "missing": _missing_runs(results, missing),
     }
@@ -93,13 +97,19 @@ def _column(infos: list[Mapping[str, Any]]) -> dict[str, str]:
     return column | {name: setting(value) for name, value in spec["hyperparams"].items()}
 
 
-def _versions(infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
-    """The versions that the runs were done with; several of a package where they differ."""
-    versions: dict[str, set[str]] = {}
+def _recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """What the runs were done with, by its name; several where runs differ, none of old runs."""
+    found: dict[str, set[str]] = {}
     for info in infos:
-        for package, version in info.get("versions", {}).items():
-            versions.setdefault(package, set()).add(version)
-    return {package: ", ".join(sorted(found)) for package, found in versions.items()}
+        for name, value in info.get(what, {}).items():
+            found.setdefault(name, set()).add(value)
+    return {name: ", ".join(sorted(values)) for name, values in found.items()}
+
+
+def _looks(report: Report) -> list[list[str]]:
+    """By environment, what looks there have been."""
+    log = read_looks(report.analysis.results.root)
+    return [look_sentences(log.on(one.environment)) for one in report.analysis.environments]
 
 
 def _missing_runs(results: StudyResults, missing: Iterable[PlannedRun]) -> list[MissingRuns]:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from report.conclusions import conclusion, places_without_a_run
+from report.latex import LATEX
+from report.markdown import MARKDOWN
 from report.page.sections import Report, Section
 from report.verdict_matrix import PHRASES, SIGNS, says_more, verdict_matrix
+from report.verdict_table import verdicts_as
 
 
 def section(report: Report) -> Section | None:
@@ -24,4 +27,8 @@ def section(report: Report) -> Section | None:
         "signs": SIGNS,
         "phrases": PHRASES,
     }
-    return Section("verdict", "Verdict", context)
+    files = {
+        name: verdicts_as(markup, report.analysis, report.command)
+        for name, markup in (("md", MARKDOWN), ("tex", LATEX))
+    }
+    return Section("verdict", "Verdict", context, files)

@@ -20,6 +20,7 @@ from commands.run_output import (
     print_outcome,
     watch_command,
 )
+from commands.terminal import TextConsole
 from mdp.work_time import WorkTime
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.run_folder import Run
@@ -233,3 +234,45 @@ def test_a_long_setting_is_cut_short_in_the_header():
     console = console_of(1000)
     print_header(console, spec_of(env_kwargs={"desc": ["S" * 100] * 100}, n_timesteps=1))
     assert len(console.file.getvalue()) < 400
+
+
+# --- into a file or a pipe ------------------------------------------------------------------------
+
+
+def test_redirected_no_row_is_broken_and_in_a_terminal_rows_hang():
+    outcome = outcome_of(final=EXACT)
+    file = io.StringIO()
+    print_outcome(TextConsole(file=file, width=80, _environ={}), spec_of(), outcome)
+    lines = file.getvalue().splitlines()
+    assert f"final    {describe(EXACT)}" in lines
+    assert [line for line in lines if line != line.rstrip()] == []
+    file = io.StringIO()
+    print_outcome(
+        TextConsole(file=file, width=80, force_terminal=True, no_color=True, _environ={}),
+        spec_of(),
+        outcome,
+    )
+    lines = [line.rstrip() for line in file.getvalue().splitlines()]
+    begins = next(place for place, line in enumerate(lines) if line.startswith("final"))
+    assert len(lines[begins]) <= 80
+    assert lines[begins + 1].startswith(" " * 9 + "constant policy")
+
+
+@pytest.mark.parametrize("is_terminal", [False, True])
+def test_redirected_no_sentence_is_broken(is_terminal):
+    file = io.StringIO()
+    console = TextConsole(file=file, width=20, force_terminal=is_terminal, _environ={})
+    console.print("a line of more than twenty letters", highlight=False)
+    assert (file.getvalue() == "a line of more than twenty letters\n") is not is_terminal
+
+
+def test_the_lists_have_a_line_for_each_row_where_they_are_redirected(monkeypatch):
+    file = io.StringIO()
+    monkeypatch.setattr(
+        listing, "TextConsole", lambda **more: TextConsole(file=file, width=80, _environ={}, **more)
+    )
+    listing.print_lists()
+    lines = file.getvalue().splitlines()
+    (lake,) = [line for line in lines if line.startswith("FrozenLake-v1 ")]
+    assert " qlearning " in lake
+    assert max(map(len, lines)) > 120

@@ -159,6 +159,8 @@ def test_a_record_that_says_nothing_is_damage_and_no_other_run(copied, record):
         {"engine": 3},
         {"versions": ["numpy"]},
         {"versions": {"numpy": 2}},
+        {"machine": "mine"},
+        {"machine": {"cores": 2}},
     ],
 )
 def test_a_record_of_wrong_types(copied, fields):

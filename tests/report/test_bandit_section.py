@@ -1,5 +1,7 @@
 """Studies on bandits as pictures and as a page."""
 
+import base64
+import gzip
 import json
 import re
 from dataclasses import replace
@@ -45,9 +47,10 @@ def page(analysis):
 
 def data_of(page, name):
     """A section's data on each environment; None where it has none."""
-    pattern = '<script type="application/json" id="data-{}-{}">(.*?)</script>'
+    pattern = '<script type="text/plain" data-packed id="data-{}-{}">(.*?)</script>'
     found = [re.search(pattern.format(name, place), page) for place in range(2)]
-    return [None if one is None else json.loads(one[1]) for one in found]
+    texts = [None if one is None else gzip.decompress(base64.b64decode(one[1])) for one in found]
+    return [None if text is None else json.loads(text) for text in texts]
 
 
 def test_the_page_has_pulls_and_no_empty_curves(page):

@@ -5,6 +5,7 @@ import gzip
 import hashlib
 import json
 import math
+import platform
 import re
 from html.parser import HTMLParser
 
@@ -12,13 +13,20 @@ import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
 
+from experiments.looks import Look, LookLog, Looks, Question
 from report.conclusions import conclusion
 from report.figures.figure_style import line_style
-from report.page import film_section, overview_section, policy_section, write_report
+from report.page import (
+    film_section,
+    overview_section,
+    policy_section,
+    settings_section,
+    write_report,
+)
 from report.page.assembly import SECTIONS
 from report.page.comparison_section import improvement_matrix
 from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
-from report.page.markup import inline_script, p_value, packed, plain, setting
+from report.page.markup import breakable, inline_script, p_value, packed, plain, setting
 from report.page.sections import Report
 from report.series.agent_marks import COLOURS, agent_marks
 from report.series.study_series import study_series
@@ -85,13 +93,13 @@ def page(text):
 
 
 def data_names(page):
-    return [a["id"] for a, _ in page.all("script") if a.get("type") == "application/json"]
+    return [a["id"] for a, _ in page.all("script") if "data-packed" in a]
 
 
 def data_of(page, name):
     found = [text for attributes, text in page.all("script") if attributes.get("id") == name]
     assert len(found) == 1
-    return json.loads(found[0])
+    return json.loads(gzip.decompress(base64.b64decode(found[0])))
 
 
 # --- structure -----------------------------------------------------------------------------------
@@ -155,7 +163,27 @@ def test_settings_command_versions_and_failures(page, report_study):
     assert "2,000" in settings  # steps run
     assert "gamma" in settings
     assert report_study.planned[0].run.read_info()["versions"]["numpy"] in settings
+    machine = report_study.planned[0].run.read_info()["machine"]
+    assert machine["processor"] in settings
+    assert f"cores{machine['cores']}" in settings.replace("\n", "")
+    assert platform.node() not in "".join(machine.values())
+    assert "looked at" not in settings  # nobody has, by the file
     assert re.search(r"on Warehouse-v0, seed 1:\s+ValueError: <the> disk & all is full", settings)
+
+
+def test_settings_have_the_looks_and_of_old_runs_no_machine(report_study, tmp_path, monkeypatch):
+    question = Question("final", None, None, 5)
+    look = Look("2026-11-22 10:00:00", question, {"a": 4, "b": 4}, {}, {}, 0.045, planned=False)
+    monkeypatch.setattr(
+        settings_section, "read_looks", lambda _: LookLog({"Warehouse-v0": Looks((look,))})
+    )
+    infos = [{"versions": {"numpy": "2"}}]
+    assert settings_section._recorded("machine", infos) == {}
+    write_report(study_series(report_study.analysis), tmp_path / "page.html", "compare.py")
+    settings = Page((tmp_path / "page.html").read_text(encoding="utf-8")).all("section")[-1][1]
+    assert "These runs have been looked at once." in settings
+    assert "2026-11-22: seeds 5 to 8; claims at 4.5 %." in settings
+    assert "None on this environment: too few runs." in settings
 
 
 def test_a_study_on_one_environment_compares_nothing_over_environments(one_environment, tmp_path):
@@ -408,3 +436,9 @@ def test_small_figures_keep_the_lines_within(page, report_study):
         assert corners[:, 1].max() <= overview_section.HEIGHT
         # Nothing lies above the optimum.
         assert corners[:, 1].min() >= figure.optimum - 0.1
+
+
+def test_labels_break_where_their_words_end():
+    assert breakable("FrozenLake8x8-v1") == "Frozen<wbr>Lake8x8-<wbr>v1"
+    assert breakable("ALE/Pong-v5") == "ALE/<wbr>Pong-<wbr>v5"
+    assert breakable("<b>-x") == "&lt;b&gt;-<wbr>x"

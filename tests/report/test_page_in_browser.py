@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from itertools import pairwise
+from types import SimpleNamespace
 
 import pytest
 from selenium import webdriver
@@ -15,8 +16,16 @@ from selenium.webdriver.support.ui import Select, WebDriverWait
 
 from experiments.analysis import analyse
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from report.latex import LATEX
+from report.markdown import MARKDOWN
 from report.page import write_report
+from report.page.assembly import STYLES
+from report.page.markup import package_file, templates
+from report.page.settings_section import SettingsTable
+from report.series.agent_marks import agent_marks
 from report.series.study_series import study_series
+from report.verdict_table import verdicts_as
+from verdicts import Estimate
 
 BROWSER, DRIVER = (
     shutil.which("chromium") or shutil.which("google-chrome"),
@@ -224,6 +233,37 @@ def test_an_axis_for_returns_that_dwarf_the_others(page):
     assert plain["tickText"] is None
     assert min(v for y in plain["y"] for v in y) < -10_000
     assert min(v for y in compressed["y"] for v in y) > -10
+
+
+def test_training_on_a_variant_is_marked_at_the_curve_and_in_the_legend(page):
+    # Data of an environment are parsed when it is first chosen.
+    page.execute_script(
+        """
+        const element = document.getElementById("data-curves-1");
+        const data = JSON.parse(element.textContent);
+        data.training.onVariant = ["sarsa"];
+        element.textContent = JSON.stringify(data);
+        """
+    )
+    Select(find(page, "#environment")).select_by_index(1)
+
+    def legend():
+        return [button.text for button in find_all(page, "#curves .legend button")]
+
+    assert sum("on a variant" in text for text in legend()) == 0
+    choose(page, "kind", "training")
+    assert [text for text in legend() if "on a variant" in text] == ["sarsa\non a variant"]
+    training = figure(page, "#curves .plot")
+    assert "sarsa (on a variant)" in training["names"]
+    assert not training["shapes"]
+    circled = page.execute_script(
+        "return document.querySelector('#curves .plot').data"
+        ".filter((t) => t.marker?.symbol === 'circle-open').map((t) => t.name)"
+    )
+    assert circled == ["sarsa (on a variant)"]
+    assert "Circles: trained on a variant" in find(page, "#curves figcaption").text
+    choose(page, "kind", "evaluation")
+    assert sum("on a variant" in text for text in legend()) == 0
 
 
 def test_hiding_an_agent_in_the_legend(page):
@@ -532,6 +572,26 @@ def test_a_picture_to_take_along_has_title_legend_and_name(page):
     assert "<script" not in picture
 
 
+def test_verdicts_to_take_along_are_those_beside_the_page(page, report_study):
+    saved = page.execute_async_script(
+        """
+        const done = arguments[0];
+        const files = [];
+        report.download = async (name, blob) => {
+          files.push([name, await blob.text()]);
+          if (files.length === 2) done(files);
+        };
+        document.querySelectorAll("#verdict [data-suffix]").forEach((button) => button.click());
+        """
+    )
+    assert [name for name, _ in saved] == [
+        "small-b-bold-b-verdict.md",
+        "small-b-bold-b-verdict.tex",
+    ]
+    for (_, text), markup in zip(saved, (MARKDOWN, LATEX), strict=True):
+        assert text == verdicts_as(markup, report_study.analysis, "python compare.py 'a & b.yml'")
+
+
 def test_a_table_to_take_along(page):
     lines = page.execute_script(
         "return report.csv(document.querySelector('#ranking table'))"
@@ -541,6 +601,12 @@ def test_a_table_to_take_along(page):
     assert sorted(line[:5] for line in lines[1:]) == ["</scr", "Q-lea", "sarsa"]
     mean = float(lines[1].split(",")[1])
     assert 0 <= mean <= 1
+    matrix = page.execute_script(
+        "return report.csv(document.querySelector('#comparison .square'))"
+    ).splitlines()
+    assert matrix[0].startswith("Agent,")
+    assert matrix[0].count(",") == 3
+    assert len(matrix) == 4
     # A label that a spreadsheet would run.
     guarded = page.execute_script(
         """
@@ -553,7 +619,10 @@ def test_a_table_to_take_along(page):
     assert guarded == "a,b\n'=1+1,-2\n"
 
 
-def test_the_ranking_needs_no_sideways_scrolling_on_a_laptop(page):
+@pytest.mark.parametrize("width", [1280, 1024, 720])
+def test_tables_need_no_sideways_scrolling_on_a_laptop_or_enlarged_to_twice(page, width):
+    resize(page, width)
+    assert page.execute_script("return document.documentElement.scrollWidth") <= width
     for css in ("#ranking", "#comparison"):
         reach, width = page.execute_script(
             "const e = document.querySelector(arguments[0] + ' figure:not([hidden]) .scroll');"
@@ -561,6 +630,76 @@ def test_the_ranking_needs_no_sideways_scrolling_on_a_laptop(page):
             css,
         )
         assert reach <= width
+
+
+@pytest.fixture(scope="module")
+def wide_tables(tmp_path_factory):
+    """The tables over all environments of ten agents on ten environments, without their figures."""
+    names = [f"double_qlearning alpha=0.{i}" for i in range(10)]
+    places = [f"FrozenLake8x{i}-v1" for i in range(10)]
+    study = StudySpec("w", "Wide", tuple(AgentSpec(n, "dqn", tuned=False) for n in names), ())
+    body = (
+        templates()
+        .get_template("overall.html")
+        .render(
+            agents=names,
+            marks=agent_marks(study),
+            environments=[SimpleNamespace(environment=place) for place in places],
+            scores=[{name: Estimate(-0.1234, -10.25, 0.9876, 9) for name in names} for _ in places],
+            improvement=[[None if i == k else 0.75 for k in range(10)] for i in range(10)],
+        )
+    )
+    settings = (
+        templates()
+        .get_template("settings.html")
+        .render(
+            study=study,
+            marks=agent_marks(study),
+            environments=[SimpleNamespace(environment=places[0])],
+            tables=[SettingsTable(names, {"learning_rate": (["exp_0.5_0.003"] * 10, False)})],
+            **dict.fromkeys(("command", "seeds", "absent", "mixed"), ""),
+            **dict.fromkeys(("missing", "looks", "machine"), ()),
+            versions={},
+        )
+    )
+    style = "".join(package_file(name) for name in STYLES)
+    path = tmp_path_factory.mktemp("wide") / "wide.html"
+    text = f"<!DOCTYPE html><meta charset=utf-8><style>{style}</style><main>"
+    text += f"<section id=wide>{body}</section><section id=settings>{settings}</section>"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("width", [1280, 1024])
+def test_ten_agents_on_ten_environments_need_no_sideways_scrolling(browser, wide_tables, width):
+    resize(browser, width)
+    browser.get(wide_tables.as_uri())
+    reaches = browser.execute_script(
+        "return [...document.querySelectorAll('#wide .scroll')]"
+        ".map((e) => [e.scrollWidth, e.clientWidth])"
+    )
+    assert len(reaches) == 2
+    assert all(reach <= room for reach, room in reaches), reaches
+    # Names break where their words end, and nowhere else.
+    heights = browser.execute_script(
+        "return [...document.querySelectorAll('#wide thead button')].map((e) => e.offsetHeight)"
+    )
+    assert max(heights) <= 80  # three lines
+
+
+def test_ten_agents_fit_on_paper(browser, wide_tables):
+    resize(browser, PAPER)
+    browser.get(wide_tables.as_uri())
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "print", "features": []})
+    try:
+        rights = browser.execute_script(
+            "return [...document.querySelectorAll('table')]"
+            ".map((e) => e.getBoundingClientRect().right)"
+        )
+    finally:
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": "", "features": []})
+    assert len(rights) == 3
+    assert max(rights) <= PAPER  # else a browser makes all that is printed smaller
 
 
 def test_no_tick_is_printed_over_another(page):

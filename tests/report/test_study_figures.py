@@ -98,7 +98,15 @@ def test_no_optimum_stands_beside_training_on_a_variant(curves_drawn, on_variant
     left, right = curves_drawn(on_variant=on_variant)
     assert right.names == ["first", "second"]
     assert right.title == f"training episodes ({words}: on a variant of the environment)"
-    assert left.names == ["first", "second", "optimum", "best random or constant policy"]
+    circles = "trained on a variant of the environment"
+    names = ["first", "second", "optimum", "best random or constant policy", circles]
+    assert left.names == left.shared_legend == names
+    # Circles lie on their curves and on no other.
+    marked = [line for line in right.lines if line["label"] is None]
+    assert [(line["x"], line["y"]) for line in marked] == [
+        (right.line(name)["x"], right.line(name)["y"]) for name in on_variant
+    ]
+    assert {line["marker"] for line in marked} == {left.line(circles)["marker"]} == {"o"}
     assert left.title == "lake: evaluations"
 
 

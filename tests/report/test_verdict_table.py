@@ -103,9 +103,9 @@ def test_the_ranking_of_an_environment(made_up, place):
 
 
 def test_the_file_says_the_seeds_first_and_the_verdicts_last(made_up, place, tmp_path):
-    path = write_verdicts(analysis_of(made_up, place, root=tmp_path), "python compare.py a.yml")
-    text = path.read_text(encoding="utf-8")
-    assert path.name == "verdicts.md"
+    paths = write_verdicts(analysis_of(made_up, place, root=tmp_path), "python compare.py a.yml")
+    assert [path.name for path in paths] == ["verdicts.md", "verdicts.tex"]
+    text = paths[0].read_text(encoding="utf-8")
     parts = text.split("\n\n")
     assert parts[:3] == [
         "# S",

@@ -3,7 +3,7 @@ report.section("bandits", (root, _, current) => {
   const same = (value) => value;
   const redraws = [];
   const redraw = () => redraws.forEach((draw) => draw());
-  const isShown = report.legend(root.querySelector(".legend"), redraw);
+  const { isShown } = report.legend(root.querySelector(".legend"), redraw);
   const agents = (items) => Object.entries(items).filter(([label]) => isShown(label));
 
   // A figure that is there where `has` says so of the environment.

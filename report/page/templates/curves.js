@@ -6,7 +6,8 @@ report.section("curves", (root, _, place) => {
   const scale = root.querySelector('[data-switch="scale"]');
   const legend = root.querySelector(".legend");
   let redraw = () => {};
-  const isShown = report.legend(legend, () => redraw());
+  const noteOf = (label) => (place()?.[chosen("kind")].onVariant.includes(label) ? "on a variant" : "");
+  const { isShown, fill } = report.legend(legend, () => redraw(), noteOf);
 
   const extent = (curves, environment) => {
     const values = curves.flatMap((curve) => [...curve.y, ...curve.low, ...curve.high]);
@@ -24,10 +25,10 @@ report.section("curves", (root, _, place) => {
     const height = symlog?.height ?? ((value) => value);
     const curves = Object.entries(place()[kind][by]).filter(([label]) => isShown(label));
     const words = symlog ? [`The vertical axis is linear up to ±${report.number(linear)} and logarithmic beyond.`] : [];
-    if (onVariant.length) words.push(`Trained on a variant of the environment: ${onVariant.join(", ")}.`);
+    if (onVariant.length) words.push(`Circles: trained on a variant of the environment, so that the optimum is none of theirs: ${onVariant.join(", ")}.`);
     detail.textContent = words.join(" ");
     return {
-      traces: curves.flatMap(([label, curve]) => report.band(label, curve, height)),
+      traces: curves.flatMap(([label, curve]) => report.band(label, curve, height, {}, noteOf(label))),
       layout: {
         hovermode: "x unified",
         uirevision: [report.environment, kind, by, across, chosen("scale")].join(),
@@ -47,4 +48,5 @@ report.section("curves", (root, _, place) => {
   };
   redraw = report.figure(figure, build, isThere);
   root.querySelectorAll(".controls input").forEach((input) => input.addEventListener("change", redraw));
+  root.querySelectorAll('input[name="kind"]').forEach((input) => input.addEventListener("change", fill));
 });

@@ -9,12 +9,13 @@
     const place = title.querySelector(".where:not([hidden])");
     return [title.firstChild.textContent.trim(), ...(place ? [visible(place)] : [])].join(" · ");
   };
-  const fileName = (element, number) => slug([document.title, heading(element), ...number].join(" ")).slice(0, 120);
+  const fileName = (element, number = []) => slug([document.title, heading(element), ...number].join(" ")).slice(0, 120);
   const placeOf = (element, css) => {
     const all = [...element.closest("section").querySelectorAll(css)].filter((one) => one.closest("[hidden]") === null);
     return all.length > 1 ? [all.indexOf(element) + 1] : [];
   };
 
+  report.fileName = fileName;
   report.download = (name, blob) => {
     const link = document.createElement("a");
     link.href = URL.createObjectURL(blob);
@@ -53,24 +54,26 @@
   };
 
   // A table as comma-separated values: what stands in small print has a column of its own.
-  const own = (cell) => visible({ textContent: [...cell.childNodes].filter((node) => node.nodeName !== "SMALL").map((node) => node.textContent).join("") });
+  const own = (cell) => visible({ textContent: [...cell.childNodes].filter((node) => node.nodeName !== "SMALL" && isHeard(node)).map((node) => node.textContent).join("") });
   const small = (cell) => (cell.querySelector("small") ? visible(cell.querySelector("small")) : "");
   const quoted = (text) => {
     // A spreadsheet would take such a text for a formula.
     const safe = /^[=+@\t]|^-[^\d.∞]/.test(text) ? `'${text}` : text;
     return /[",\n]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
   };
+  const isHeard = (element) => element.getAttribute?.("aria-hidden") !== "true";
   report.csv = (table) => {
-    const rows = [...table.rows].filter((row) => row.parentElement.tagName !== "THEAD");
-    const headings = [...table.tHead.rows[0].cells];
-    const hasSmall = headings.map((_, i) => rows.some((row) => row.cells[i] && small(row.cells[i]) !== ""));
+    const cellsOf = (row) => [...row.cells].filter(isHeard);
+    const rows = [...table.rows].filter((row) => row.parentElement.tagName !== "THEAD").map(cellsOf);
+    const headings = cellsOf(table.tHead.rows[0]);
+    const hasSmall = headings.map((_, i) => rows.some((cells) => cells[i] && small(cells[i]) !== ""));
     const split = (cells, first, second) => cells.flatMap((cell, i) => (hasSmall[i] ? [first(cell), second(cell)] : [first(cell)]));
     const title = (cell) => [own(cell), small(cell)].filter((text) => text !== "").join(", ");
     const figure = (cell) => {
       const value = cell.dataset.value;
       return value === undefined || cell.tagName === "TH" || Number.isNaN(Number(value.replace("inf", "Infinity"))) ? own(cell) : value;
     };
-    const lines = [split(headings, title, (cell) => `${own(cell)}: small print`), ...rows.map((row) => split([...row.cells], figure, small))];
+    const lines = [split(headings, title, (cell) => `${own(cell)}: small print`), ...rows.map((cells) => split(cells, figure, small))];
     return lines.map((line) => line.map(quoted).join(",")).join("\n") + "\n";
   };
 

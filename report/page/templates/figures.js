@@ -109,7 +109,8 @@
   };
 
   // The interval of a curve as a surface, and the curve itself.
-  report.band = (label, curve, height, line = {}) => {
+  // Where `note` says something of the curve, circles along it say that there is something to say.
+  report.band = (label, curve, height, line = {}, note = "") => {
     const colour = report.colour(label);
     const seen = curve.x.map((_, i) => i).filter((i) => curve.low[i] !== null);
     const traces = [];
@@ -128,12 +129,12 @@
     traces.push({
       x: curve.x,
       y: curve.y.map(height),
-      name: report.text(label),
+      name: report.text(note === "" ? label : `${label} (${note})`),
       text: curve.y.map((point, i) => report.interval({ point, low: curve.low[i], high: curve.high[i] })),
       hovertemplate: "%{text}",
-      mode: curve.x.length > 1 ? "lines" : "markers",
+      mode: curve.x.length === 1 ? "markers" : note === "" ? "lines" : "lines+markers",
       line: { color: colour, width: 2.2, dash: report.mark(label).dash, ...line },
-      marker: { color: colour, size: 9 },
+      marker: { color: colour, size: 9, ...(note !== "" && { symbol: "circle-open", line: { width: 2 }, maxdisplayed: 10 }) },
     });
     return traces;
   };
@@ -190,8 +191,9 @@
     return { height, ticks };
   };
 
-  // Buttons that hide and show agents; returns whether one is shown.
-  report.legend = (root, redraw) => {
+  // Buttons that hide and show agents, with what `noteOf` says of each. Returns whether one is
+  // shown, and what fills the legend anew.
+  report.legend = (root, redraw, noteOf = () => "") => {
     const hidden = new Set();
     const fill = () => {
       root.replaceChildren(
@@ -203,7 +205,9 @@
           line.setAttribute("aria-hidden", "true");
           line.innerHTML = `<line x1="0" x2="100%" y1="50%" y2="50%" stroke="var(--agent)" stroke-width="3" stroke-dasharray="${dash}"/>`;
           line.dataset.colour = report.mark(label).colour;
-          button.append(line, label);
+          const note = noteOf(label);
+          if (note !== "") line.innerHTML += `<circle cx="50%" cy="50%" r="4" fill="var(--card)" stroke="var(--agent)" stroke-width="2"/>`;
+          button.append(line, label, ...(note === "" ? [] : [Object.assign(document.createElement("small"), { textContent: note })]));
           button.setAttribute("aria-pressed", String(!hidden.has(label)));
           button.addEventListener("click", () => {
             if (!hidden.delete(label)) hidden.add(label);
@@ -216,7 +220,7 @@
     };
     report.onChange(fill);
     fill();
-    return (label) => !hidden.has(label);
+    return { isShown: (label) => !hidden.has(label), fill };
   };
 
   // Dots with intervals, an agent on each line.
