@@ -20,7 +20,7 @@ from agents.common.schedules import ExponentialSchedule, library_schedule
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 
 # Classes of ours on agents of the library, whose zips are its own.
-ON_THE_LIBRARY = ("dqn", "double_dqn", "deep_qlearning", "ars")
+ON_THE_LIBRARY = ("dqn", "double_dqn", "deep_qlearning", "ppo", "a2c", "ars")
 HAND_WRITTEN = [
     name
     for name, entry in ALGORITHMS.items()
