@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
+from agents.compiled.row_text import whole_rows
 from mdp.array_types import Bools, Floats, Ints
 
 DECIMALS = 6
@@ -81,9 +82,12 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
 def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> None:
     """Append rows as csv.DictWriter would."""
     end = f"{seconds}\r\n"
-    # As one number, which is found sooner than a pair of them.
-    rows = (returns + 1j * lengths).tolist()
-    file.write(end.join(map(_beginnings.__getitem__, rows)) + end)
+    text = whole_rows(np.ascontiguousarray(returns), np.ascontiguousarray(lengths), end)
+    if text is None:
+        # As one number, which is found sooner than a pair of them.
+        rows = (returns + 1j * lengths).tolist()
+        text = end.join(map(_beginnings.__getitem__, rows)) + end
+    file.write(text)
     file.flush()
 
 

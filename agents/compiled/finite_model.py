@@ -23,8 +23,8 @@ OUTCOME = np.dtype(
     [
         ("cumulative", np.float64),  # probability of this outcome or one before it
         ("reward", np.float64),  # as Monitor sees it
-        ("agent_reward", np.float64),  # as the agent is given it, rounded to single precision
-        ("next_state", np.int64),
+        ("agent_reward", np.float32),  # as the agent is given it, rounded to single precision
+        ("next_state", np.int32),
         ("terminated", np.bool_),
         ("success", np.bool_),
     ],

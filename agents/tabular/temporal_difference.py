@@ -73,10 +73,11 @@ def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
     """An allowed action by the mean of the tables' values."""
     settings, tables = agent.settings, agent.tables
     room = room_at(tables, obs, agent.room)
-    for k in range(len(room.draws)):
-        if settings.strategy == GAUSSIAN_NOISE:
+    if settings.strategy == GAUSSIAN_NOISE:
+        for k in range(len(room.draws)):
             room.draws[k] = generator_of(agent.rng).standard_normal()
-        else:
+    else:
+        for k in range(len(room.draws)):
             room.draws[k] = next_uniform(agent.rng)
     rate = exploration_rate(agent, progress)
     chosen = random_action(settings.strategy, len(room.values), rate, room.draws)
