@@ -56,8 +56,9 @@ class JsonAlgorithm(BaseAlgorithm):
         for name, value in self.__dict__.items():
             if name not in left_out:
                 data[name] = self._encode_attribute(name, value)
+        content = _zipped(data, self.get_parameters())
         file = open_path(path, "w", verbose=0, suffix="zip")
-        file.write(_zipped(data, self.get_parameters()))
+        file.write(content)
         if isinstance(path, str | pathlib.Path):
             file.close()
 

@@ -197,8 +197,8 @@ def found_files(folder):
 
 
 def test_runs_in_one_process_leave_what_each_leaves_alone(tmp_path):
-    """The last seed's, which come after all others."""
-    together, alone = runs_of(tmp_path / "together"), runs_of(tmp_path / "alone")[6:]
+    """Of the last seed, whose runs come after all others, one of each agent."""
+    together, alone = runs_of(tmp_path / "together"), runs_of(tmp_path / "alone")[-5::2]
     assert all(is_plain(run.spec) for run in together)
     assert not execute(together, tmp_path / "together", "c", 1, lambda *_: None)
     with local_executor(1) as executor:
@@ -206,7 +206,8 @@ def test_runs_in_one_process_leave_what_each_leaves_alone(tmp_path):
             draft = draft_path(tmp_path / "alone", run)
             work = (do_run, run, draft, "c")
             executor.submit(supervise, *work, clean_up=nothing).result()
-    for mine, its in zip(together[6:], alone, strict=True):
+    assert {run.agent for run in alone} == {agent.label for agent in AGENTS}
+    for mine, its in zip(together[-5::2], alone, strict=True):
         ours, theirs = bits_of(mine.path), bits_of(its.path)
         assert ours.keys() == theirs.keys()
         for name, found in ours.items():
