@@ -9,6 +9,9 @@ this project's is held against `step` before it is believed, once a process: see
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from typing import Any
 
@@ -51,6 +54,11 @@ TRANSPARENT_WRAPPERS = frozenset(
     }
 )
 OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservation)
+
+Judgement = tuple[Claim | None, ModelCheck | None]
+
+# By the numbers of environments, which live as long: what was found out about them.
+_looked_at: ContextVar[dict[int, Judgement] | None] = ContextVar("looked_at", default=None)
 
 
 def transition_model(env: Env) -> TransitionModel | None:
@@ -192,7 +200,25 @@ def _believed(base: Env) -> Claim | None:
     return claim if check is not None and check.refusal is None else None
 
 
-def _judged(base: Env) -> tuple[Claim | None, ModelCheck | None]:
+@contextmanager
+def one_look(env: Env) -> Iterator[None]:
+    """Within the ``with`` statement, the model of ``env`` is worked out once, not at each question.
+
+    Nothing may change the environment there.
+    """
+    token = _looked_at.set({id(env.unwrapped): _judged(env.unwrapped)})
+    try:
+        yield
+    finally:
+        _looked_at.reset(token)
+
+
+def _judged(base: Env) -> Judgement:
+    known = _looked_at.get()
+    return _judged_now(base) if known is None or id(base) not in known else known[id(base)]
+
+
+def _judged_now(base: Env) -> Judgement:
     try:
         claim = claim_of(base)
     except ValueError as error:

@@ -22,7 +22,9 @@ RETURNED, RAISED, DIED = "returned", "raised", "died"
 def awaited(
     child: BaseProcess, receiver: Connection, last_words: Connection, limits: RunLimits
 ) -> tuple[str, Any]:
-    """Wait for the answer of a child and for its end, and end it where it exceeds a limit.
+    """Wait for the answer of a child, and end it where it exceeds a limit.
+
+    One that has returned a value may be given another task; any other has ended.
 
     Args:
         child: has been started with `experiments.task_in_child.answer_from_child`.
@@ -39,6 +41,8 @@ def awaited(
         kind, answer = (RAISED, None) if reason else receiver.recv()
     except (EOFError, OSError):
         kind, answer = DIED, None
+    if kind == RETURNED:
+        return kind, answer
     child.join()
     if reason:
         answer = (reason, f"{_read(last_words)}{reason}\n")

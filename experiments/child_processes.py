@@ -1,7 +1,8 @@
 """Tasks in processes of their own, so that one that dies takes nothing else with it.
 
-`supervise` runs a function in a fresh child process and waits for it; any executor whose workers
-can call it launches a study. Here that is a pool of threads, each with one child at a time. On
+`supervise` runs a function in a child process and waits for it; any executor whose workers
+can call it launches a study. Here that is a pool of threads, each with one child at a time. A child
+is a fresh one, or for tasks that may share a process, the one that the thread had before. On
 Linux the children are forked from a server that has imported the heavy libraries once. Windows
 cannot fork, and on macOS a process that has used its libraries should not: there each child begins
 anew, and imports for some seconds.
@@ -23,7 +24,7 @@ from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
 
-from experiments.awaited_child import RAISED, RETURNED, awaited, kill
+from experiments.awaited_child import DIED, RAISED, RETURNED, awaited, kill
 from experiments.run_limits import RunLimits
 from experiments.task_in_child import LEFT_TO_SUPERVISOR, answer_from_child
 from pipeline.stopping import current
@@ -44,6 +45,7 @@ NO_LIMITS = RunLimits()
 _log = logging.getLogger(__name__)
 _context: Any = multiprocessing.get_context(START_METHOD)
 _children: set[BaseProcess] = set()
+_idle: dict[int, _Child] = {}  # by thread
 _lock = threading.Lock()
 _stopping = threading.Event()
 
@@ -74,8 +76,13 @@ def supervise(
     clean_up: Callable[[], object],
     tries: int = 2,
     limits: RunLimits = NO_LIMITS,
+    shares_process: bool = False,
 ) -> Any:
     """Call ``function`` in a child process; again if the process dies without an answer.
+
+    A task that may share a process is done where others were done before, and leaves it to others;
+    not so where memory is limited, which is that of the process. After one that fails, and for
+    another try, there is a fresh process.
 
     Args:
         function: of a module that the child can import.
@@ -83,6 +90,7 @@ def supervise(
         clean_up: called here after each try, and in the child if this process dies before it.
         tries: how often to begin.
         limits: what each try may take.
+        shares_process: whether it may share one with other such tasks.
 
     Returns:
         What the function returns.
@@ -93,8 +101,9 @@ def supervise(
         StoppedError: if `stop_all` ended it.
     """
     task = bytes(ForkingPickler.dumps((function, args, clean_up)))
+    shares_process = shares_process and limits.memory is None
     for _ in range(tries):
-        kind, answer = _attempt(task, limits)
+        kind, answer = _attempt(task, limits, shares_process)
         clean_up()
         if _stopping.is_set():
             raise StoppedError
@@ -107,29 +116,76 @@ def supervise(
     raise TaskDiedError(f"its process died {tries} times ({how})", details)
 
 
-def _attempt(task: bytes, limits: RunLimits) -> tuple[str, Any]:
-    """What became of one child, see `awaited`."""
-    receiver, sender = _context.Pipe(duplex=False)
-    last_words, writer = _context.Pipe(duplex=False)
-    child = _context.Process(target=answer_from_child, args=(sender, writer, task), daemon=True)
-    with receiver, last_words, _started(child):
-        sender.close()
-        writer.close()
-        return awaited(child, receiver, last_words, limits)
+class _Child:
+    """A child process, and what goes to it and comes from it."""
 
+    def __init__(self) -> None:
+        self.answers, sender = _context.Pipe(duplex=False)
+        self.last_words, writer = _context.Pipe(duplex=False)
+        given, self.tasks = _context.Pipe(duplex=False)
+        theirs = (sender, writer, given)
+        self.process = _context.Process(target=answer_from_child, args=theirs, daemon=True)
+        try:
+            with _lock:
+                if _stopping.is_set():
+                    raise StoppedError
+                _start(self.process)
+                _children.add(self.process)
+        except BaseException:
+            self._close()
+            raise
+        finally:
+            for connection in theirs:
+                connection.close()
 
-@contextlib.contextmanager
-def _started(child: BaseProcess) -> Iterator[None]:
-    with _lock:
-        if _stopping.is_set():
-            raise StoppedError
-        _start(child)
-        _children.add(child)
-    try:
-        yield
-    finally:
+    def attempt(self, task: bytes, limits: RunLimits, is_last: bool) -> tuple[str, Any]:
+        """What becomes of a task, see `awaited`."""
+        with contextlib.suppress(OSError):  # it is gone, as `awaited` will find
+            self.tasks.send_bytes(task)
+        if is_last:
+            self.tasks.close()
+        return awaited(self.process, self.answers, self.last_words, limits)
+
+    def end(self) -> None:
+        """Wait until it is gone, which it is soon, since nothing is left to do."""
+        self.tasks.close()
+        self.process.join()
         with _lock:
-            _children.discard(child)
+            _children.discard(self.process)
+        self._close()
+
+    def _close(self) -> None:
+        for connection in (self.answers, self.last_words, self.tasks):
+            connection.close()
+
+
+def _attempt(task: bytes, limits: RunLimits, shares_process: bool) -> tuple[str, Any]:
+    """What became of the task in this thread's child, or in a fresh one; see `awaited`."""
+    thread = threading.get_ident()
+    child = _idle.pop(thread, None)
+    if child is not None and not (shares_process and child.process.is_alive()):
+        child.end()
+        child = None
+    if child is None:
+        child = _Child()
+    kind = DIED
+    try:
+        kind, answer = child.attempt(task, limits, is_last=not shares_process)
+    except BaseException:
+        kill(child.process)
+        raise
+    finally:
+        if shares_process and kind == RETURNED:
+            _idle[thread] = child
+        else:
+            child.end()
+    return kind, answer
+
+
+def _end_idle() -> None:
+    """End the children that wait for more."""
+    while _idle:
+        _idle.popitem()[1].end()
 
 
 def _start(child: BaseProcess) -> None:
@@ -163,8 +219,10 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
         with current().held():  # a second Ctrl-C finds it as short as it can be
             stop_all()
             executor.shutdown(cancel_futures=True)
+            _end_idle()
         raise
     executor.shutdown(cancel_futures=True)
+    _end_idle()
 
 
 def start_server(warm_ups: str = "[]") -> None:

@@ -24,6 +24,7 @@ from experiments.run_limits import RunLimits
 from experiments.study_spec import file_name
 from pipeline.errors import one_line
 from pipeline.files import write_text
+from pipeline.plain_runs import is_plain
 
 
 @dataclass(frozen=True)
@@ -62,7 +63,7 @@ def execute(
     listener: Listener,
     limits: RunLimits = NO_LIMITS,
 ) -> list[RunFailure]:
-    """Do the runs, each in a process of its own.
+    """Do the runs, each in a process of its own, but for plain ones, of which many share one.
 
     Args:
         runs: those to do.
@@ -119,7 +120,15 @@ def _supervised_run(
     log, name = failure_log(root, planned), run_name(planned)
     clean_up = partial(leave_drafts, root, name)
     try:
-        supervise(do_planned_run, planned, root, command, clean_up=clean_up, limits=limits)
+        supervise(
+            do_planned_run,
+            planned,
+            root,
+            command,
+            clean_up=clean_up,
+            limits=limits,
+            shares_process=is_plain(planned.spec) and not planned.is_batch,
+        )
     except StoppedError:
         return None
     except TaskFailedError as error:

@@ -1,4 +1,4 @@
-"""What a child process of `child_processes` does: a task, and the answer to its supervisor."""
+"""What a child process of `child_processes` does: tasks, and an answer to each."""
 
 from __future__ import annotations
 
@@ -22,26 +22,49 @@ LEFT_TO_SUPERVISOR = tuple(
 )
 
 
-def answer_from_child(sender: Connection, last_words: Connection, task: bytes) -> None:
-    """Do the task and send what came of it.
+def answer_from_child(sender: Connection, last_words: Connection, tasks: Connection) -> None:
+    """Do tasks until there are none any more, or one fails, and send what came of each.
 
     Args:
         sender: takes ``("returned", value)`` or ``("raised", (message, traceback))``.
         last_words: takes the traceback where the process crashes, or is about to be ended.
-        task: function, arguments, and what to call if the supervisor dies first, pickled.
+        tasks: where they come from: function, arguments, and what to call if the supervisor dies
+            first, pickled.
     """
     leave_signals_to_supervisor()
     _say_last_words(last_words)
+    clean_up = _CleanUp()
+    threading.Thread(target=_end_with_parent, args=(clean_up,), daemon=True).start()
+    kind = "returned"
+    while kind == "returned":
+        try:
+            task = tasks.recv_bytes()
+        except (EOFError, OSError):
+            break
+        kind, answer = _done(task, clean_up)
+        with contextlib.suppress(BrokenPipeError):
+            sender.send((kind, answer))
+    sender.close()
+
+
+class _CleanUp:
+    """What to call if the supervisor dies: that of the task under way."""
+
+    def __init__(self) -> None:
+        self.of_task: Callable[[], object] | None = None
+
+    def __call__(self) -> None:
+        if self.of_task is not None:
+            self.of_task()
+
+
+def _done(task: bytes, clean_up: _CleanUp) -> tuple[str, Any]:
     # Only now is the task unpacked: in a process that begins anew, its imports take seconds.
     try:
-        function, args, clean_up = ForkingPickler.loads(task)
-        threading.Thread(target=_end_with_parent, args=(clean_up,), daemon=True).start()
-        answer: tuple[str, Any] = ("returned", function(*args))
+        function, args, clean_up.of_task = ForkingPickler.loads(task)
+        return "returned", function(*args)
     except BaseException as error:  # noqa: BLE001  # whatever it is, the supervisor is told
-        answer = ("raised", (_words(error), traceback.format_exc()))
-    with contextlib.suppress(BrokenPipeError):
-        sender.send(answer)
-    sender.close()
+        return "raised", (_words(error), traceback.format_exc())
 
 
 def leave_signals_to_supervisor() -> None:

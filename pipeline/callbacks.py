@@ -60,13 +60,8 @@ class StepCheckpoint(Checkpoint):
             raise ValueError(f"every_n_steps must be at least 1, not {every_n_steps}")
         self.every_n_steps = every_n_steps
 
-    def horizon(self) -> Horizon:
-        steps = self.every_n_steps - self.num_timesteps % self.every_n_steps
-        return Horizon(calls=-(-steps // self.training_env.num_envs))
-
     def _on_step(self) -> bool:
-        if self.num_timesteps % self.every_n_steps < self.training_env.num_envs:
-            self.save()
+        self.save()
         return True
 
 

@@ -22,12 +22,8 @@ from pipeline.environments import (
     make_training_env,
     trains_on_variant,
 )
-from pipeline.evaluation.exact import (
-    ExactEvaluator,
-    exact_evaluator,
-    model_refusal,
-    why_not_exact,
-)
+from pipeline.evaluation.exact import ExactEvaluator, model_refusal, why_not_exact
+from pipeline.evaluation.kept_evaluators import evaluator_of
 from pipeline.evaluation.sampled import takes_batches
 from pipeline.evaluation.value_maps import map_refusal
 from pipeline.evaluation_callback import EvaluationCallback
@@ -140,11 +136,12 @@ def set_up(
         model.set_logger(Logger(folder=None, output_formats=[]))
     elif keeping.state is not None:
         model.set_logger(resumed_logger(model, keeping.state.note))
-    n_eval_envs = min(spec.n_eval_envs, spec.eval_episodes) if takes_batches(model) else 1
-    eval_env = make_evaluation_env(spec, n_eval_envs)
+    exact = _exact_evaluator(spec, model, console)
+    # One is enough where none is played on.
+    n_eval_envs = spec.n_eval_envs if exact is None and takes_batches(model) else 1
+    eval_env = make_evaluation_env(spec, min(n_eval_envs, spec.eval_episodes))
     undo.callback(close_environments, eval_env)
     is_bandit = are_bandits(env)
-    exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
     saver = StateSaver(
@@ -181,7 +178,7 @@ def _exact_evaluator(
     spec: TrainSpec, model: BaseAlgorithm, console: Console
 ) -> ExactEvaluator | None:
     """What computes evaluations where the environment's model is known and the agent lets it."""
-    exact = exact_evaluator(spec)
+    exact = evaluator_of(spec)
     reason = (
         "" if exact is None else exact.obstacle(model) or why_not_exact(model, exact.observations)
     )

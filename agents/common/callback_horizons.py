@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
@@ -40,11 +41,47 @@ class Horizon:
 
 
 class BlockCallback(BaseCallback):
-    """A callback that says when it will act, so that it need not be called before that."""
+    """A callback that says when it will act, so that it need not be called before that.
+
+    The short way is ``every_n_steps``: `_on_step` is called then, and at no other step, by every
+    algorithm and every engine. Whoever wants other moments says them in `horizon` and looks in
+    `_on_step` whether this is one: it is called wherever any callback acts.
+
+    Attributes:
+        every_n_steps: environment steps between two calls of `_on_step`, counted over all
+            environments since ``num_timesteps`` was 0; where several environments step at once, it
+            is called after the step that reaches a multiple or passes it. ``n_calls`` goes on
+            counting all steps. None for what `horizon` says.
+
+    Raises:
+        ValueError: at the start of the training, if ``every_n_steps`` is no number from 1 on.
+    """
+
+    every_n_steps: int | None = None
+
+    def init_callback(self, model: BaseAlgorithm) -> None:
+        """Take note of the model."""
+        every: object = self.every_n_steps
+        if every is not None and not (isinstance(every, int) and every >= 1):
+            name = type(self).__name__
+            raise ValueError(f"{name}.every_n_steps must be a number from 1 on, not {every!r}")
+        super().init_callback(model)
+
+    def on_step(self) -> bool:
+        """Count the step, and act where that is due."""
+        if self.every_n_steps is None:
+            return super().on_step()
+        self.n_calls += 1
+        self.num_timesteps = self.model.num_timesteps
+        is_due = self.num_timesteps % self.every_n_steps < self.training_env.num_envs
+        return self._on_step() if is_due else True
 
     def horizon(self) -> Horizon:
-        """When it may act next; by default never by itself."""
-        return Horizon()
+        """When it may act next; without ``every_n_steps`` never by itself."""
+        if self.every_n_steps is None:
+            return Horizon()
+        steps = self.every_n_steps - self.num_timesteps % self.every_n_steps
+        return Horizon(calls=-(-steps // self.training_env.num_envs))
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
         """Count ``n_calls`` calls that were left out, in which ``n_episodes`` ended."""

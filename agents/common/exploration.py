@@ -51,19 +51,20 @@ def greedy_action(values: Floats, uniform: float) -> int:
         values: action values, shape (A,).
         uniform: a number in [0, 1).
     """
+    # Without branches: which value is higher is hard to foresee, for a processor as well.
+    highest = values[0]
     best_action = 0
     n_best = 1
     for action in range(1, len(values)):
-        if values[action] > values[best_action]:
-            best_action = action
-            n_best = 1
-        elif values[action] == values[best_action]:
-            n_best += 1
+        value = values[action]
+        n_best = 1 if value > highest else n_best + (value == highest)
+        best_action = action if value > highest else best_action
+        highest = value if value > highest else highest
     if n_best == 1:
         return best_action
     skip = int(uniform * n_best)
     for action in range(best_action, len(values)):
-        if values[action] == values[best_action]:
+        if values[action] == highest:
             if skip == 0:
                 return action
             skip -= 1
@@ -71,11 +72,25 @@ def greedy_action(values: Floats, uniform: float) -> int:
 
 
 @inlined
+def random_action(strategy: int, n_actions: int, rate: float, draws: Floats) -> int:
+    """The action that is chosen whatever the values are; -1 where they decide.
+
+    Args:
+        strategy: one of `STRATEGIES`.
+        n_actions: number of actions.
+        rate: how much to explore.
+        draws: as in `choose_action`.
+    """
+    if strategy == EPSILON_GREEDY and draws[0] < rate:
+        return int(draws[1] * n_actions)
+    return -1
+
+
+@inlined
 def epsilon_greedy_action(values: Floats, epsilon: float, tie_scale: float, draws: Floats) -> int:
     """A uniformly random action with probability ``epsilon``, else a greedy one."""
-    if draws[0] < epsilon:
-        return int(draws[1] * len(values))
-    return greedy_action(values, draws[1] * tie_scale)
+    action = random_action(EPSILON_GREEDY, len(values), epsilon, draws)
+    return action if action >= 0 else greedy_action(values, draws[1] * tie_scale)
 
 
 @inlined

@@ -18,6 +18,7 @@ import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import DISABLED, Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
@@ -222,7 +223,14 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
             self.dump_logs()
 
     def dump_logs(self) -> None:
-        """Write the log: episode statistics, speed, and what the agent records."""
+        """Write the log: episode statistics, speed, and what the agent records.
+
+        Where nothing reads it, nothing is worked out; what others have recorded is forgotten then,
+        as it is when it has been written.
+        """
+        if not is_read(self.logger):
+            self.logger.dump(self.num_timesteps)
+            return
         self._record_training()
         OffPolicyAlgorithm.dump_logs(cast(OffPolicyAlgorithm, self))
 
@@ -238,6 +246,17 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
         self.action_space.seed(seed)
         if self.env is not None:
             self.env.seed(seed)
+
+
+def is_read(logger: Logger) -> bool:
+    """Whether anything comes of what a logger writes; one that was changed by hand may do anything.
+
+    ``learn`` makes one without outputs where nothing else was asked for. One that is disabled keeps
+    what is recorded.
+    """
+    by_hand = any(hasattr(Logger, name) for name in vars(logger))
+    changed = type(logger) is not Logger or by_hand
+    return changed or bool(logger.output_formats) or logger.level == DISABLED
 
 
 def true_outcome(new_obs: Any, dones: Bools, infos: list[dict[str, Any]]) -> tuple[Any, Bools]:

@@ -44,6 +44,8 @@ def schedule_value(schedule: ScheduleRow, progress_remaining: float) -> float:
     if elapsed > schedule.end_fraction:
         return schedule.end
     if schedule.kind == LINEAR:
+        if schedule.start == schedule.end:  # a division at every step, for nothing
+            return schedule.start
         change = elapsed * (schedule.end - schedule.start)
         return schedule.start + change / schedule.end_fraction
     rate = math.log(schedule.end / schedule.start)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.compiled.generators import generator_of
+from agents.compiled.generators import next_uniform
 from agents.compiled.training_records import env_dtype
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined
@@ -98,10 +98,9 @@ class CartPole(NamedTuple):
     @inlined
     def reset(self, env: Any, handle: Any) -> None:
         """Draw a state as ``Generator.uniform(-0.05, 0.05, 4)`` does."""
-        rng = generator_of(handle)
         width = 0.05 - -0.05
-        env.x = -0.05 + width * rng.random()
-        env.x_dot = -0.05 + width * rng.random()
-        env.theta = -0.05 + width * rng.random()
-        env.theta_dot = -0.05 + width * rng.random()
+        env.x = -0.05 + width * next_uniform(handle)
+        env.x_dot = -0.05 + width * next_uniform(handle)
+        env.theta = -0.05 + width * next_uniform(handle)
+        env.theta_dot = -0.05 + width * next_uniform(handle)
         env.new_obs = bin_index(self, env)

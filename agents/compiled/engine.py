@@ -9,22 +9,25 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.common.callback_horizons import (
+    NEVER,
     EpisodeBudget,
     horizon,
     members,
     pass_over,
     wants_position,
 )
-from agents.compiled.compile_envs import World
+from agents.common.online import is_read
 from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
 from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.generators import handles_of
 from agents.compiled.interrupts import interrupts_held
+from agents.compiled.kept_worlds import World
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
 from agents.compiled.training_records import EPISODE, PROGRESS
 
-MAX_BLOCK_STEPS = 65_536
+# Some hundredths of a second: what a signal waits for.
+MAX_BLOCK_STEPS = 262_144
 
 
 class CompiledEngine:
@@ -106,11 +109,6 @@ class CompiledEngine:
         self.progress[0]["episodes"] = agent._episode_num
         ahead = horizon(self.callback)
         steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
-        episodes_to_log = (
-            ahead.episodes
-            if self.log_interval is None
-            else self.log_interval - agent._episode_num % self.log_interval
-        )
         n_steps = run_block(
             self.world,
             self._learner(),
@@ -119,7 +117,7 @@ class CompiledEngine:
             self.progress[0],
             self.log,
             min(ahead.calls, steps_left, self.block_steps),
-            min(ahead.episodes, episodes_to_log),
+            min(ahead.episodes, self._episodes_to_log()),
             COMPENSATED_SUM,
         )
         episodes = Episodes.of(self.log.episodes[: self.progress[0]["logged_episodes"]])
@@ -129,6 +127,12 @@ class CompiledEngine:
         self._take_over_counts(1, len(episodes.envs) - last_step)
         self.callback.on_rollout_end()
         return keep_going
+
+    def _episodes_to_log(self) -> int:
+        """Episodes until something is written that somebody reads."""
+        if self.log_interval is None or not is_read(self.agent.logger):
+            return NEVER
+        return self.log_interval - int(self.agent._episode_num) % self.log_interval
 
     def _tell(self, episodes: Episodes, n_steps: int) -> bool:
         """Monitor, statistics and callbacks; False once a callback asks to stop."""

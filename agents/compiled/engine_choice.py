@@ -7,8 +7,9 @@ from typing import Any, Literal
 from stable_baselines3.common.callbacks import BaseCallback
 
 from agents.common.callback_horizons import unknown_callbacks
-from agents.compiled.compile_envs import NotCompilable, World, compile_envs, draws_alike
+from agents.compiled.compile_envs import NotCompilable, compile_envs, draws_alike
 from agents.compiled.engine import CompiledEngine
+from agents.compiled.kept_worlds import World
 from agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]

@@ -15,10 +15,11 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.compiled.cart_pole import CART_POLE_ENV, STATE, CartPole
-from agents.compiled.compile_envs import World, layers, monitor_of
+from agents.compiled.compile_envs import layers, monitor_of
 from agents.compiled.env_steps import add_to_return
 from agents.compiled.episodes import Episodes
 from agents.compiled.finite_model import FINITE_ENV
+from agents.compiled.kept_worlds import World
 from mdp.array_types import Floats
 
 # Python's sum of floats makes up for rounding from this version on.
@@ -96,14 +97,19 @@ class EnvStates:
             base.pulls_done = int(record["elapsed"])
 
     def keep_rewards(self, episodes: Episodes, rewards: Floats) -> None:
-        """Keep the rewards of episodes under way after a block, whose rewards are (steps, n)."""
+        """Keep the rewards of episodes under way after a block.
+
+        Args:
+            episodes: those that have ended in it.
+            rewards: as in `agents.compiled.loop.EpisodeLog`, as many as steps were done.
+        """
         for i in range(len(self.records)):
             ends = episodes.steps[episodes.envs == i]
             if len(ends):
                 self._unfinished[i] = []
-            first = int(ends[-1]) + 1 if len(ends) else 0
-            if first < len(rewards):
-                self._unfinished[i].append(rewards[first:, i].copy())
+            n_new = len(rewards) - (int(ends[-1]) + 1 if len(ends) else 0)
+            if n_new > 0:
+                self._unfinished[i].append(rewards[:n_new, i].copy())
 
 
 def _elapsed_steps(env: gym.Env[Any, Any]) -> int:

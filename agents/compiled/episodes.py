@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
+from agents.compiled.row_text import whole_rows
 from mdp.array_types import Bools, Floats, Ints
 
 DECIMALS = 6
 # Of Monitor, besides its own attributes: to look at a million numbers later would take long.
 _N_WHOLE = "n_whole_returns"
+MOST_BEGINNINGS = 10_000
 
 
 @dataclass(frozen=True)
@@ -94,15 +96,29 @@ def _note_whole(monitor: Monitor, returns: Floats) -> None:
 def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> None:
     """Append rows as csv.DictWriter would."""
     end = f"{seconds}\r\n"
-    rows = zip(returns.tolist(), lengths.tolist(), strict=True)
-    file.write("".join([_beginning_of_row(total, length) + end for total, length in rows]))
+    text = whole_rows(np.ascontiguousarray(returns), np.ascontiguousarray(lengths), end)
+    if text is None:
+        # As one number, which is found sooner than a pair of them.
+        rows = (returns + 1j * lengths).tolist()
+        text = end.join(map(_beginnings.__getitem__, rows)) + end
+    file.write(text)
     file.flush()
 
 
-# Equal episodes are common where rewards are whole numbers.
-@lru_cache(maxsize=10_000)
-def _beginning_of_row(episode_return: float, length: int) -> str:
-    return f"{_rounded(episode_return)},{length},"
+class _Beginnings(dict[complex, str]):
+    """How the row of an episode begins; equal episodes are common where rewards are whole.
+
+    By the return of an episode, and its length as the imaginary part.
+    """
+
+    def __missing__(self, key: complex) -> str:
+        if len(self) >= MOST_BEGINNINGS:
+            self.clear()
+        self[key] = beginning = f"{_rounded(key.real)},{int(key.imag)},"
+        return beginning
+
+
+_beginnings = _Beginnings()
 
 
 @lru_cache(maxsize=10_000)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.compiled.generators import generator_of
+from agents.compiled.generators import next_uniform, skip_uniform
 from agents.compiled.training_records import env_dtype
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined
@@ -23,8 +23,8 @@ OUTCOME = np.dtype(
     [
         ("cumulative", np.float64),  # probability of this outcome or one before it
         ("reward", np.float64),  # as Monitor sees it
-        ("agent_reward", np.float64),  # as the agent is given it, rounded to single precision
-        ("next_state", np.int64),
+        ("agent_reward", np.float32),  # as the agent is given it, rounded to single precision
+        ("next_state", np.int32),
         ("terminated", np.bool_),
         ("success", np.bool_),
     ],
@@ -70,8 +70,12 @@ class FiniteModel(NamedTuple):
     @inlined
     def step(self, env: Any, handle: Any) -> None:
         """Do ``env.action`` in ``env.state``."""
-        uniform = generator_of(handle).random()
-        outcome = pick_outcome(self.outcomes, env.state, env.action, uniform)
+        outcome = 0
+        if self.outcomes.shape[2] > 1:
+            uniform = next_uniform(handle)
+            outcome = pick_outcome(self.outcomes, env.state, env.action, uniform)
+        else:
+            skip_uniform(handle)
         result = self.outcomes[env.state, env.action, outcome]
         env.state = result.next_state
         env.reward = result.agent_reward
@@ -83,5 +87,5 @@ class FiniteModel(NamedTuple):
     @inlined
     def reset(self, env: Any, handle: Any) -> None:
         """Draw a state to begin in."""
-        env.state = pick_start(self.starts, self.start_cumulative, generator_of(handle).random())
+        env.state = pick_start(self.starts, self.start_cumulative, next_uniform(handle))
         env.new_obs = self.observation[env.state]

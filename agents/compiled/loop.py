@@ -48,7 +48,8 @@ class EpisodeLog(NamedTuple):
 
     Attributes:
         episodes: records of type `EPISODE`, filled with those that end, shape (capacity,).
-        rewards: filled with what Monitor sees, shape (steps, n_envs).
+        rewards: filled with what Monitor sees of the episode under way, from its first step in the
+            block on, shape (steps, n_envs).
     """
 
     episodes: NDArray[Any]
@@ -56,8 +57,8 @@ class EpisodeLog(NamedTuple):
 
     @inlined
     def note_step(self, env: Any, i: int, step: int) -> None:
-        """Write down the reward."""
-        self.rewards[step, i] = env.monitor_reward
+        """Write down the reward, over those of the episode before."""
+        self.rewards[min(step, env.elapsed - 1), i] = env.monitor_reward
 
 
 @inlined

@@ -21,7 +21,7 @@ from agents.common.signatures import CommonArguments, TieBreaking
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
 from agents.tabular.q_table_policy import QTablePolicy
-from agents.tabular.temporal_difference import MaskedTables, Tables
+from agents.tabular.value_tables import MaskedTables, Tables
 from envs.action_masks import INFO_KEY
 from mdp.array_types import Bools
 

@@ -31,12 +31,12 @@ from agents.compiled.training_records import UNDECIDED
 from agents.tabular.mask_keeping import MaskedArguments, MaskKeeper
 from agents.tabular.q_table_policy import QTablePolicy
 from agents.tabular.temporal_difference import (
-    Room,
     TabularAgent,
     act_on_values,
     no_commitment,
     td_learning,
 )
+from agents.tabular.value_tables import Room
 from agents.tabular.workspace import Workspace
 from mdp.array_types import Floats, Ints
 

@@ -12,99 +12,15 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from agents.common.exploration import GAUSSIAN_NOISE, choose_action
+from agents.common.exploration import GAUSSIAN_NOISE, choose_action, random_action
 from agents.common.step_sizes import step_size
 from agents.compiled.dispatch import CompiledOnlyError, by_type
-from agents.compiled.generators import generator_of
+from agents.compiled.generators import generator_of, next_uniform
 from agents.compiled.loop import act, learn_from_step
 from agents.compiled.training_records import UNDECIDED
+from agents.tabular.value_tables import MaskedTables, Room, action_at, room_at, with_mean_values
 from mdp.array_types import Bools, Floats, Ints
 from mdp.machine_code import inlined, kernel
-
-
-class Room(NamedTuple):
-    """Where numbers are worked out; what it holds between two calls means nothing.
-
-    Attributes:
-        values: a number for each action that is allowed, shape (n,).
-        actions: which actions these are, in order, shape (n,).
-        draws: the random numbers of one choice, shape (draws_per_choice,).
-    """
-
-    values: Floats
-    actions: Ints
-    draws: Floats
-
-
-@by_type
-def room_at(tables: Any, obs: int, room: Room) -> Room:
-    """The room for the actions that are allowed at ``obs``."""
-    raise CompiledOnlyError
-
-
-@by_type
-def action_at(tables: Any, room: Room, k: int) -> int:
-    """The action whose number is ``room.values[k]``."""
-    raise CompiledOnlyError
-
-
-class Tables(NamedTuple):
-    """What an agent knows, in the memory of its policy, where all actions are allowed.
-
-    `MaskedTables` of no rows mean the same, and cost the compiled loop a sixth of its speed.
-
-    Attributes:
-        values: action values, shape (T, S, A).
-        visit_counts: updates of each entry so far, shape (T, S, A).
-    """
-
-    values: Floats
-    visit_counts: Ints
-
-    @inlined
-    def room_at(self, obs: int, room: Room) -> Room:
-        """All of it."""
-        return room
-
-    @inlined
-    def action_at(self, room: Room, k: int) -> int:
-        """The k-th of all."""
-        return k
-
-
-class MaskedTables(NamedTuple):
-    """What an agent knows, and what the environment allows.
-
-    Attributes:
-        values: as in `Tables`.
-        visit_counts: as in `Tables`.
-        allowed: what may be done at each observation, bool of shape (S, A); everything where a row
-            is False, which means that nothing is known, or where there are no rows.
-    """
-
-    values: Floats
-    visit_counts: Ints
-    allowed: Bools
-
-    @inlined
-    def room_at(self, obs: int, room: Room) -> Room:
-        """As much as there are allowed actions, which are listed in it."""
-        actions, n_allowed = room.actions, 0
-        if len(self.allowed) > 0:
-            for action in range(len(actions)):
-                if self.allowed[obs, action]:
-                    actions[n_allowed] = action
-                    n_allowed += 1
-        if n_allowed == 0:
-            n_allowed = len(actions)
-            for action in range(n_allowed):
-                actions[action] = action
-        return Room(room.values[:n_allowed], actions[:n_allowed], room.draws)
-
-    @inlined
-    def action_at(self, room: Room, k: int) -> int:
-        """The k-th that is allowed."""
-        return int(room.actions[k])
 
 
 class TabularAgent(NamedTuple):
@@ -157,19 +73,17 @@ def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
     """An allowed action by the mean of the tables' values."""
     settings, tables = agent.settings, agent.tables
     room = room_at(tables, obs, agent.room)
-    rng = generator_of(agent.rng)
-    for k in range(len(room.draws)):
-        if settings.strategy == GAUSSIAN_NOISE:
-            room.draws[k] = rng.standard_normal()
-        else:
-            room.draws[k] = rng.random()
-    for k in range(len(room.values)):
-        action = action_at(tables, room, k)
-        room.values[k] = tables.values[0, obs, action]
-        if tables.values.shape[0] > 1:
-            room.values[k] = 0.5 * (room.values[k] + tables.values[1, obs, action])
+    if settings.strategy == GAUSSIAN_NOISE:
+        for k in range(len(room.draws)):
+            room.draws[k] = generator_of(agent.rng).standard_normal()
+    else:
+        for k in range(len(room.draws)):
+            room.draws[k] = next_uniform(agent.rng)
     rate = exploration_rate(agent, progress)
-    chosen = choose_action(settings.strategy, room.values, rate, settings.tie_scale, room.draws)
+    chosen = random_action(settings.strategy, len(room.values), rate, room.draws)
+    if chosen < 0:
+        values = with_mean_values(tables, obs, room).values
+        chosen = choose_action(settings.strategy, values, rate, settings.tie_scale, room.draws)
     return action_at(tables, room, chosen)
 
 
@@ -211,7 +125,7 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
         commit(agent, envs[i], progress)
     if agent.tables.values.shape[0] > 1:
         for i in range(len(envs)):
-            envs[i].uniform = generator_of(agent.rng).random()
+            envs[i].uniform = next_uniform(agent.rng)
     total_error = 0.0
     for i in range(len(envs)):
         env = envs[i]
@@ -220,7 +134,7 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
         env.obs = env.new_obs
         if env.done:
             env.next_action = UNDECIDED
-    progress.mean_td_error = total_error / len(envs)
+    progress.mean_td_error = total_error if len(envs) == 1 else total_error / len(envs)
 
 
 # Python hands over arrays one by one, which costs it less than to take tuples of them apart.

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -14,8 +16,13 @@ from pipeline.errors import UserError
 
 def takes_masks(model: Any) -> bool:
     """Whether `predict` takes ``action_masks``, and the agent goes by them."""
-    known = "action_masks" in inspect.signature(model.predict).parameters
-    return known and bool(getattr(model, "mask_actions", True))
+    predict = getattr(model.predict, "__func__", model.predict)
+    return _knows_masks(predict) and bool(getattr(model, "mask_actions", True))
+
+
+@lru_cache(maxsize=64)
+def _knows_masks(predict: Callable[..., Any]) -> bool:
+    return "action_masks" in inspect.signature(predict).parameters
 
 
 def player(model: BaseAlgorithm, env: VecEnv) -> Any:

@@ -123,7 +123,8 @@ def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
 
     limits = RunLimits(seconds=9)
 
-    def supervise(work, run, root, command, *, clean_up, limits):
+    def supervise(work, run, root, command, *, clean_up, limits, shares_process):
+        assert shares_process
         assert (work, root, command, limits) == (do_planned_run, tmp_path, "c", RunLimits(9))
         if run is bad:
             raise TaskFailedError("thin ice", "Traceback: thin ice\n")
