@@ -11,7 +11,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import get_cython_function_address, intrinsic
 from numpy.typing import NDArray
@@ -20,6 +19,8 @@ from threadpoolctl import ThreadpoolController
 from mdp.machine_code import internal
 
 Singles = NDArray[np.float32]
+
+ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
 
 AS_IT_IS = ord("N")
 TRANSPOSED = ord("T")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.common.schedules import schedule_value
-from agents.compiled.generators import generator_of
+from agents.compiled.generators import next_uniform
 from agents.compiled.training_records import SCHEDULE
 from agents.networks.categorical import draw, log_probability
 from agents.networks.matrix_products import Singles
@@ -144,7 +144,7 @@ def choose_randomly(learner: Any, _: float, __: float) -> int:
     evaluate(learner, 0.0, 0.0)
     forward(learner.policy, learner.flat, learner.single, 1, learner.policy_outputs)
     logits = last_outputs(learner.policy, learner.policy_outputs, 1)[0]
-    action = draw(logits, generator_of(learner.rng[0]).random())
+    action = draw(logits, next_uniform(learner.rng[0]))
     learner.place[0].log_probability = log_probability(logits, action)
     return action
 
@@ -171,7 +171,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     place.policy_gradient = place.value = place.entropy = place.clipped = 0.0
     n_batches, goes_on = 0, True
     for _ in range(rules.n_epochs):
-        shuffle(learner.order, generator_of(learner.rng[0]))
+        shuffle(learner.order, learner.rng[0])
         n_in_epoch, goes_on = learn_for_an_epoch(learner, learning_rate, clip_range, clip_range_vf)
         n_batches += n_in_epoch
         place.n_updates += 1
@@ -202,12 +202,12 @@ def estimate_advantages(learner: Any) -> None:
 
 
 @inlined
-def shuffle(numbers: Ints, generator: Any) -> None:
+def shuffle(numbers: Ints, handle: Any) -> None:
     """Put 0, 1, ... into a random order (Fisher and Yates)."""
     for i in range(len(numbers)):
         numbers[i] = i
     for i in range(len(numbers) - 1, 0, -1):
-        j = int(generator.random() * (i + 1))
+        j = int(next_uniform(handle) * (i + 1))
         numbers[i], numbers[j] = numbers[j], numbers[i]
 
 

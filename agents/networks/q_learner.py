@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.compiled.generators import generator_of
+from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
 from agents.networks.observations import AFTER, BEFORE, copy_row, move_on, observe
 from agents.networks.optimizers import Optimizer
@@ -106,7 +106,7 @@ def choose_greedily(learner: Any, _: float, __: float) -> int:
 @kernel
 def train(learner: Any, n_updates: float, learning_rate: float) -> int:
     """Learn from ``n_updates`` minibatches, whose number is returned."""
-    place, generator = learner.place[0], generator_of(learner.rng[0])
+    place = learner.place[0]
     place.losses, place.n_losses, place.learning_rate = 0.0, int(n_updates), learning_rate
     for _ in range(int(n_updates)):
         draw_minibatch(
@@ -115,7 +115,7 @@ def train(learner: Any, n_updates: float, learning_rate: float) -> int:
             place,
             learner.rules[0],
             learner.layers.one_hot,
-            generator,
+            learner.rng[0],
         )
         place.losses += learn_from_minibatch(learner, learning_rate)
     place.n_updates += int(n_updates)
@@ -170,13 +170,13 @@ def explores(learner: Any, num_timesteps: int) -> bool:
     """Whether the next actions are random; tosses a coin once the warm-up is over."""
     if num_timesteps < learner.rules[0].learning_starts:
         return True
-    return bool(generator_of(learner.rng[0]).random() < learner.place[0].exploration_rate)
+    return bool(next_uniform(learner.rng[0]) < learner.place[0].exploration_rate)
 
 
 @inlined
 def random_action(learner: Any) -> int:
     """Any of the actions, each as likely as the others."""
-    return int(generator_of(learner.rng[0]).random() * learner.layers.sizes[-1])
+    return int(next_uniform(learner.rng[0]) * learner.layers.sizes[-1])
 
 
 @kernel

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
+from numba import typeof as _typeof
 from numba.core import cgutils, types
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import (
@@ -29,7 +29,10 @@ from numba.extending import (
 
 from mdp.machine_code import internal
 
+ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
+
 # Numba ships no types.
+typeof: Any = _typeof
 _typed_unbox: Any = unbox
 _typed_getattr: Any = lower_getattr_generic
 
@@ -46,6 +49,7 @@ class Reference:
     Attributes:
         held: the same; its arrays live as long as the reference.
         address: where compiled functions find it.
+        kind: Numba's type of the reference.
 
     Raises:
         TypeError: if a part is anything else.
@@ -55,6 +59,8 @@ class Reference:
         self.held = held
         self._words = np.array(list(_words(held)), dtype=np.int64)
         self.address = int(self._words.ctypes.data)
+        # To find it takes Numba longer than most functions that a reference is handed to.
+        self.kind = ReferenceType(typeof(held))
 
 
 def _words(value: Any) -> Iterator[int]:
@@ -101,7 +107,7 @@ class ReferenceType(types.Type):
 
 @typeof_impl.register(Reference)
 def _type_of(value: Reference, context: Any) -> ReferenceType:
-    return ReferenceType(typeof_impl(value.held, context))
+    return value.kind
 
 
 register_model(ReferenceType)(models.OpaqueModel)
@@ -143,7 +149,7 @@ def address_of(function: Any, reference: Reference) -> np.uintp:
         function: of a reference and two floating-point numbers, with a whole number as its result.
         reference: what it is to be called with.
     """
-    arguments = _type_of(reference, None), types.float64, types.float64
+    arguments = reference.kind, types.float64, types.float64
     code = function.get_compile_result(types.int64(*arguments))
     name = code.fndesc.llvm_cfunc_wrapper_name
     return np.uintp(code.library.get_pointer_to_function(name))

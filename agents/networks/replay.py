@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
 from agents.networks.perceptron import Inputs
 from mdp.array_types import Ints
@@ -76,14 +77,14 @@ def draw_minibatch(
         place: says where the next transition will lie, and whether the ring is full.
         rules: with the discount factor and the number of steps.
         one_hot: whether observations are numbers of states.
-        rng: a generator of compiled code.
+        rng: a handle of the generator.
     """
     n_places, n_envs = replay.rewards.shape
     filled = n_places if place.full else place.position
     newest = (place.position - 1) % n_places
     for i in range(len(batch.actions)):
-        begin = int(rng.random() * filled)
-        env = int(rng.random() * n_envs)
+        begin = int(next_uniform(rng) * filled)
+        env = int(next_uniform(rng) * n_envs)
         at, discount, total = begin, np.float32(rules.gamma), replay.rewards[begin, env]
         for _ in range(rules.n_steps - 1):
             if replay.dones[at, env] or replay.timeouts[at, env] or at == newest:
