@@ -22,12 +22,8 @@ from pipeline.environments import (
     make_training_env,
     trains_on_variant,
 )
-from pipeline.evaluation.exact import (
-    ExactEvaluator,
-    exact_evaluator,
-    model_refusal,
-    why_not_exact,
-)
+from pipeline.evaluation.asked_policies import why_not_exact
+from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator, model_refusal
 from pipeline.evaluation.sampled import takes_batches
 from pipeline.evaluation.value_maps import map_refusal
 from pipeline.evaluation_callback import EvaluationCallback
@@ -140,11 +136,10 @@ def set_up(
         model.set_logger(Logger(folder=None, output_formats=[]))
     elif keeping.state is not None:
         model.set_logger(resumed_logger(model, keeping.state.note))
-    n_eval_envs = min(spec.n_eval_envs, spec.eval_episodes) if takes_batches(model) else 1
-    eval_env = make_evaluation_env(spec, n_eval_envs)
+    exact = _exact_evaluator(spec, model, console)
+    eval_env = make_evaluation_env(spec, _n_eval_envs(spec, model, is_exact=exact is not None))
     undo.callback(close_environments, eval_env)
     is_bandit = are_bandits(env)
-    exact = _exact_evaluator(spec, model, console)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
     saver = StateSaver(
@@ -171,6 +166,13 @@ def set_up(
         refusal,
         None if trained is None else trained.digest,
     )
+
+
+def _n_eval_envs(spec: TrainSpec, model: BaseAlgorithm, *, is_exact: bool) -> int:
+    """How many environments to evaluate on; exact evaluation plays on none."""
+    if is_exact or not takes_batches(model):
+        return 1
+    return min(spec.n_eval_envs, spec.eval_episodes)
 
 
 def _say(console: Console, line: str) -> None:
