@@ -23,6 +23,7 @@ from pipeline.environments import (
     trains_on_variant,
 )
 from pipeline.evaluation.asked_policies import why_not_exact
+from pipeline.evaluation.evaluation_budget import n_environments
 from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator, model_refusal
 from pipeline.evaluation.sampled import takes_batches
 from pipeline.evaluation.value_maps import map_refusal
@@ -172,7 +173,7 @@ def _n_eval_envs(spec: TrainSpec, model: BaseAlgorithm, *, is_exact: bool) -> in
     """How many environments to evaluate on; exact evaluation plays on none."""
     if is_exact or not takes_batches(model):
         return 1
-    return min(spec.n_eval_envs, spec.eval_episodes)
+    return n_environments(spec.n_eval_envs, spec.eval_episodes)
 
 
 def _say(console: Console, line: str) -> None:

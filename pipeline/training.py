@@ -63,6 +63,9 @@ class Outcome:
             evaluation was turned off.
         best_return: mean return of the best evaluation during training, if there was one.
         best_timesteps: when that was.
+        best_episodes: how many episodes that is the mean of; 0 where it is exact.
+        evaluating: what all evaluations have taken, the last one included.
+        evaluation_steps: environment steps of those that were sampled.
         engine: for tabular agents, whether training was compiled, and if not, why.
         pulls: on bandits, figures on the pulls of training; else None.
     """
@@ -75,6 +78,9 @@ class Outcome:
     best_return: float | None
     best_timesteps: int
     engine: str | None
+    best_episodes: int
+    evaluating: WorkTime
+    evaluation_steps: int
     pulls: PullSummary | None = None
 
 
@@ -263,6 +269,9 @@ def _finish(training: Training, state: str, taken: WorkTime, activity: Activity)
         best_timesteps=evaluation.best_timesteps,
         engine=getattr(model, "engine_in_use", None),
         pulls=pulls,
+        best_episodes=evaluation.best_episodes,
+        evaluating=evaluation.taken,
+        evaluation_steps=getattr(evaluation.evaluator, "n_steps", 0),
     )
     _record(outcome)
     if state == FINISHED and not training.keeping.stays:
@@ -279,6 +288,8 @@ def _record(outcome: Outcome) -> None:
         final=None if outcome.final is None else outcome.final.summary(),
         best_mean_return=outcome.best_return,
         best_timesteps=outcome.best_timesteps,
+        best_episodes=outcome.best_episodes,
+        evaluation_steps=outcome.evaluation_steps,
         engine=outcome.engine,
         **outcome.taken.as_data(),
         **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),

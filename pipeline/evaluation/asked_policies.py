@@ -16,6 +16,7 @@ from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from mdp.array_types import Bools, Floats, Ints
+from pipeline.evaluation.evaluation_budget import is_network
 from pipeline.evaluation.mask_telling import takes_masks
 from pipeline.evaluation.policy_kinds import has_memory
 from pipeline.evaluation.sampled import KNOWN_LIBRARIES
@@ -49,7 +50,7 @@ def obstacle(
     n_states = len(observations)
     if reason := _cannot_be_asked(agent, masks):
         return reason
-    if _is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
+    if is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
         return f"to ask a network about {n_states:,} states takes longer than to play"
     if isinstance(agent, PlanningAgent):
         is_too_large = not agent.policy.is_stationary and n_states * horizon > MOST_PLANNED
@@ -150,18 +151,13 @@ def _in_parts(
 ) -> NDArray[Any]:
     """What ``asked`` returns for all observations, which may be too many for a network at once."""
     n_states = len(observations)
-    n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if _is_network(agent) else n_states
+    n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
     found = [
         asked(observations[i : i + n_rows], **{k: v[i : i + n_rows] for k, v in told.items()})
         for i in range(0, n_states, n_rows)
     ]
     return found[0] if len(found) == 1 else np.concatenate(found)
-
-
-def _is_network(agent: BaseAlgorithm) -> bool:
-    policy = getattr(agent, "policy", None)
-    return isinstance(policy, th.nn.Module) and next(policy.parameters(), None) is not None
 
 
 def _n_inputs(agent: BaseAlgorithm) -> int:
