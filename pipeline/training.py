@@ -120,8 +120,7 @@ def prepare(
             folder is left behind then.
         Stopped: if a signal asks for it, likewise.
     """
-    if spec.num_threads > 0:
-        th.set_num_threads(spec.num_threads)
+    _set_arithmetic(spec)
     stop = current()
     with stop.waiting(0.0):
         kwargs = algorithm_kwargs(spec)
@@ -143,6 +142,15 @@ def prepare(
             stop.raise_if_asked()
         undo.pop_all()
     return training
+
+
+def _set_arithmetic(spec: TrainSpec) -> None:
+    """What holds for the whole process, and so is set anew for each run in it."""
+    if spec.num_threads > 0:
+        th.set_num_threads(spec.num_threads)
+    flushes = spec.hyperparams.flush_denormal
+    if not th.set_flush_denormal(flushes) and flushes:
+        raise UserError("flush_denormal: this processor has no such setting; leave it out")
 
 
 def _record_beginning(training: Training, args: dict[str, Any], command: str) -> None:

@@ -24,7 +24,7 @@ from pipeline.evaluation.sampled import KNOWN_LIBRARIES
 # Numbers that a network is handed at once, and at all: beyond, asking for every state takes longer
 # than playing.
 MOST_AT_ONCE = 1 << 26
-MOST_NUMBERS = 1_000_000_000
+MOST_NUMBERS = 400_000_000
 # A plan that changes with the step holds an action for each step and state.
 MOST_PLANNED = 1 << 27
 # States times steps that probability may spread over, where actions are random.
