@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
+import torch as th
 from gymnasium import spaces
 from rich.console import Console
 from rich.markup import escape
@@ -22,6 +23,7 @@ from pipeline.environments import (
     make_training_env,
     trains_on_variant,
 )
+from pipeline.errors import UserError
 from pipeline.evaluation.asked_policies import why_not_exact
 from pipeline.evaluation.evaluation_budget import n_environments
 from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator, model_refusal
@@ -118,6 +120,19 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     defaults = {name: parameter.default for name, parameter in parameters.items()}
     check_agent(spec.hyperparams, {**defaults, **built}, observations, spec.algo)
     return built
+
+
+def set_arithmetic(spec: TrainSpec) -> None:
+    """What holds for the whole process, and so is set anew for each run in it.
+
+    Raises:
+        UserError: if the processor does not know a setting.
+    """
+    if spec.num_threads > 0:
+        th.set_num_threads(spec.num_threads)
+    flushes = spec.hyperparams.flush_denormal
+    if not th.set_flush_denormal(flushes) and flushes:
+        raise UserError("flush_denormal: this processor has no such setting; leave it out")
 
 
 def set_up(

@@ -10,7 +10,6 @@ from signal import Signals
 from typing import Any
 from uuid import uuid4
 
-import torch as th
 from rich.console import Console
 
 from mdp.machine_code import compile_timer
@@ -23,7 +22,7 @@ from pipeline.finishing import draw, judge, save
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.leftovers import remove_leftovers
 from pipeline.library_errors import blame_settings, blame_weights
-from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
+from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
 from pipeline.pull_recording import PullSummary
 from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
 from pipeline.resuming.state_folder import remove_states
@@ -120,7 +119,7 @@ def prepare(
             folder is left behind then.
         Stopped: if a signal asks for it, likewise.
     """
-    _set_arithmetic(spec)
+    set_arithmetic(spec)
     stop = current()
     with stop.waiting(0.0):
         kwargs = algorithm_kwargs(spec)
@@ -142,15 +141,6 @@ def prepare(
             stop.raise_if_asked()
         undo.pop_all()
     return training
-
-
-def _set_arithmetic(spec: TrainSpec) -> None:
-    """What holds for the whole process, and so is set anew for each run in it."""
-    if spec.num_threads > 0:
-        th.set_num_threads(spec.num_threads)
-    flushes = spec.hyperparams.flush_denormal
-    if not th.set_flush_denormal(flushes) and flushes:
-        raise UserError("flush_denormal: this processor has no such setting; leave it out")
 
 
 def _record_beginning(training: Training, args: dict[str, Any], command: str) -> None:
