@@ -60,6 +60,11 @@ class ActionTablePolicy(TablePolicy):
         self.actions = th.from_numpy(actions.astype(np.int64))
         self.horizon = th.tensor(horizon)
 
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the actions are the same however many steps are left."""
+        return len(self.actions) == 1
+
     def actions_after(self, obs: Ints, steps: Ints) -> Ints:
         """What to do in ``obs`` after ``steps`` steps of the episode, all of shape (n,)."""
         steps_left = np.clip(int(self.horizon) - steps, 1, len(self.actions))

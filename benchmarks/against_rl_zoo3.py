@@ -1,13 +1,17 @@
 """PPO on CartPole as a whole process: `train.py` beside `python -m rl_zoo3.train`.
 
-    python benchmarks/against_rl_zoo3.py                # five rounds, two to five minutes
+    python benchmarks/against_rl_zoo3.py                # three rounds, eight minutes
     python benchmarks/against_rl_zoo3.py --repeats 1
 
-Both take rl_zoo3's own hyperparameters for CartPole-v1, 20,000 steps and the same interval between
-evaluations; all else is as each has it by default, the number of torch threads above all. Once
-alone, and once two at a time, as one trains several seeds; then the time is that until both are
-done. Wall-clock time and the processors' time, medians over the rounds. rl_zoo3 has an environment
-of its own, which is made first where it is not there.
+Both take rl_zoo3's own hyperparameters for CartPole-v1 and 20,000 steps, in four comparisons:
+
+- default against default: no flag that is not needed;
+- equal evaluation: five episodes every 5,000 steps in both, and ours at the end too;
+- the same with one thread of PyTorch in both, instead of each one's default;
+- default against default, two at a time, as one trains several seeds; the time until both are done.
+
+Wall-clock time and the processors' time, medians over the rounds. rl_zoo3 has an environment of its
+own, which is made first where it is not there.
 """
 
 from __future__ import annotations
@@ -27,37 +31,43 @@ from rich.table import Table
 from tests.peers.peer_environment import peer_folder, peer_python
 
 ROOT = Path(__file__).resolve().parent.parent
-SETTINGS = ("--algo", "ppo", "--env", "CartPole-v1", "-n", "20000", "--eval-freq", "25000")
+SETTINGS = ("--algo", "ppo", "--env", "CartPole-v1", "-n", "20000")
+EQUAL = ("--eval-freq", "5000", "--eval-episodes", "5", "--n-eval-envs", "1")
+ONE_THREAD = ("--num-threads", "1")
+# What is compared: further settings of both, and how many trainings run at once.
+COMPARISONS: dict[str, tuple[tuple[str, ...], int]] = {
+    "defaults": ((), 1),
+    "equal evaluation": (EQUAL, 1),
+    "equal evaluation, one thread": ((*EQUAL, *ONE_THREAD), 1),
+    "defaults, two at once": ((), 2),
+}
 CONTENDERS = ("train.py", "rl_zoo3")
 # Set by whoever runs this; each contender is to choose for itself.
 THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
-def command(contender: str, seed: int, folder: str) -> list[str]:
+def command(contender: str, further: tuple[str, ...], seed: int, folder: str) -> list[str]:
     """One training, with its files in ``folder``."""
     hyperparams = peer_folder("rl_zoo3") / "hyperparams" / "ppo.yml"
     ours, theirs = [sys.executable, "train.py"], [peer_python(), "-m", "rl_zoo3.train"]
-    settings = [*SETTINGS, "--conf-file", str(hyperparams), "--seed", str(seed), "-f", folder]
-    return [*(ours if contender == "train.py" else theirs), *settings]
+    where = ["--conf-file", str(hyperparams), "--seed", str(seed), "-f", folder]
+    return [*(ours if contender == "train.py" else theirs), *SETTINGS, *further, *where]
 
 
-def times(contender: str, at_once: int, folder: str) -> tuple[float, float]:
-    """Seconds of the clock and of the processors that some trainings at once take together."""
+def times(contender: str, comparison: str, folder: str) -> tuple[float, float]:
+    """Seconds of the clock and of the processors that a comparison's trainings take together."""
+    further, at_once = COMPARISONS[comparison]
     environ = {name: value for name, value in os.environ.items() if name not in THREADS}
+    commands = [command(contender, further, seed, folder) for seed in range(at_once)]
     used_before, started = _seconds_of_children(), time.perf_counter()
+    null = subprocess.DEVNULL
     processes = [
-        subprocess.Popen(
-            command(contender, seed, folder),
-            cwd=ROOT,
-            env=environ,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for seed in range(at_once)
+        subprocess.Popen(words, cwd=ROOT, env=environ, stdout=null, stderr=null)
+        for words in commands
     ]
     exit_codes = [process.wait() for process in processes]
     if any(exit_codes):
-        raise SystemExit(f"{contender} failed: {' '.join(command(contender, 0, folder))}")
+        raise SystemExit(f"{contender} failed: {' '.join(commands[0])}")
     return time.perf_counter() - started, _seconds_of_children() - used_before
 
 
@@ -71,14 +81,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
-    parser.add_argument("--repeats", type=int, default=5, metavar="N", help="rounds (default 5)")
+    parser.add_argument("--repeats", type=int, default=3, metavar="N", help="rounds (default 3)")
     repeats = parser.parse_args().repeats
     peer_python()  # so that making its environment counts for nobody
-    table = Table("trainings at once", "program", "wall, s", "processors, s", "rl_zoo3 takes")
+    table = Table("comparison", "program", "wall, s", "processors, s", "rl_zoo3 takes")
     with tempfile.TemporaryDirectory() as folder:
-        for at_once in (1, 2):
+        for comparison in COMPARISONS:
             rounds = [
-                {contender: times(contender, at_once, folder) for contender in CONTENDERS}
+                {contender: times(contender, comparison, folder) for contender in CONTENDERS}
                 for _ in range(repeats)
             ]
             wall, processors = (
@@ -86,9 +96,10 @@ def main() -> None:
                 for k in (0, 1)
             )
             for name in CONTENDERS:
-                ratio = f"{wall['rl_zoo3'] / wall[name]:.1f} x" if name != "rl_zoo3" else ""
+                ratios = [figures["rl_zoo3"] / figures[name] for figures in (wall, processors)]
+                ratio = "" if name == "rl_zoo3" else f"{ratios[0]:.2f} x, {ratios[1]:.2f} x"
                 table.add_row(
-                    str(at_once), name, f"{wall[name]:.1f}", f"{processors[name]:.1f}", ratio
+                    comparison, name, f"{wall[name]:.1f}", f"{processors[name]:.1f}", ratio
                 )
     Console(width=110).print(table)
 

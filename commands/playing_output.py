@@ -15,7 +15,8 @@ from rich.console import Console
 
 from commands.run_output import describe, episodes, print_refusal
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator, model_refusal, why_not_exact
+from pipeline.evaluation.asked_policies import why_not_exact
+from pipeline.evaluation.exact import exact_evaluator, model_refusal
 from pipeline.filming import write_film
 from pipeline.models.model_choice import ChosenModel
 from pipeline.models.model_loading import load_to_play
@@ -165,7 +166,7 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
         if evaluator is None:
             print_refusal(console, model_refusal(spec))
             return
-        obstacle = evaluator.obstacle(model)
+        obstacle = evaluator.obstacle(model, deterministic)
         if obstacle:
             console.print(f"[dim]sampled, not exact: {spec.algo}: {obstacle}[/]")
             return

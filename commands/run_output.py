@@ -106,8 +106,11 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     if outcome.final is not None:
         rows.append(("final", describe(outcome.final)))
     if outcome.best_return is not None:
-        best = f"return {outcome.best_return:.2f}, first at step {outcome.best_timesteps:,}"
+        over = f" over {episodes(outcome.best_episodes)}" if outcome.best_episodes else ""
+        best = f"return {outcome.best_return:.2f}{over}, first at step {outcome.best_timesteps:,}"
         rows.append(("best", best))
+    if outcome.final is not None:
+        rows.append(("judged", _describe_evaluations(outcome)))
     rows.append(("files", str(outcome.run.path)))
     table = Table.grid(padding=(0, 2))
     for row in rows:
@@ -117,6 +120,15 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     width = max(len(label) for label, _ in rows) + 2
     command = f"{'watch':<{width}}{watch_command(spec, outcome.run)}"
     console.print(command, highlight=False, markup=False, soft_wrap=True)
+
+
+def _describe_evaluations(outcome: Outcome) -> str:
+    """What all evaluations have taken."""
+    taken = f"in {outcome.evaluating.cpu_seconds:.1f} s of processor time"
+    if not outcome.evaluation_steps:
+        return f"exactly, {taken}"
+    share = outcome.evaluation_steps / max(outcome.n_steps, 1)
+    return f"by {outcome.evaluation_steps:,} steps ({share:.0%} of training's) {taken}"
 
 
 @contextmanager

@@ -133,9 +133,9 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add(
         "--eval-episodes",
         type=COUNT,
-        default=20,
         metavar="N",
-        help="episodes of each (default: 20)",
+        help="episodes of each, the final one too (default: as few as will do, up to 20, at the "
+        "end up to 100)",
     )
     add("--n-eval-envs", type=COUNT, default=10, metavar="N", help="environments for it (10)")
     add("--save-freq", type=INTERVAL, default=-1, metavar="N", help="steps between checkpoints")

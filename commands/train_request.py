@@ -50,6 +50,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
         "gym_packages": tuple(module.name for module in modules),
         "user_modules": modules,
         "unique_id": args.uuid,
+        "final_episodes": args.eval_episodes,
     }
     spec = TrainSpec(**{**named, **changed})
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from functools import lru_cache
 
 import numpy as np
 
@@ -34,6 +35,11 @@ def random_warehouse(size: int, shelf_density: float = 0.3, seed: int = 0) -> li
     check_whole_number("size", size, 2, MAX_SIZE)
     check_whole_number("map_seed", seed, 0, 2**63 - 1)
     check_number("shelf_density", shelf_density, 0, 1)
+    return list(_rows(int(size), float(shelf_density), int(seed)))
+
+
+@lru_cache(maxsize=4)  # a run makes its environment several times, and a large map takes a second
+def _rows(size: int, shelf_density: float, seed: int) -> tuple[str, ...]:
     free = np.random.default_rng(seed).random((size, size)) >= shelf_density
     free[-1, 0] = free[0, -1] = True
     width = size + 2
@@ -43,7 +49,7 @@ def random_warehouse(size: int, shelf_density: float = 0.3, seed: int = 0) -> li
         padded.flat[cell] = True
     letters = np.where(padded[1:-1, 1:-1], b".", b"#")
     letters[-1, 0], letters[0, -1] = b"S", b"G"
-    return [row.tobytes().decode("ascii") for row in letters]
+    return tuple(row.tobytes().decode("ascii") for row in letters)
 
 
 def _easiest_way(free: Bools, start: int, goal: int) -> list[int]:

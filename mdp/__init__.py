@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING
 from mdp.transition_model import TransitionModel
 
 if TYPE_CHECKING:
+    from mdp.far_limit import optimum_far_from_limit
     from mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
     from mdp.optimal_policies import Plan, policy_iteration, value_iteration
     from mdp.policy_evaluation import (
-        PolicyReturn,
         baseline_policies,
         baseline_return,
         policy_return,
         state_visitation,
     )
+    from mdp.policy_returns import PolicyReturn
     from mdp.valuation import optimal_choices, state_values
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "baseline_return",
     "finite_horizon_optimum",
     "optimal_choices",
+    "optimum_far_from_limit",
     "policy_iteration",
     "policy_return",
     "state_values",
@@ -45,12 +47,13 @@ _HOMES = {
     "Plan": "mdp.optimal_policies",
     "policy_iteration": "mdp.optimal_policies",
     "value_iteration": "mdp.optimal_policies",
-    "PolicyReturn": "mdp.policy_evaluation",
+    "PolicyReturn": "mdp.policy_returns",
     "baseline_return": "mdp.policy_evaluation",
     "baseline_policies": "mdp.policy_evaluation",
     "policy_return": "mdp.policy_evaluation",
     "state_visitation": "mdp.policy_evaluation",
     "optimal_choices": "mdp.valuation",
+    "optimum_far_from_limit": "mdp.far_limit",
     "state_values": "mdp.valuation",
 }
 

@@ -6,40 +6,14 @@ policy visits are used.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from mdp.array_types import Bools, Floats, Ints
+from mdp.array_types import Bools, Floats
 from mdp.chain import PolicyChain
-from mdp.graph import reachable_states
-from mdp.moments import moments_under_limit, visits_under_limit
-from mdp.policies import Policy, actions_used, canonical_policy, chances_in, policy_matrix
+from mdp.limited_episodes import LimitedEpisodes
+from mdp.policies import Policy, canonical_policy, policy_matrix
+from mdp.policy_returns import PolicyReturn, over_starts
 from mdp.transition_model import TransitionModel
-
-
-@dataclass(frozen=True)
-class PolicyReturn:
-    """Mean and variance of one episode, from the distribution of starting states.
-
-    Attributes:
-        expected_return: the mean of the (discounted) sum of rewards.
-        return_variance: its variance.
-        expected_length: the mean number of steps; infinite where episodes may never end.
-        length_variance: its variance; NaN where the mean is infinite.
-        success_rate: the probability that the episode succeeds; None where success was not defined.
-    """
-
-    expected_return: float
-    return_variance: float
-    expected_length: float
-    length_variance: float
-    success_rate: float | None
-
-    @property
-    def success_variance(self) -> float | None:
-        """The variance of one episode's success, counted as 0 or 1."""
-        return None if self.success_rate is None else self.success_rate * (1 - self.success_rate)
 
 
 def policy_return(
@@ -66,18 +40,12 @@ def policy_return(
     _check(model, horizon, discount, success)
     policy = canonical_policy(model, policy, horizon)
     ends_well = model.terminated if success is None else model.terminated & success
-    if horizon is None:
-        chain = PolicyChain.build(model, policy_matrix(model, policy))
-        moments = _moments_without_limit(chain, discount, ends_well)
-        start = model.initial[chain.states]
-    else:
-        states, prob, next_state, terminated = _visited(model, policy)
-        reward, good = model.reward[states], ends_well[states]
-        chances = chances_in(model, policy, states)
-        rows = (prob, next_state, terminated, reward, good, chances)
-        moments = moments_under_limit(*rows, horizon, float(discount))
-        start = model.initial[states]
-    return _over_starts(start, moments, with_success=success is not None)
+    if horizon is not None:
+        episodes = LimitedEpisodes(model, policy, horizon)
+        return episodes.result(float(discount), ends_well, with_success=success is not None)
+    chain = PolicyChain.build(model, policy_matrix(model, policy))
+    moments = _moments_without_limit(chain, discount, ends_well)
+    return over_starts(model.initial[chain.states], moments, with_success=success is not None)
 
 
 def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None) -> Floats:
@@ -93,15 +61,12 @@ def state_visitation(model: TransitionModel, policy: Policy, horizon: int | None
     """
     _check(model, horizon, 1.0, None)
     policy = canonical_policy(model, policy, horizon)
+    if horizon is not None:
+        return LimitedEpisodes(model, policy, horizon).visits()
     visits = np.zeros(model.n_states)
-    if horizon is None:
-        chain = PolicyChain.build(model, policy_matrix(model, policy))
-        _refuse_endless(chain)
-        visits[chain.states] = chain.solve(model.initial[chain.states], 1.0, transposed=True)
-    else:
-        states, prob, next_state, terminated = _visited(model, policy)
-        chances, start = chances_in(model, policy, states), model.initial[states]
-        visits[states] = visits_under_limit(prob, next_state, terminated, chances, start, horizon)
+    chain = PolicyChain.build(model, policy_matrix(model, policy))
+    _refuse_endless(chain)
+    visits[chain.states] = chain.solve(model.initial[chain.states], 1.0, transposed=True)
     return visits
 
 
@@ -123,10 +88,16 @@ def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0)
     still beats them by far. (Not the best that ignores the observation: a fixed list of actions
     does too, and may be optimal where nothing is random.)
     """
-    return max(
-        policy_return(model, policy, horizon, discount).expected_return
-        for policy in baseline_policies(model)
-    )
+    _check(model, horizon, discount, None)
+    best = -np.inf
+    uniform, *constant = baseline_policies(model)
+    # Random actions visit most, and it soon shows that they are worse, where others are known.
+    for policy in (*constant, uniform):
+        episodes = LimitedEpisodes(model, canonical_policy(model, policy, horizon), horizon)
+        floor = best if discount == 1 else -np.inf
+        found = episodes.result(discount, model.terminated, with_success=False, floor=floor)
+        best = max(best, found.expected_return)
+    return best
 
 
 def _check(
@@ -138,18 +109,6 @@ def _check(
         raise ValueError(f"discount is {discount}, it must lie between 0 and 1")
     if success is not None and success.shape != model.prob.shape:
         raise ValueError(f"success has shape {success.shape}, the model has {model.prob.shape}")
-
-
-def _visited(model: TransitionModel, policy: Policy) -> tuple[Ints, Floats, Ints, Bools]:
-    """The states that a policy visits, and the rows of the model for them alone.
-
-    Returns:
-        The states, shape (n,); prob, next_state (counting in those n), terminated: (n, A, K).
-    """
-    visited = reachable_states(model, actions_used(model, policy))
-    states = np.flatnonzero(visited)
-    place = np.cumsum(visited) - 1
-    return states, model.prob[states], place[model.next_state[states]], model.terminated[states]
 
 
 def _moments_without_limit(chain: PolicyChain, discount: float, ends_well: Bools) -> Floats:
@@ -178,19 +137,3 @@ def _refuse_endless(chain: PolicyChain) -> None:
             f"from state {state} the policy never ends the episode: give a time limit (horizon) "
             "or a discount below 1"
         )
-
-
-def _over_starts(initial: Floats, moments: Floats, *, with_success: bool) -> PolicyReturn:
-    """Average over the starting states; their differences add to the variances."""
-    start = initial > 0
-    chance, moments = initial[start], moments[start]
-    mean = chance @ moments
-    return PolicyReturn(
-        expected_return=float(mean[0]),
-        return_variance=float(mean[1] + chance @ (moments[:, 0] - mean[0]) ** 2),
-        expected_length=float(mean[2]),
-        length_variance=float(mean[3] + chance @ (moments[:, 2] - mean[2]) ** 2)
-        if np.isfinite(mean[2])
-        else float("nan"),
-        success_rate=float(mean[4]) if with_success else None,
-    )

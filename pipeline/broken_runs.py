@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 
 from pipeline.errors import UserError, one_line
 from pipeline.exhaustion import exhaustion
@@ -47,6 +47,8 @@ def give_up(training: Training, error: BaseException) -> None:
             return
         message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
         raise UserError(message) from error
+    with suppress(OSError):  # what the run has failed by says more
+        training.evaluation.write()
     if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
         run.update_info(state=INTERRUPTED)
         return

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
+import math
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from agents.common.callback_horizons import Horizon, calls_until_multiple
+from mdp.work_time import WorkTime
+from pipeline.evaluation.evaluation_budget import SampledEvaluator
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
@@ -20,6 +25,8 @@ from pipeline.models.companions import statistics_path
 from pipeline.models.model_saving import save_model, save_normalization
 from pipeline.run_folder import Run
 from pipeline.stopping import current
+
+SECONDS_BETWEEN_WRITES = 1.0
 
 
 class EvaluationCallback(EvalCallback):
@@ -38,6 +45,11 @@ class EvaluationCallback(EvalCallback):
         callback_after_eval: told after every evaluation.
         value_maps: keeps the agent's policy at every evaluation, where that can be drawn.
         during: shows what goes on while an evaluation runs.
+
+    Attributes:
+        taken: the time that evaluations have taken.
+        n_episodes: episodes of each evaluation, 0 of those that are exact.
+        best_episodes: of the best one.
     """
 
     def __init__(
@@ -62,6 +74,11 @@ class EvaluationCallback(EvalCallback):
         self.episodes_seen = 0
         self.last_evaluation: Evaluation | None = None
         self.best_timesteps = 0
+        self.best_episodes = 0
+        self.taken = WorkTime()
+        self.n_episodes: list[int] = []
+        self._is_written = True
+        self._written_at = -np.inf
 
     def horizon(self) -> Horizon:
         """When the next evaluation is due."""
@@ -91,7 +108,23 @@ class EvaluationCallback(EvalCallback):
             is_due |= (
                 self.episodes_seen // self.eval_episode_freq > before // self.eval_episode_freq
             )
-        return self.evaluate_now() if is_due else True
+        return self.evaluate_now() if is_due and self._can_afford() else True
+
+    def _can_afford(self) -> bool:
+        sampled = self.evaluator if isinstance(self.evaluator, SampledEvaluator) else None
+        return sampled is None or sampled.can_afford(self.model, self.episodes_seen)
+
+    def _on_training_end(self) -> None:
+        self.write()
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Count what is done within among the time that evaluation takes."""
+        begun = WorkTime.now()
+        try:
+            yield
+        finally:
+            self.taken += WorkTime.now() - begun
 
     def evaluate_now(self) -> bool:
         """Evaluate the agent as it is; False where a callback asks to stop the training.
@@ -101,17 +134,18 @@ class EvaluationCallback(EvalCallback):
         """
         check_model(self.model)
         self.take_statistics()
-        with self.during("evaluating"):
+        with self.during("evaluating"), self.timed():
             evaluation = self.evaluator(self.model)
         self.last_evaluation = evaluation
         self.last_mean_reward = evaluation.mean_return
-        self._append_to_file(evaluation)
+        self._append(evaluation)
         if self.value_maps is not None:
             self.value_maps.record(self.model, self.num_timesteps)
         self._log(evaluation)
         if evaluation.mean_return > self.best_mean_reward:
             self.best_mean_reward = evaluation.mean_return
             self.best_timesteps = self.num_timesteps
+            self.best_episodes = self.n_episodes[-1]
             best = self.run.best_model_path
             with current().held():
                 save_model(self.model, best)
@@ -123,23 +157,34 @@ class EvaluationCallback(EvalCallback):
         if self.model.get_vec_normalize_env() is not None:
             sync_envs_normalization(self.training_env, self.eval_env)
 
-    def _append_to_file(self, evaluation: Evaluation) -> None:
+    def _append(self, evaluation: Evaluation) -> None:
         self.evaluations_timesteps.append(self.num_timesteps)
-        # A single figure, as of an exact evaluation, stands twice: the plot commands of rl_zoo3
-        # take rows of one for runs that are too short.
-        times = 2 if len(evaluation.returns) == 1 else 1
-        self.evaluations_results.append(evaluation.returns.tolist() * times)
-        self.evaluations_length.append(evaluation.lengths.tolist() * times)
+        self.evaluations_results.append(evaluation.returns.tolist())
+        self.evaluations_length.append(evaluation.lengths.tolist())
+        if evaluation.successes is not None:
+            self.evaluations_successes.append(evaluation.successes.tolist())
+        self.n_episodes.append(0 if evaluation.is_exact else len(evaluation.returns))
+        self._is_written = False
+        # To replace a file takes longer than an exact evaluation.
+        if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
+            self.write()
+
+    def write(self) -> None:
+        """Write the evaluations, unless they are written already."""
+        if self._is_written:
+            return
         arrays: dict[str, Any] = {
             "timesteps": self.evaluations_timesteps,
-            "results": self.evaluations_results,
-            "ep_lengths": self.evaluations_length,
+            "results": _table(self.evaluations_results),
+            "ep_lengths": _table(self.evaluations_length),
         }
-        if evaluation.successes is not None:
-            self.evaluations_successes.append(evaluation.successes.tolist() * times)
-            arrays["successes"] = self.evaluations_successes
+        if self.evaluations_successes:
+            arrays["successes"] = _table(self.evaluations_successes)
+        if len(set(self.n_episodes)) > 1:
+            arrays["n_episodes"] = self.n_episodes
         with replacing(self.run.evaluations_path) as draft, draft.open("wb") as file:
             np.savez(file, **arrays)
+        self._is_written, self._written_at = True, time.monotonic()
 
     def _log(self, evaluation: Evaluation) -> None:
         self.logger.record("eval/mean_reward", evaluation.mean_return)
@@ -151,3 +196,13 @@ class EvaluationCallback(EvalCallback):
             self.logger.record("eval/score", evaluation.yardstick.score(evaluation.mean_return))
         self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
         self.logger.dump(self.num_timesteps)
+
+
+def _table(rows: list[list[Any]]) -> NDArray[Any]:
+    """Rows as one array; the shorter ones are repeated, which leaves mean and spread as they are.
+
+    A single figure, as of an exact evaluation, stands twice: the plot commands of rl_zoo3 take rows
+    of one for runs that are too short.
+    """
+    width = max(math.lcm(*map(len, rows)), 2)
+    return np.array([row * (width // len(row)) for row in rows])

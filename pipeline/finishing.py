@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pipeline.evaluation.exact import ExactEvaluator
-from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
+from pipeline.evaluation.evaluation_budget import SampledEvaluator
+from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation.value_maps import value_map
 from pipeline.models.companions import final_replay_buffer_path
 from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
@@ -14,8 +14,6 @@ from pipeline.preparation import Training
 from pipeline.pull_recording import PullSummary, summarise_pulls
 from pipeline.run_folder import FINISHED, INTERRUPTED
 from pipeline.stopping import current
-
-FINAL_EVALUATION_EPISODES = 100
 
 
 def save(training: Training, state: str) -> PullSummary | None:
@@ -44,6 +42,7 @@ def judge(training: Training, state: str) -> Evaluation | None:
         # The run was shorter than the time to its first evaluation, or called no callback.
         evaluation.init_callback(model)
         evaluation.evaluate_now()
+    evaluation.write()
     if evaluation.value_maps is not None:
         evaluation.value_maps.finish(model, model.num_timesteps)
     return _final_evaluation(training) if state == FINISHED else None
@@ -68,13 +67,9 @@ def draw(training: Training, final: Evaluation | None) -> None:
 
 
 def _final_evaluation(training: Training) -> Evaluation:
-    evaluator = training.evaluation.evaluator
-    training.evaluation.take_statistics()
-    if isinstance(evaluator, ExactEvaluator):
-        return evaluator(training.model)
-    return evaluate(
-        training.model,
-        training.eval_env,
-        FINAL_EVALUATION_EPISODES,
-        evaluation_seed(training.spec.seed, 2),
-    )
+    evaluation, model = training.evaluation, training.model
+    evaluation.take_statistics()
+    with evaluation.timed():
+        if isinstance(evaluation.evaluator, SampledEvaluator):
+            return evaluation.evaluator.at_the_end(model)
+        return evaluation.evaluator(model)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
 
+import torch as th
 from gymnasium import spaces
 from rich.console import Console
 from rich.markup import escape
@@ -22,7 +23,10 @@ from pipeline.environments import (
     make_training_env,
     trains_on_variant,
 )
-from pipeline.evaluation.exact import ExactEvaluator, model_refusal, why_not_exact
+from pipeline.errors import UserError
+from pipeline.evaluation.asked_policies import why_not_exact
+from pipeline.evaluation.evaluation_budget import n_environments
+from pipeline.evaluation.exact import ExactEvaluator, model_refusal
 from pipeline.evaluation.kept_evaluators import evaluator_of
 from pipeline.evaluation.sampled import takes_batches
 from pipeline.evaluation.value_maps import map_refusal
@@ -119,6 +123,19 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     return built
 
 
+def set_arithmetic(spec: TrainSpec) -> None:
+    """What holds for the whole process, and so is set anew for each run in it.
+
+    Raises:
+        UserError: if the processor does not know a setting.
+    """
+    if spec.num_threads > 0:
+        th.set_num_threads(spec.num_threads)
+    flushes = spec.hyperparams.flush_denormal
+    if not th.set_flush_denormal(flushes) and flushes:
+        raise UserError("flush_denormal: this processor has no such setting; leave it out")
+
+
 def set_up(
     spec: TrainSpec,
     run: Run,
@@ -137,9 +154,7 @@ def set_up(
     elif keeping.state is not None:
         model.set_logger(resumed_logger(model, keeping.state.note))
     exact = _exact_evaluator(spec, model, console)
-    # One is enough where none is played on.
-    n_eval_envs = spec.n_eval_envs if exact is None and takes_batches(model) else 1
-    eval_env = make_evaluation_env(spec, min(n_eval_envs, spec.eval_episodes))
+    eval_env = make_evaluation_env(spec, _n_eval_envs(spec, model, is_exact=exact is not None))
     undo.callback(close_environments, eval_env)
     is_bandit = are_bandits(env)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
@@ -168,6 +183,13 @@ def set_up(
         refusal,
         None if trained is None else trained.digest,
     )
+
+
+def _n_eval_envs(spec: TrainSpec, model: BaseAlgorithm, *, is_exact: bool) -> int:
+    """How many environments to evaluate on; exact evaluation plays on none."""
+    if is_exact or not takes_batches(model):
+        return 1
+    return n_environments(spec.n_eval_envs, spec.eval_episodes)
 
 
 def _say(console: Console, line: str) -> None:

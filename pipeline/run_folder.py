@@ -52,6 +52,8 @@ OUTCOME = (
     "final",
     "best_mean_return",
     "best_timesteps",
+    "best_episodes",
+    "evaluation_steps",
     "engine",
     "regret",
     "pulls",

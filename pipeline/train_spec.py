@@ -23,7 +23,8 @@ class TrainSpec:
         seed: of everything random in the run.
         eval_freq: environment steps between two evaluations; below 0 for none, None for twenty
             evaluations over the run.
-        eval_episodes: episodes of each evaluation during training.
+        eval_episodes: episodes of each evaluation during training; None for as few as will do.
+        final_episodes: of the evaluation at the end, likewise.
         n_eval_envs: environments that an evaluation plays on at once.
         save_freq: environment steps between two checkpoints; below 1 for none.
         save_every_n_episodes: episodes between two checkpoints; below 1 for none.
@@ -53,7 +54,8 @@ class TrainSpec:
     saved_hyperparams: dict[str, Any]
     seed: int
     eval_freq: int | None = None
-    eval_episodes: int = 20
+    eval_episodes: int | None = 20
+    final_episodes: int | None = 100
     n_eval_envs: int = 10
     save_freq: int = -1
     save_every_n_episodes: int = -1

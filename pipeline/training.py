@@ -10,7 +10,6 @@ from signal import Signals
 from typing import Any
 from uuid import uuid4
 
-import torch as th
 from rich.console import Console
 
 from mdp.machine_code import compile_timer
@@ -24,7 +23,7 @@ from pipeline.finishing import draw, judge, save
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.leftovers import remove_leftovers
 from pipeline.library_errors import blame_settings, blame_weights
-from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_up
+from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
 from pipeline.pull_recording import PullSummary
 from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
 from pipeline.resuming.state_folder import remove_states
@@ -65,6 +64,9 @@ class Outcome:
             evaluation was turned off.
         best_return: mean return of the best evaluation during training, if there was one.
         best_timesteps: when that was.
+        best_episodes: how many episodes that is the mean of; 0 where it is exact.
+        evaluating: what all evaluations have taken, the last one included.
+        evaluation_steps: environment steps of those that were sampled.
         engine: for tabular agents, whether training was compiled, and if not, why.
         pulls: on bandits, figures on the pulls of training; else None.
     """
@@ -77,6 +79,9 @@ class Outcome:
     best_return: float | None
     best_timesteps: int
     engine: str | None
+    best_episodes: int
+    evaluating: WorkTime
+    evaluation_steps: int
     pulls: PullSummary | None = None
 
 
@@ -116,8 +121,7 @@ def prepare(
             folder is left behind then.
         Stopped: if a signal asks for it, likewise.
     """
-    if spec.num_threads > 0:
-        th.set_num_threads(spec.num_threads)
+    set_arithmetic(spec)
     stop = current()
     with stop.waiting(0.0):
         kwargs = algorithm_kwargs(spec)
@@ -267,6 +271,9 @@ def _finish(training: Training, state: str, taken: WorkTime, activity: Activity)
         best_timesteps=evaluation.best_timesteps,
         engine=getattr(model, "engine_in_use", None),
         pulls=pulls,
+        best_episodes=evaluation.best_episodes,
+        evaluating=evaluation.taken,
+        evaluation_steps=getattr(evaluation.evaluator, "n_steps", 0),
     )
     _record(outcome)
     if state == FINISHED and not training.keeping.stays:
@@ -283,6 +290,8 @@ def _record(outcome: Outcome) -> None:
         final=None if outcome.final is None else outcome.final.summary(),
         best_mean_return=outcome.best_return,
         best_timesteps=outcome.best_timesteps,
+        best_episodes=outcome.best_episodes,
+        evaluation_steps=outcome.evaluation_steps,
         engine=outcome.engine,
         **outcome.taken.as_data(),
         **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 from rich.console import Console
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
@@ -13,8 +11,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
 from pipeline.errors import UserError
+from pipeline.evaluation.evaluation_budget import SampledEvaluator
 from pipeline.evaluation.exact import ExactEvaluator
-from pipeline.evaluation.sampled import evaluate, evaluation_seed
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.progress import ProgressDisplay
@@ -47,12 +45,10 @@ def evaluation_callback(
     display: ProgressDisplay,
 ) -> EvaluationCallback:
     """The evaluations during training: exact ones where they can be."""
-    seed = evaluation_seed(spec.seed, 1)
-    sampled = partial(evaluate, env=eval_env, n_episodes=spec.eval_episodes, seed=seed)
     return EvaluationCallback(
         run,
         eval_env,
-        exact or sampled,
+        exact or SampledEvaluator(spec, eval_env),
         *_evaluation_intervals(spec, n_envs, is_judged_by_regret=exact is None and is_bandit),
         value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
         during=display.doing,

@@ -11,13 +11,11 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-import torch as th
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
-from agents.tabular.tabular_algorithm import TabularAlgorithm
 from envs.known_models import (
     action_masks_of_states,
     model_check,
@@ -32,17 +30,22 @@ from mdp import (
     baseline_return,
     finite_horizon_optimum,
     optimal_choices,
+    optimum_far_from_limit,
     policy_return,
 )
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
-from pipeline.evaluation.mask_telling import takes_masks
-from pipeline.evaluation.policy_kinds import has_memory
-from pipeline.evaluation.sampled import KNOWN_LIBRARIES, Evaluation, Yardstick
+from pipeline.evaluation.asked_policies import best_actions, obstacle, policy_matrix
+from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.memory_limits import observation_bytes
 from pipeline.train_spec import TrainSpec
 
-# Beyond this, episodes are sampled: exact evaluation would take longer than training.
-MAX_STATES = 20_000
+# What is observed in all states, kept as one array.
+MOST_BYTES_OBSERVED = 1 << 30
+# Planning backwards from the time limit: steps times outcomes of all states and actions, of which a
+# second does some hundred million. Beyond the first number there may be a shorter way.
+FEW_BACKUPS = 200_000_000
+MOST_BACKUPS = 20_000_000_000
 
 
 @dataclass(frozen=True)
@@ -87,15 +90,21 @@ class ExactEvaluator:
         return optimal_choices(self.model, self.horizon)
 
     def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
-        """The agent's policy: of shape (S, A), or (horizon, S) where it depends on the time."""
+        """The agent's policy, in one of the forms of `mdp.policies`.
+
+        Probabilities of shape (S, A); or actions, of shape (S,), or (horizon, S) where they depend
+        on the time.
+        """
         if isinstance(agent, PlanningAgent):
-            steps = np.arange(self.horizon)[:, None]
-            return agent.policy.actions_after(self.observations[None], steps)
+            n_steps = 1 if agent.policy.is_stationary else self.horizon
+            return agent.policy.actions_after(self.observations[None], np.arange(n_steps)[:, None])
+        if deterministic and not isinstance(agent, RandomAgent):
+            return best_actions(agent, self.observations, self.masks)
         return policy_matrix(agent, self.observations, deterministic, self.masks)
 
-    def obstacle(self, agent: BaseAlgorithm) -> str:
-        """Why the agent's policy cannot be had by asking it for every state; empty where it can."""
-        return _obstacle(agent, self.masks)
+    def obstacle(self, agent: BaseAlgorithm, deterministic: bool = True) -> str:
+        """Why the agent's policy is not to be had, or too dear; empty where it is neither."""
+        return obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
 
 
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
@@ -104,11 +113,16 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         return None
     env = make_single_env(spec)
     try:
-        model, observations = transition_model(env), observations_of_states(env)
-        horizon = time_limit(env)
-        if model is None or observations is None or horizon is None:
+        model, horizon = transition_model(env), time_limit(env)
+        if model is None or horizon is None:
             return None
-        if model.n_states > MAX_STATES:
+        if model.n_states * observation_bytes(env.observation_space) > MOST_BYTES_OBSERVED:
+            return None
+        observations = observations_of_states(env)
+        if observations is None:
+            return None
+        optimum = _optimum(model, horizon)
+        if optimum is None:
             return None
         masks = action_masks_of_states(env)
         success, layout = success_outcomes(env), grid_layout(env)
@@ -116,35 +130,21 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         env.close()
     if layout is not None and layout.n_states != model.n_states:
         layout = None  # a grid world of somebody's own has states that are no cells
-    yardstick = Yardstick(
-        optimum=float(finite_horizon_optimum(model, horizon).start_value),
-        baseline=float(baseline_return(model, horizon)),
-    )
+    yardstick = Yardstick(optimum, baseline=float(baseline_return(model, horizon)))
     return ExactEvaluator(model, observations, horizon, success, yardstick, layout, masks)
 
 
-def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
-    """Say why an agent cannot be asked for all states at once; empty where it can.
+def _optimum(model: TransitionModel, horizon: int) -> float | None:
+    """The highest return under the time limit; None where it takes too long to find.
 
-    Agents of this project and of Stable-Baselines3 can. Of others, what `predict` returns is looked
-    at: it has to be one action a state, the same when it is asked again, and nothing to remember.
-
-    Args:
-        agent: any agent with discrete actions.
-        observations: what it observes in each state, states along the first axis.
+    It goes by numbers of operations: what is exact may not depend on how fast a machine is.
     """
-    if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
-        return ""
-    try:
-        asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
-        first, second = (np.asarray(actions) for actions, _ in asked)
-    except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
-        return f"predict takes no batch of observations ({type(error).__name__})"
-    if first.shape != observations.shape[:1]:
-        return f"predict returns actions of shape {first.shape} for {len(observations)} states"
-    if any(state is not None for _, state in asked):
-        return "predict remembers what it saw before"
-    return "" if np.array_equal(first, second) else "predict draws its actions at random"
+    n_backups = int(model.reachable.sum()) * model.n_actions * model.n_outcomes * horizon
+    if n_backups > FEW_BACKUPS:
+        found = optimum_far_from_limit(model, horizon)
+        if found is not None or n_backups > MOST_BACKUPS:
+            return found
+    return finite_horizon_optimum(model, horizon).start_value
 
 
 def model_refusal(spec: TrainSpec) -> str | None:
@@ -166,66 +166,3 @@ def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
     """Whether the agent sees the environment through something around all of its copies."""
     special = spec.hyperparams
     return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)
-
-
-def policy_matrix(
-    agent: BaseAlgorithm,
-    observations: NDArray[Any],
-    deterministic: bool = True,
-    masks: Bools | None = None,
-) -> Floats:
-    """The agent's policy as probabilities of shape (S, A).
-
-    Args:
-        agent: any agent with discrete actions whose policy depends on the observation alone.
-        observations: what it observes in each state, states along the first axis.
-        deterministic: its best actions rather than what it samples.
-        masks: what may be done in each state, bool of shape (S, A), for agents that are told.
-
-    Raises:
-        TypeError: if the probabilities that the agent acts with are not known.
-    """
-    obstacle = _obstacle(agent, masks)
-    if obstacle:
-        raise TypeError(f"{type(agent).__name__}: {obstacle}")
-    n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
-    told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
-    if isinstance(agent, RandomAgent):
-        return np.full((n_states, n_actions), 1 / n_actions)
-    if deterministic:
-        actions, _ = agent.predict(observations, deterministic=True, **told)
-        return np.eye(n_actions)[np.asarray(actions, dtype=np.int64)]
-    if isinstance(agent, TabularAlgorithm):
-        return np.asarray(agent.action_probabilities()[observations])
-    policy = getattr(agent, "policy", None)
-    if hasattr(policy, "get_distribution"):
-        return _actor_probabilities(policy, observations, told)
-    if _is_epsilon_greedy(agent):
-        epsilon = float(vars(agent)["exploration_rate"])
-        greedy = policy_matrix(agent, observations, masks=masks)
-        allowed = told.get("action_masks", np.ones(greedy.shape, dtype=np.bool_))
-        random = epsilon * allowed / allowed.sum(axis=1, keepdims=True)
-        return np.asarray(random + (1 - epsilon) * greedy)
-    raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
-
-
-def _is_epsilon_greedy(agent: BaseAlgorithm) -> bool:
-    """Whether it is DQN or QR-DQN, which may not be installed and is no subclass of it."""
-    homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
-    return any(base.__module__.startswith(homes) for base in type(agent).__mro__)
-
-
-def _obstacle(agent: BaseAlgorithm, masks: Bools | None) -> str:
-    if has_memory(agent):
-        return "it acts by what it remembers, not by the state alone"
-    if masks is None and takes_masks(agent):
-        return "which actions are valid in each state is not known"
-    return ""
-
-
-def _actor_probabilities(policy: Any, observations: NDArray[Any], told: dict[str, Any]) -> Floats:
-    """The probabilities of an actor with a softmax over its actions, shape (S, A)."""
-    with th.no_grad():
-        tensor, _ = policy.obs_to_tensor(observations)
-        distribution = policy.get_distribution(tensor, **told).distribution
-    return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)

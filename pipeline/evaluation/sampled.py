@@ -74,6 +74,11 @@ class Evaluation:
         return float(self.returns.mean())
 
     @property
+    def mean_length(self) -> float:
+        """Mean number of steps of an episode."""
+        return float(self.lengths.mean())
+
+    @property
     def std_return(self) -> float:
         """Standard deviation of an episode's return."""
         return float(self.returns.std()) if self.exact_std is None else self.exact_std
@@ -83,12 +88,20 @@ class Evaluation:
         """Share of the episodes that succeed, if the environment says so."""
         return None if self.successes is None else float(self.successes.mean())
 
+    def joined(self, more: Evaluation) -> Evaluation:
+        """These episodes and further ones of the same agent, all of them sampled."""
+        both = None
+        if self.successes is not None and more.successes is not None:
+            both = np.concatenate([self.successes, more.successes])
+        returns = np.concatenate([self.returns, more.returns])
+        return Evaluation(returns, np.concatenate([self.lengths, more.lengths]), both)
+
     def summary(self) -> dict[str, Any]:
         """The figures as JSON."""
         figures: dict[str, Any] = {
             "mean_return": self.mean_return,
             "std_return": self.std_return,
-            "mean_length": float(self.lengths.mean()),
+            "mean_length": self.mean_length,
             "success_rate": self.success_rate,
             "exact": self.is_exact,
             "n_episodes": None if self.is_exact else len(self.returns),
@@ -104,7 +117,7 @@ class Evaluation:
 
 
 def evaluate(
-    model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int, deterministic: bool = True
+    model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int | None, deterministic: bool = True
 ) -> Evaluation:
     """Play ``n_episodes``, the same ones each time that ``seed`` is the same.
 
@@ -112,7 +125,7 @@ def evaluate(
         model: the agent.
         env: environments to play on, with a time limit.
         n_episodes: how many episodes, shared evenly between the environments.
-        seed: of the environments.
+        seed: of the environments; None to go on with the episodes that come next.
         deterministic: play the policy's best action rather than sample one.
 
     Raises:
@@ -126,7 +139,8 @@ def evaluate(
 
     # Others that play have no count of their own.
     when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
-    env.seed(seed)
+    if seed is not None:
+        env.seed(seed)
     watched: Any = FinitePlayer(player(model, env), when)
     returns, lengths = evaluate_policy(
         watched,

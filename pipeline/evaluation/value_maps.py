@@ -103,7 +103,7 @@ def _deterministic_policy(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> In
         return None
     policy = evaluator.policy(agent, deterministic=True)
     if np.issubdtype(policy.dtype, np.integer):
-        return policy.astype(np.int64)
+        return np.atleast_2d(policy).astype(np.int64)
     return policy.argmax(axis=1)[None] if (policy.max(axis=1) == 1).all() else None
 
 

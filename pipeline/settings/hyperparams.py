@@ -82,6 +82,7 @@ class Hyperparams:
         noise_type: action noise, for algorithms that take an ``action_noise``.
         noise_std: its standard deviation. Without a ``noise_type`` the key is an argument of the
             algorithm like any other.
+        flush_denormal: let the processor take numbers below 1e-38 for zero.
         algorithm: everything else: arguments of the algorithm's constructor, not checked yet.
     """
 
@@ -100,6 +101,7 @@ class Hyperparams:
     monitor_kwargs: dict[str, Any] = field(default_factory=dict)
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
     noise_std: float | None = None
+    flush_denormal: bool = False
     algorithm: dict[str, Any] = field(default_factory=dict)
 
 

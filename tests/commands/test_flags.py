@@ -22,6 +22,7 @@ COMPARE = ["--algos", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
         (["--seed", "7"], "seed", 7),
         (["--eval-freq", "-1"], "eval_freq", -1),
         (["--eval-episodes", "3"], "eval_episodes", 3),
+        (["--eval-episodes", "3"], "final_episodes", 3),
         (["--n-eval-envs", "2"], "n_eval_envs", 2),
         (["--save-freq", "9"], "save_freq", 9),
         (["--vec-env", "subproc"], "vec_env", "subproc"),
@@ -41,6 +42,9 @@ def test_a_flag_of_train_reaches_the_specification(words, name, value):
 def test_without_flags_a_run_is_the_default_one():
     spec = train_spec(train_agent.build_parser().parse_args(TRAIN))
     own = {"algo", "env_id", "hyperparams", "saved_hyperparams", "seed"}
+    # A study has the same number of episodes in all its runs; a run by itself as few as will do.
+    assert (spec.eval_episodes, spec.final_episodes) == (None, None)
+    own |= {"eval_episodes", "final_episodes"}
     assert {
         key.name: getattr(spec, key.name) for key in fields(TrainSpec) if key.name not in own
     } == {key.name: key.default for key in fields(TrainSpec) if key.name not in own}

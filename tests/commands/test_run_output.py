@@ -66,6 +66,9 @@ def outcome_of(**changes):
         "final": None,
         "best_return": None,
         "best_timesteps": 0,
+        "best_episodes": 0,
+        "evaluating": WorkTime(3.0, 0.5),
+        "evaluation_steps": 0,
         "engine": None,
         "pulls": None,
     }
@@ -135,15 +138,18 @@ def test_a_run_with_everything():
         final=SAMPLED,
         best_return=3.25,
         best_timesteps=10_000,
+        best_episodes=5,
+        evaluation_steps=700,
         taken=WorkTime(),
-        n_steps=0,
+        n_steps=1000,
     )
     assert printed(outcome, spec_of("else where")) == [
-        "interrupted  0 steps in 0.0 s (0 steps/s)",
+        "interrupted  1,000 steps in 0.0 s (1,000,000,000,000 steps/s)",
         "engine       compiled",
         "regret       not known: none of 1,500 pulls is in the log",
         "final        return 2.00 ± 1.00 over 2 episodes",
-        "best         return 3.25, first at step 10,000",
+        "best         return 3.25 over 5 episodes, first at step 10,000",
+        "judged       by 700 steps (70% of training's) in 0.5 s of processor time",
         "files        logs/qlearning/Lake-v1_3",
         "watch        python enjoy.py --algo qlearning --env Lake-v1 -f 'else where'",
     ]

@@ -23,6 +23,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import load_algorithm
 from agents.common.callback_horizons import EpisodeBudget
+from pipeline import evaluation_callback
 from pipeline.callbacks import (
     EpisodeCheckpoint,
     ExponentialExploration,
@@ -177,8 +178,10 @@ def test_the_best_model_is_the_first_of_the_best(run):
     assert np.load(run.evaluations_path)["timesteps"].tolist() == [10, 20, 30, 40, 50]
 
 
-def test_files_are_there_after_each_evaluation(run):
-    """A run that is killed leaves what it has found until then."""
+@pytest.mark.parametrize(("pause", "left"), [(0.0, [1, 2]), (1e9, [1, 1])])
+def test_files_are_there_soon_after_each_evaluation(run, monkeypatch, pause, left):
+    """A run that is killed leaves what it has found until then, or until a second before."""
+    monkeypatch.setattr(evaluation_callback, "SECONDS_BETWEEN_WRITES", pause)
     seen = []
 
     class Look(BaseCallback):
@@ -193,7 +196,7 @@ def test_files_are_there_after_each_evaluation(run):
     ]
     callbacks = CallbackList([scripted(run, evaluations), Look()])
     make("qlearning", "FrozenLake-v1").learn(20, callback=callbacks)
-    assert seen == [0] * 9 + [1] * 10 + [2]
+    assert seen == [0] * 9 + [left[0]] * 10 + [left[1]]
     written = np.load(run.evaluations_path)
     assert written["results"].tolist() == [[1, 3], [0, 1]]
     assert written["ep_lengths"].tolist() == [[4, 5], [6, 7]]

@@ -7,7 +7,9 @@ from gymnasium import spaces
 from agents import load_algorithm
 from mdp import policy_return, value_iteration
 from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation.exact import exact_evaluator, policy_matrix
+from pipeline.evaluation import asked_policies
+from pipeline.evaluation.asked_policies import policy_matrix
+from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.sampled import Yardstick, evaluate
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -184,12 +186,50 @@ def test_networks_on_other_observations(name):
             {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"},
         ),
         ("Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}),
-        # Twenty-two thousand states and more take longer than episodes.
-        ("envs:RandomWarehouse-v0", {"env_kwargs": {"size": 150}}),
+        # Twenty-two thousand states of as many numbers each are two gigabytes.
+        (
+            "envs:RandomWarehouse-v0",
+            {"env_kwargs": {"size": 150, "observation": "one_hot"}},
+        ),
     ],
 )
 def test_where_episodes_must_be_sampled(env, entry):
     assert exact_evaluator(spec_of(env, **entry)) is None
+
+
+def test_what_takes_longer_than_playing_is_said(monkeypatch):
+    spec = spec_of("Warehouse")
+    evaluator = exact_evaluator(spec)
+    agents = {name: briefly_trained(name, spec) for name in ("qlearning", "dqn", "random")}
+    assert [evaluator.obstacle(agent) for agent in agents.values()] == ["", "", ""]
+    monkeypatch.setattr(asked_policies, "MOST_NUMBERS", 100 * 100 - 1)
+    monkeypatch.setattr(asked_policies, "MOST_AT_RANDOM", 100 * 60 - 1)
+    assert evaluator.obstacle(agents["qlearning"]) == ""
+    assert evaluator.obstacle(agents["dqn"]).startswith("to ask a network about 100 states")
+    assert evaluator.obstacle(agents["random"]).startswith("random actions come to too many")
+    assert evaluator.obstacle(agents["qlearning"], deterministic=False).startswith("random")
+
+
+@pytest.mark.parametrize("name", ["dqn", "ppo"])
+def test_a_network_is_asked_in_parts_where_states_are_many(name, monkeypatch):
+    spec = spec_of("Warehouse")
+    evaluator, agent = exact_evaluator(spec), briefly_trained(name, spec)
+    at_once = [evaluator(agent, sure) for sure in (True, False)]
+    monkeypatch.setattr(asked_policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
+    for sure, expected in zip((True, False), at_once, strict=True):
+        assert evaluator(agent, sure).mean_return == pytest.approx(expected.mean_return, rel=1e-5)
+
+
+@pytest.mark.parametrize("slip", [0.0, 0.1])
+def test_a_large_warehouse_is_evaluated_exactly(slip):
+    """Against planning and evaluating backwards, which takes a hundred times as long."""
+    spec = spec_of("envs:RandomWarehouse-v0", env_kwargs={"size": 150, "slip": slip})
+    evaluator = exact_evaluator(spec)
+    best = value_iteration(evaluator.model, 1.0)
+    found = evaluator(Lookup(best.policy, lambda state: state))
+    assert found.mean_return == pytest.approx(evaluator.yardstick.optimum, rel=1e-9)
+    assert found.summary()["score"] == pytest.approx(1, abs=1e-9)
+    assert evaluator.yardstick.optimum == pytest.approx(best.start_value, rel=1e-9)
 
 
 def test_what_an_unknown_agent_samples_from_is_not_guessed():

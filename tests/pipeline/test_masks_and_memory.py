@@ -15,7 +15,8 @@ import enjoy
 from agents import load_algorithm
 from pipeline.agent_checks import check_fit
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator, policy_matrix
+from pipeline.evaluation.asked_policies import policy_matrix
+from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.mask_telling import player, takes_masks
 from pipeline.evaluation.policy_kinds import has_memory
 from pipeline.evaluation.sampled import evaluate

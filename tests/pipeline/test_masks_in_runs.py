@@ -15,7 +15,8 @@ from envs.known_models import action_masks_of_states
 from pipeline.agent_checks import check_fit
 from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import exact_evaluator, policy_matrix
+from pipeline.evaluation.asked_policies import policy_matrix
+from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.mask_telling import takes_masks
 from pipeline.evaluation.sampled import evaluate
 from pipeline.models.model_choice import ModelRequest, choose_model
@@ -49,7 +50,7 @@ def trained(name, spec, steps=200):
 def test_no_evaluation_does_what_is_masked(name, deterministic):
     spec = spec_of(name)
     agent, evaluator = trained(name, spec), exact_evaluator(spec)
-    policy = evaluator.policy(agent, deterministic)
+    policy = policy_matrix(agent, evaluator.observations, deterministic, evaluator.masks)
     assert not policy[~evaluator.masks].any()
     np.testing.assert_allclose(policy.sum(axis=1), 1)
     # A shelf costs 100, the edge of the map 1: what is masked alone can cost more than 30.

@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from rich.console import Console
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -74,3 +75,29 @@ def test_hindsight_replay_as_rl_zoo3_writes_it(tmp_path):
     assert training.model.replay_buffer.her_ratio == 0.8
     # As many updates as steps, after whole episodes.
     assert 0 < training.model._n_updates <= 60
+
+
+# --- faster networks -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("fused", [True, False])
+def test_a_fused_optimizer_is_a_matter_of_settings(tmp_path, fused):
+    policy_kwargs = {"net_arch": [4], "optimizer_kwargs": {"fused": fused}}
+    training = prepared(tmp_path, "dqn", "CartPole-v1", n_timesteps=10, policy_kwargs=policy_kwargs)
+    assert training.model.policy.optimizer.defaults["fused"] is fused
+    training.model.env.close()
+
+
+def test_denormals_are_flushed_in_the_runs_that_ask_for_it(tmp_path):
+    def halved():
+        return float(th.tensor([1.5e-38]) / 2)
+
+    try:
+        for flushes in (True, False):
+            training = prepared(
+                tmp_path, "dqn", "CartPole-v1", n_timesteps=10, flush_denormal=flushes
+            )
+            training.model.env.close()
+            assert (halved() == 0) is flushes
+    finally:
+        th.set_flush_denormal(False)

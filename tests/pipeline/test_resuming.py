@@ -87,7 +87,8 @@ def spec_of(folder, env_id, algo, n_timesteps, settings, **more):
     raw = override({**entry, "n_timesteps": n_timesteps}, settings)
     raw.pop("n_episodes", None)
     common = {"seed": 3, "log_folder": folder, "verbose": 0, "pictures": False}
-    return TrainSpec(algo, env_id, split(raw), raw, **{**common, **more})
+    sparing = {"eval_episodes": None, "final_episodes": None}
+    return TrainSpec(algo, env_id, split(raw), raw, **{**common, **sparing, **more})
 
 
 def training_of(spec, keeping, run=None):

@@ -1,0 +1,187 @@
+"""Policies as arrays: agents asked what they do in every state at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.planning import PlanningAgent
+from agents.reference import RandomAgent
+from agents.tabular.tabular_algorithm import TabularAlgorithm
+from mdp.array_types import Bools, Floats, Ints
+from pipeline.evaluation.evaluation_budget import is_network
+from pipeline.evaluation.mask_telling import takes_masks
+from pipeline.evaluation.policy_kinds import has_memory
+from pipeline.evaluation.sampled import KNOWN_LIBRARIES
+
+# Numbers that a network is handed at once, and at all: beyond, asking for every state takes longer
+# than playing.
+MOST_AT_ONCE = 1 << 26
+MOST_NUMBERS = 400_000_000
+# A plan that changes with the step holds an action for each step and state.
+MOST_PLANNED = 1 << 27
+# States times steps that probability may spread over, where actions are random.
+MOST_AT_RANDOM = 30_000_000
+
+
+def obstacle(
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    masks: Bools | None,
+    horizon: int,
+    deterministic: bool = True,
+) -> str:
+    """Why exact evaluation is out of reach, or dearer than playing; empty where it is neither.
+
+    Args:
+        agent: any agent with discrete actions.
+        observations: what it observes in each state, states along the first axis.
+        masks: what may be done in each state, bool of shape (S, A), or None if that is not known.
+        horizon: the time limit.
+        deterministic: whether it is its best actions that count.
+    """
+    n_states = len(observations)
+    if reason := _cannot_be_asked(agent, masks):
+        return reason
+    if is_network(agent) and n_states * _n_inputs(agent) > MOST_NUMBERS:
+        return f"to ask a network about {n_states:,} states takes longer than to play"
+    if isinstance(agent, PlanningAgent):
+        is_too_large = not agent.policy.is_stationary and n_states * horizon > MOST_PLANNED
+        text = f"a plan for {horizon:,} steps in {n_states:,} states is too large"
+        return text if is_too_large else ""
+    is_random = isinstance(agent, RandomAgent) or not deterministic
+    if is_random and n_states * horizon > MOST_AT_RANDOM:
+        return f"random actions come to too many of {n_states:,} states in {horizon:,} steps"
+    return ""
+
+
+def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
+    """Say why an agent cannot be asked for all states at once; empty where it can.
+
+    Agents of this project and of Stable-Baselines3 can. Of others, what `predict` returns is looked
+    at: it has to be one action a state, the same when it is asked again, and nothing to remember.
+
+    Args:
+        agent: any agent with discrete actions.
+        observations: what it observes in each state, states along the first axis.
+    """
+    if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
+        return ""
+    try:
+        asked = [agent.predict(observations, deterministic=True) for _ in range(2)]
+        first, second = (np.asarray(actions) for actions, _ in asked)
+    except Exception as error:  # noqa: BLE001  # a stranger's code can fail in any way
+        return f"predict takes no batch of observations ({type(error).__name__})"
+    if first.shape != observations.shape[:1]:
+        return f"predict returns actions of shape {first.shape} for {len(observations)} states"
+    if any(state is not None for _, state in asked):
+        return "predict remembers what it saw before"
+    return "" if np.array_equal(first, second) else "predict draws its actions at random"
+
+
+def policy_matrix(
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    deterministic: bool = True,
+    masks: Bools | None = None,
+) -> Floats:
+    """The agent's policy as probabilities of shape (S, A).
+
+    Args:
+        agent: any agent with discrete actions whose policy depends on the observation alone.
+        observations: what it observes in each state, states along the first axis.
+        deterministic: its best actions rather than what it samples.
+        masks: what may be done in each state, bool of shape (S, A), for agents that are told.
+
+    Raises:
+        TypeError: if the probabilities that the agent acts with are not known.
+    """
+    if reason := _cannot_be_asked(agent, masks):
+        raise TypeError(f"{type(agent).__name__}: {reason}")
+    n_states, n_actions = len(observations), int(agent.action_space.n)  # type: ignore[attr-defined]
+    if isinstance(agent, RandomAgent):
+        return np.full((n_states, n_actions), 1 / n_actions)
+    if deterministic:
+        return np.eye(n_actions)[best_actions(agent, observations, masks)]
+    if isinstance(agent, TabularAlgorithm):
+        return np.asarray(agent.action_probabilities()[observations])
+    policy = getattr(agent, "policy", None)
+    if hasattr(policy, "get_distribution"):
+        return _in_parts(agent, observations, masks, partial(_actor_probabilities, policy))
+    if _is_epsilon_greedy(agent):
+        epsilon = float(vars(agent)["exploration_rate"])
+        greedy = policy_matrix(agent, observations, masks=masks)
+        is_told = masks is not None and takes_masks(agent)
+        allowed = masks if is_told else np.ones(greedy.shape, dtype=np.bool_)
+        assert allowed is not None
+        random = epsilon * allowed / allowed.sum(axis=1, keepdims=True)
+        return np.asarray(random + (1 - epsilon) * greedy)
+    raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
+
+
+def best_actions(
+    agent: BaseAlgorithm, observations: NDArray[Any], masks: Bools | None = None
+) -> Ints:
+    """What the agent does in each state, shape (S,); arguments as of `policy_matrix`.
+
+    Raises:
+        TypeError: if that does not depend on the state alone.
+    """
+    if reason := _cannot_be_asked(agent, masks):
+        raise TypeError(f"{type(agent).__name__}: {reason}")
+
+    def predicted(observations: NDArray[Any], **told: Any) -> NDArray[Any]:
+        return np.asarray(agent.predict(observations, deterministic=True, **told)[0])
+
+    return _in_parts(agent, observations, masks, predicted).astype(np.int64)
+
+
+def _in_parts(
+    agent: BaseAlgorithm,
+    observations: NDArray[Any],
+    masks: Bools | None,
+    asked: Callable[..., NDArray[Any]],
+) -> NDArray[Any]:
+    """What ``asked`` returns for all observations, which may be too many for a network at once."""
+    n_states = len(observations)
+    n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
+    told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
+    found = [
+        asked(observations[i : i + n_rows], **{k: v[i : i + n_rows] for k, v in told.items()})
+        for i in range(0, n_states, n_rows)
+    ]
+    return found[0] if len(found) == 1 else np.concatenate(found)
+
+
+def _n_inputs(agent: BaseAlgorithm) -> int:
+    """Numbers that an observation becomes before a network is handed it."""
+    return max(int(spaces.flatdim(agent.observation_space)), 1)
+
+
+def _is_epsilon_greedy(agent: BaseAlgorithm) -> bool:
+    """Whether it is DQN or QR-DQN, which may not be installed and is no subclass of it."""
+    homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
+    return any(base.__module__.startswith(homes) for base in type(agent).__mro__)
+
+
+def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:
+    if has_memory(agent):
+        return "it acts by what it remembers, not by the state alone"
+    if masks is None and takes_masks(agent):
+        return "which actions are valid in each state is not known"
+    return ""
+
+
+def _actor_probabilities(policy: Any, observations: NDArray[Any], **told: Any) -> Floats:
+    """The probabilities of an actor with a softmax over its actions, shape (S, A)."""
+    with th.no_grad():
+        tensor, _ = policy.obs_to_tensor(observations)
+        distribution = policy.get_distribution(tensor, **told).distribution
+    return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)

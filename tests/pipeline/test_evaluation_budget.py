@@ -1,0 +1,182 @@
+"""Sampled evaluation takes no more than its share, goes by steps, and says how much it took."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+from pipeline.evaluation import evaluation_budget as budget
+from pipeline.evaluation.evaluation_budget import SampledEvaluator, allowed_steps, is_sure
+from pipeline.evaluation.sampled import Evaluation, evaluate
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+from pipeline.training import train
+
+SMALL = {"policy": "MlpPolicy", "n_steps": 50, "batch_size": 50, "n_epochs": 1}
+
+
+def spec_of(folder, algo="random", env="CartPole-v1", n_timesteps=3000, **fields):
+    entry = {"n_timesteps": n_timesteps, **(SMALL if algo == "ppo" else {})}
+    fields = {"eval_episodes": None, "final_episodes": None, "pictures": False, **fields}
+    return TrainSpec(algo, env, split(entry), entry, seed=0, log_folder=folder, **fields)
+
+
+def run_of(spec):
+    return train(replace(spec, verbose=0), Console(quiet=True), {}, "")
+
+
+def episodes(*returns, length=10):
+    return Evaluation(np.array(returns, float), np.full(len(returns), length), None)
+
+
+def test_when_a_mean_is_sure():
+    assert is_sure(episodes(*[7.0] * 10), 0.01)
+    assert not is_sure(episodes(*[7.0] * 5), 0.01), "five may be alike by chance"
+    # 9 and 11 in turn: mean 10, standard deviation sqrt(10/9), standard error 1/3.
+    assert is_sure(episodes(*[9.0, 11.0] * 5), 0.0334)
+    assert not is_sure(episodes(*[9.0, 11.0] * 5), 0.0333)
+    assert not is_sure(episodes(*[-1.0, 1.0] * 5), 0.5)
+
+
+def test_what_is_allowed():
+    assert allowed_steps(1000, learns_by_gradients=True) == budget.STEPS_IN_ANY_CASE
+    assert allowed_steps(1e6, learns_by_gradients=True) == 250_000
+    assert allowed_steps(1e6, learns_by_gradients=False) == 10_000
+
+
+def played(monkeypatch, returns, length):
+    """An evaluator whose episodes are made up, and a list of how many were asked for."""
+    asked, left = [], list(returns)
+
+    def evaluate(model, env, n_episodes, seed):
+        asked.append((n_episodes, seed is None))
+        return episodes(*[left.pop(0) for _ in range(n_episodes)], length=length)
+
+    monkeypatch.setattr(budget, "evaluate", evaluate)
+    return asked
+
+
+class Model:
+    num_timesteps = 0
+    _num_timesteps_at_start = 0
+    policy = None
+
+
+@pytest.mark.parametrize(
+    ("returns", "length", "expected"),
+    [
+        ([1.0] * 100, 1, [10]),
+        ([0.0, 9.0] * 50, 1, [10, 15, 25, 50]),
+        ([0.0, 9.0] * 50, 300, [10, 15]),  # the next 25 would be 15,000 steps
+        ([0.0, 9.0] * 50, 1001, [10]),  # ten there are in any case
+    ],
+)
+def test_the_last_evaluation_ends_when_it_is_sure_or_dear(
+    monkeypatch, tmp_path, returns, length, expected
+):
+    asked = played(monkeypatch, returns, length)
+    evaluator = SampledEvaluator(spec_of(tmp_path), None)
+    found = evaluator.at_the_end(Model())
+    assert [n for n, _ in asked] == expected
+    assert [goes_on for _, goes_on in asked] == [False, *[True] * (len(expected) - 1)]
+    assert len(found.returns) == sum(expected)
+    assert evaluator.n_steps == sum(expected) * length
+
+
+def test_evaluations_are_left_out_while_they_are_too_dear(monkeypatch, tmp_path):
+    asked = played(monkeypatch, [1.0, 5.0] * 500, length=200)
+    evaluator, model = SampledEvaluator(spec_of(tmp_path, n_timesteps=20_000), None), Model()
+    done = []
+    for step in range(1000, 20_001, 1000):
+        model.num_timesteps = step
+        if evaluator.can_afford(model, 0):
+            evaluator(model)
+            done.append(step)
+    # Five episodes are 1,000 steps, and half of 10,000 are allowed over the whole training; of the
+    # first nobody knows how long it takes.
+    assert done == [1000, 8000, 12_000, 16_000, 20_000]
+    assert [n for n, _ in asked] == [5] * 5
+    assert evaluator.n_steps == 5000
+
+
+def test_what_is_asked_for_is_done(tmp_path):
+    run = run_of(spec_of(tmp_path, eval_episodes=3, final_episodes=3)).run
+    evaluations = np.load(run.evaluations_path)
+    assert evaluations["results"].shape == (20, 3)
+    assert "n_episodes" not in evaluations, "all have as many as there are columns"
+    assert json.loads(run.info_path.read_text())["final"]["n_episodes"] == 3
+    often = run_of(spec_of(tmp_path, eval_freq=20, n_timesteps=2000)).run
+    assert len(np.load(often.evaluations_path)["timesteps"]) == 100
+
+
+def test_a_run_says_what_its_evaluations_took(tmp_path):
+    outcome = run_of(spec_of(tmp_path, "ppo", n_timesteps=2000))
+    assert 0 < outcome.evaluation_steps <= budget.STEPS_IN_ANY_CASE
+    info = json.loads(outcome.run.info_path.read_text())
+    assert info["evaluation_steps"] == outcome.evaluation_steps
+    evaluations = np.load(outcome.run.evaluations_path)
+    final, n_columns = info["final"], evaluations["results"].shape[1]
+    counts = np.array(evaluations.get("n_episodes", [n_columns] * len(evaluations["timesteps"])))
+    during = (evaluations["ep_lengths"].mean(axis=1) * counts).sum()
+    assert outcome.evaluation_steps == during + final["mean_length"] * final["n_episodes"]
+    assert info["best_episodes"] in counts
+    assert outcome.evaluating.cpu_seconds > 0
+    # Rows of fewer episodes are repeated, so that all tools read them.
+    assert set(n_columns % counts) == {0}
+    again = run_of(spec_of(tmp_path, "ppo", n_timesteps=2000))
+    for name, array in np.load(again.run.evaluations_path).items():
+        np.testing.assert_array_equal(array, evaluations[name])
+
+
+def test_further_episodes_are_others_and_always_the_same(tmp_path):
+    from pipeline.environments import make_evaluation_env, make_training_env
+
+    spec = spec_of(tmp_path, env="Blackjack-v1")
+    from agents import load_algorithm
+
+    env = make_evaluation_env(spec, 5)
+    agent = load_algorithm("random")("RandomPolicy", make_training_env(spec, None), seed=0)
+    agent.predict = lambda obs, **_: (np.zeros(len(obs[0]), int), None)  # stick
+    first = evaluate(agent, env, 20, 1).returns
+    more = evaluate(agent, env, 20, None).returns
+    assert not np.array_equal(first, more)
+    np.testing.assert_array_equal(evaluate(agent, env, 20, 1).returns, first)
+    np.testing.assert_array_equal(evaluate(agent, env, 20, None).returns, more)
+
+
+# --- the file ------------------------------------------------------------------------------------
+
+
+def test_the_file_is_not_written_at_each_evaluation(tmp_path, monkeypatch):
+    from pipeline import evaluation_callback
+
+    writes = []
+    replacing = evaluation_callback.replacing
+    monkeypatch.setattr(
+        evaluation_callback, "replacing", lambda path: writes.append(path) or replacing(path)
+    )
+    monkeypatch.setattr(evaluation_callback, "SECONDS_BETWEEN_WRITES", 1e9)
+    outcome = run_of(spec_of(tmp_path, "qlearning", "FrozenLake-v1", 2000))
+    assert [path.name for path in writes] == ["evaluations.npz"] * 2, "the first, and at the end"
+    assert len(np.load(outcome.run.evaluations_path)["timesteps"]) == 20
+
+
+def test_what_a_broken_run_has_evaluated_is_there(tmp_path, monkeypatch):
+    from pipeline import evaluation_callback
+
+    monkeypatch.setattr(evaluation_callback, "SECONDS_BETWEEN_WRITES", 1e9)
+    calls = []
+
+    def broken(self, evaluation):
+        calls.append(evaluation)
+        if len(calls) == 7:
+            raise RuntimeError("broken")
+
+    monkeypatch.setattr(evaluation_callback.EvaluationCallback, "_log", broken)
+    with pytest.raises(RuntimeError, match="broken"):
+        run_of(spec_of(tmp_path, "qlearning", "FrozenLake-v1", 2000))
+    run = next((tmp_path / "qlearning").iterdir())
+    assert len(np.load(run / "evaluations.npz")["timesteps"]) == 7
+    assert json.loads((run / "run.json").read_text())["state"] == "failed"
