@@ -15,9 +15,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.train_spec import TrainSpec
 
-# Steps of evaluation for one of training: by a network, which learns for longer than it plays, and
-# by a table, which may be trained by a compiled loop that evaluation has not.
+# Steps of evaluation for one of training: by a network, which learns for longer than it plays; by
+# one that learns on compiled code, which evaluation has not; and by a table, likewise.
 SHARE_OF_NETWORKS = 1 / 4
+SHARE_OF_COMPILED_NETWORKS = 1 / 16
 SHARE_OF_TABLES = 1 / 100
 # Of short trainings; tenths of a second in most environments.
 STEPS_IN_ANY_CASE = 10_000
@@ -69,7 +70,7 @@ class SampledEvaluator:
             if self.training_episodes is not None:
                 progress = n_episodes / self.training_episodes
             planned = n_trained / progress if progress > 0 else 0.0
-            allowed = allowed_steps(planned, is_network(model)) * min(progress, 1.0)
+            allowed = allowed_steps(planned, share_of(model)) * min(progress, 1.0)
             self._left = allowed * PART_DURING_TRAINING - self.n_steps
         return STAGES[0] * self._usual_length <= self._left
 
@@ -82,7 +83,7 @@ class SampledEvaluator:
         """The final evaluation, by episodes of its own."""
         stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
         n_trained = model.num_timesteps - model._num_timesteps_at_start
-        left = allowed_steps(n_trained, is_network(model)) - self.n_steps
+        left = allowed_steps(n_trained, share_of(model)) - self.n_steps
         return self._evaluate(model, stages, PRECISION_AT_THE_END, left, purpose=2)
 
     def _evaluate(
@@ -107,9 +108,16 @@ class SampledEvaluator:
         return found
 
 
-def allowed_steps(n_trained: float, learns_by_gradients: bool) -> float:
+def share_of(model: BaseAlgorithm) -> float:
+    """Steps of evaluation for one of the model's training."""
+    if not is_network(model):
+        return SHARE_OF_TABLES
+    is_compiled = getattr(model, "engine_in_use", "").startswith("compiled")
+    return SHARE_OF_COMPILED_NETWORKS if is_compiled else SHARE_OF_NETWORKS
+
+
+def allowed_steps(n_trained: float, share: float) -> float:
     """Steps that all evaluations of a training of so many may take."""
-    share = SHARE_OF_NETWORKS if learns_by_gradients else SHARE_OF_TABLES
     return max(share * n_trained, STEPS_IN_ANY_CASE)
 
 

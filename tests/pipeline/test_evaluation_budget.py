@@ -3,12 +3,19 @@
 import json
 from dataclasses import replace
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
 
+from agents import load_algorithm
 from pipeline.evaluation import evaluation_budget as budget
-from pipeline.evaluation.evaluation_budget import SampledEvaluator, allowed_steps, is_sure
+from pipeline.evaluation.evaluation_budget import (
+    SampledEvaluator,
+    allowed_steps,
+    is_sure,
+    share_of,
+)
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -40,10 +47,22 @@ def test_when_a_mean_is_sure():
     assert not is_sure(episodes(*[-1.0, 1.0] * 5), 0.5)
 
 
-def test_what_is_allowed():
-    assert allowed_steps(1000, learns_by_gradients=True) == budget.STEPS_IN_ANY_CASE
-    assert allowed_steps(1e6, learns_by_gradients=True) == 250_000
-    assert allowed_steps(1e6, learns_by_gradients=False) == 10_000
+@pytest.mark.parametrize(
+    ("algo", "engine_in_use", "steps"),
+    [
+        ("ppo", "library", 250_000),
+        ("ppo", "library: it masks actions", 250_000),
+        ("ppo", "compiled", 62_500),
+        ("ppo", "compiled but for the environment: none is known", 62_500),
+        ("qlearning", "compiled", 10_000),
+    ],
+)
+def test_what_is_allowed(algo, engine_in_use, steps):
+    env = gym.make("FrozenLake-v1")
+    model = load_algorithm(algo)(env=env, **({"policy": "MlpPolicy"} if algo == "ppo" else {}))
+    model.engine_in_use = engine_in_use
+    assert allowed_steps(1e6, share_of(model)) == steps
+    assert allowed_steps(1000, share_of(model)) == budget.STEPS_IN_ANY_CASE
 
 
 def played(monkeypatch, returns, length):
