@@ -72,9 +72,9 @@ TASKS: list[Task] = [
     ("PPO, 16 x 128", "ppo", "FrozenLake-v1", 16, LAKE, 200_000, 20_000, 10),
     ("PPO, 16 x 128", "ppo", "Warehouse-v0", 16, LAKE, 200_000, 20_000, 10),
     ("A2C, 8 x 5", "a2c", "CartPole-v1", 8, {}, 100_000, 8_000, 0),
-    ("DQN [64, 64]", "dqn", "CartPole-v1", 1, SMALL_DQN, 200_000, 5_000, 50),
-    ("DQN [64, 64]", "dqn", "FrozenLake-v1", 1, SMALL_DQN, 200_000, 5_000, 50),
-    ("DQN [256, 256], rl_zoo3's", "dqn", "CartPole-v1", 1, ZOO_DQN, 20_000, 5_000, 7),
+    ("DQN [64, 64]", "dqn", "CartPole-v1", 1, SMALL_DQN, 200_000, 20_000, 50),
+    ("DQN [64, 64]", "dqn", "FrozenLake-v1", 1, SMALL_DQN, 200_000, 20_000, 50),
+    ("DQN [256, 256], rl_zoo3's", "dqn", "CartPole-v1", 1, ZOO_DQN, 20_000, 20_000, 7),
 ]
 
 LIBRARY, COMPILED, LEARNING, SBX = (
