@@ -10,6 +10,7 @@ import stable_baselines3
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.signatures import full_signature
@@ -20,9 +21,18 @@ from agents.networks.policy_training import PolicyTraining, policy_networks, pol
 
 
 class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
-    """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does."""
+    """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does.
+
+    Attributes:
+        collected: steps of the rollout that the compiled loop has under way.
+    """
 
     _training: PolicyTraining | None
+    _own = (*CompiledNetworks._own, "collected")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.collected = 0
+        super().__init__(*args, **kwargs)
 
     @property
     def minibatch_size(self) -> int | None:
@@ -33,6 +43,10 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         check_policy_agent(self)
         check_optimizer(self.policy.optimizer)
         policy_networks(self.policy, self._seen_in_python())
+
+    def _schedules(self) -> list[Schedule]:
+        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
+        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
 
     def _compiled_training(self, seen: Any) -> AbstractContextManager[PolicyTraining]:
         return policy_training(self, seen)

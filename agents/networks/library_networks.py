@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,7 +93,10 @@ def _activation(module: nn.Module) -> tuple[int, float]:
     if type(module) not in _ACTIVATIONS:
         raise NotCompilable(f"a network has a layer of {type(module).__name__}")
     kind, parameter = _ACTIVATIONS[type(module)]
-    return kind, 0.0 if parameter is None else float(getattr(module, parameter))
+    slope = 0.0 if parameter is None else float(getattr(module, parameter))
+    if slope < 0:
+        raise NotCompilable(f"a network has a layer of {type(module).__name__} that falls")
+    return kind, slope
 
 
 def check_optimizer(optimizer: th.optim.Optimizer) -> None:
@@ -104,11 +108,16 @@ def check_optimizer(optimizer: th.optim.Optimizer) -> None:
     kind = type(optimizer)
     if kind not in {th.optim.Adam, th.optim.RMSprop, RMSpropTFLike}:
         raise NotCompilable(f"its optimizer is {kind.__name__}, not Adam or RMSprop")
-    for name, plain in _PLAIN.items():
-        if optimizer.defaults.get(name, plain) != plain:
-            raise NotCompilable(f"its optimizer has {name} {optimizer.defaults[name]}")
     if len(optimizer.param_groups) != 1:
         raise NotCompilable("its optimizer has several groups of parameters")
+    group = optimizer.param_groups[0]
+    for name, plain in _PLAIN.items():
+        if group.get(name, plain) != plain:
+            raise NotCompilable(f"its optimizer has {name} {group[name]}")
+    if not all(parameter.requires_grad for parameter in group["params"]):
+        raise NotCompilable("some of its parameters are frozen")
+    if any(parameter.dtype is not th.float32 for parameter in group["params"]):
+        raise NotCompilable("its parameters are not in single precision")
 
 
 class FlatTensors:
@@ -176,14 +185,15 @@ def shared_optimizer(
             empty = 1.0 if kind == RMSPROP_TENSORFLOW else 0.0
             place.copy_(known[parameter][name]) if begun else place.fill_(empty)
             known[parameter][name] = place
+    tell_steps(optimizer, first.linears, n_steps)
     mean_square = vectors[names[-1]].vector
-    defaults = optimizer.defaults
-    momentum, smoothing = defaults.get("betas", (0.0, defaults.get("alpha", 0.0)))
+    group = optimizer.param_groups[0]
+    momentum, smoothing = group.get("betas", (0.0, group.get("alpha", 0.0)))
     shared = Optimizer(
         kind,
         float(momentum),
         float(smoothing),
-        float(defaults["eps"]),
+        float(group["eps"]),
         vectors[names[0]].vector,
         mean_square,
         n_steps,
@@ -207,6 +217,17 @@ def tell_steps(optimizer: th.optim.Optimizer, linears: Sequence[nn.Linear], n_st
             counts = int(n_steps[0])
             own = type(optimizer) is RMSpropTFLike
             known[parameter]["step"] = counts if own else th.tensor(float(counts))
+
+
+def with_own_memory(state: Any) -> Any:
+    """A copy of what a ``state_dict`` holds, where its tensors are parts of something larger."""
+    if isinstance(state, dict):
+        copied = copy(state)
+        copied.update({name: with_own_memory(value) for name, value in state.items()})
+        return copied
+    if isinstance(state, th.Tensor) and state.untyped_storage().nbytes() > state.nbytes:
+        return state.clone(memory_format=th.contiguous_format)
+    return state
 
 
 def _own_memory(known: Any, parameter: th.Tensor, names: Iterable[str]) -> None:

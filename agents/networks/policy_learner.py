@@ -153,7 +153,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     """Learn from the whole rollout as often as there are epochs.
 
     Args:
-        learner: with the values of what the rollout ends with.
+        learner: with the advantages of the rollout.
         remaining: share of the training that is left.
         learning_rate: of the optimizer.
 
@@ -161,7 +161,6 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
         The number of minibatches.
     """
     place, rules = learner.place[0], learner.rules[0]
-    estimate_advantages(learner)
     place.step = 0
     place.n_rollouts += 1
     clip_range = schedule_value(rules.clip_range, remaining)
@@ -182,8 +181,8 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     return n_batches
 
 
-@called
-def estimate_advantages(learner: Any) -> None:
+@kernel
+def estimate_advantages(learner: Any, _: float, __: float) -> int:
     """Generalised advantage estimation (Schulman et al., 2016), from the last step backwards."""
     rollout, rules = learner.rollout, learner.rules[0]
     n_steps, n_envs = rollout.rewards.shape
@@ -197,6 +196,7 @@ def estimate_advantages(learner: Any) -> None:
             rollout.advantages[step, i] = np.float32(advantage)
             rollout.returns[step, i] = np.float32(advantage + value)
             next_value, goes_on = value, 1.0 - rollout.episode_starts[step, i]
+    return 0
 
 
 @inlined
@@ -260,6 +260,7 @@ class PolicyAgent(NamedTuple):
         seen: how observations are read, of `agents.networks.observations`.
         choose: the address of `choose_randomly`.
         evaluate: that of `evaluate`.
+        estimate: that of `estimate_advantages`.
         train: that of `train`.
     """
 
@@ -267,6 +268,7 @@ class PolicyAgent(NamedTuple):
     seen: Any
     choose: np.uintp
     evaluate: np.uintp
+    estimate: np.uintp
     train: np.uintp
 
     @inlined
@@ -288,6 +290,7 @@ class PolicyAgent(NamedTuple):
         if learner.place[0].step == len(learner.rollout.rewards):
             for i in range(len(envs)):
                 learner.last_values[i] = np.float32(value_at(self, envs[i], BEFORE))
+            call(self.estimate, learner, 0.0, 0.0)
             call(self.train, learner, progress.remaining, progress.learning_rate)
 
 
@@ -309,11 +312,12 @@ def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
     rollout.values[step, i] = np.float32(env.value)
     rollout.log_probs[step, i] = np.float32(env.log_probability)
     rollout.episode_starts[step, i] = learner.starts[i]
-    reward = env.reward
+    reward = np.float32(env.reward)
     if env.done and not env.terminated:
         # The episode was cut off: what would have come is a part of the reward.
-        reward += learner.rules[0].gamma * value_at(agent, env, AFTER)
-    rollout.rewards[step, i] = np.float32(reward)
+        gamma = np.float32(learner.rules[0].gamma)
+        reward += gamma * np.float32(value_at(agent, env, AFTER))
+    rollout.rewards[step, i] = reward
     learner.starts[i] = np.float32(env.done)
 
 

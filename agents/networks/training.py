@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.callback_horizons import NEVER, Horizon
+from agents.compiled.generators import handles_of
 from agents.networks.library_networks import Network, tell_steps
 from agents.networks.observations import Numbers
 from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs
+from agents.networks.references import Reference
 
 
 class NetworkTraining(ABC):
@@ -25,10 +27,16 @@ class NetworkTraining(ABC):
         optimizer: what moves them.
 
     Attributes:
-        learner: the agent as compiled functions see it.
+        learner: the agent as compiled functions see it, by reference.
+        held: the same itself.
+        shown: observations of environments in Python, shape (n_envs, d).
+        heeds_budgets: whether a number of episodes to train for moves the schedules.
     """
 
-    learner: Any
+    learner: Reference
+    held: Any
+    shown: Any
+    heeds_budgets: ClassVar[bool]
 
     def __init__(
         self, agent: Any, seen: Any, networks: tuple[Network, ...], optimizer: Optimizer
@@ -37,6 +45,8 @@ class NetworkTraining(ABC):
         self.seen = seen
         self.networks = networks
         self.optimizer = optimizer
+        # A handle does not keep it alive.
+        self.generator = agent.rng
 
     @abstractmethod
     def in_loop(self) -> Any:
@@ -45,6 +55,41 @@ class NetworkTraining(ABC):
     @abstractmethod
     def schedules(self) -> dict[str, Schedule]:
         """What compiled code works out after each step, by the names in its record."""
+
+    @abstractmethod
+    def read_settings(self) -> None:
+        """Take over what a callback has changed."""
+        if self.agent.rng is not self.generator:
+            self.generator = self.agent.rng
+            self.held.rng[:] = handles_of([self.generator])
+
+    def show(self, observations: Any) -> None:
+        """Take observations of environments in Python, of as many numbers as there is room for.
+
+        Raises:
+            ValueError: if one lies outside of its space, where no weights are.
+        """
+        self.shown[:] = np.reshape(observations, self.shown.shape)
+        self.check_numbers(self.shown)
+
+    def check_numbers(self, shown: Any) -> None:
+        """Make sure that numbers of states are within their space; anything goes for vectors.
+
+        Raises:
+            ValueError: if they are not.
+        """
+        if isinstance(self.seen, Numbers) and not (shown.min() >= 0 and shown.max() < self.seen.n):
+            wrong = shown[(shown < 0) | (shown >= self.seen.n)][0]
+            raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
+
+    @property
+    @abstractmethod
+    def knows_progress(self) -> bool:
+        """Whether the library would have worked out by now how much of the training remains."""
+
+    @abstractmethod
+    def give_up_rollout(self) -> None:
+        """Forget how much was collected since the last training."""
 
     @abstractmethod
     def read(self) -> None:

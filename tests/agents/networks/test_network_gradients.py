@@ -18,6 +18,7 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from torch import nn
 
 from agents import load_algorithm
+from agents.networks.policy_learner import estimate_advantages
 
 N_ACTIONS = 3
 TOLERANCE = 1e-5
@@ -256,6 +257,7 @@ def train_policy_agents(name, observations, n_envs=2, **kwargs):
     with ours._learning_compiled():
         held = ours._training.held
         held.last_values[:], held.starts[:] = last_values, dones
+        estimate_advantages(ours._training.learner, 0.0, 0.0)
         ours.train()
         slopes = as_library(ours._training.networks, held.gradient, names)
     with pytest.MonkeyPatch.context() as patch:
@@ -359,6 +361,7 @@ def test_a2c_after_100_updates(optimizer, normalize, observations):
         with ours._learning_compiled():
             held = ours._training.held
             held.last_values[:], held.starts[:] = last_values, dones
+            estimate_advantages(ours._training.learner, 0.0, 0.0)
             ours.train()
         buffer = theirs.rollout_buffer
         buffer.compute_returns_and_advantage(th.as_tensor(last_values), dones)
