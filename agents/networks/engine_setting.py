@@ -19,7 +19,7 @@ from agents.common.callback_horizons import unknown_callbacks
 from agents.common.setting_checks import check_option
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import compiled_schedule
-from agents.networks.library_networks import with_own_memory
+from agents.networks.library_networks import in_rows
 from agents.networks.matrix_products import one_thread
 from agents.networks.network_engine import NetworkEngine
 from agents.networks.network_worlds import network_world
@@ -160,8 +160,8 @@ class CompiledNetworks(BaseAlgorithm):
         callback.on_training_end()
 
     def get_parameters(self) -> dict[str, dict[str, Any]]:
-        """As the library's, with memory of their own in the middle of a training as well."""
-        return {name: with_own_memory(state) for name, state in super().get_parameters().items()}
+        """As the library's, also in the middle of a training."""
+        return {name: in_rows(state) for name, state in super().get_parameters().items()}
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *self._own]

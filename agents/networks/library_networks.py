@@ -219,15 +219,13 @@ def tell_steps(optimizer: th.optim.Optimizer, linears: Sequence[nn.Linear], n_st
             known[parameter]["step"] = counts if own else th.tensor(float(counts))
 
 
-def with_own_memory(state: Any) -> Any:
-    """A copy of what a ``state_dict`` holds, where its tensors are parts of something larger."""
+def in_rows(state: Any) -> Any:
+    """What a ``state_dict`` holds, with tensors that lie in memory as the library lays them out."""
     if isinstance(state, dict):
         copied = copy(state)
-        copied.update({name: with_own_memory(value) for name, value in state.items()})
+        copied.update({name: in_rows(value) for name, value in state.items()})
         return copied
-    if isinstance(state, th.Tensor) and state.untyped_storage().nbytes() > state.nbytes:
-        return state.clone(memory_format=th.contiguous_format)
-    return state
+    return state.contiguous() if isinstance(state, th.Tensor) else state
 
 
 def _own_memory(known: Any, parameter: th.Tensor, names: Iterable[str]) -> None:

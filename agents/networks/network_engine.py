@@ -72,12 +72,12 @@ class NetworkEngine(CompiledEngine):
 
     def _run_block(self, total_timesteps: int) -> bool:
         self._begin_rollout()
-        learner, progress = self._learner(), self.progress[0]
+        progress = self.progress[0]
         limit = self._steps_allowed(total_timesteps)
         began = time.perf_counter()
         n_steps = run_block(
             self.world,
-            learner,
+            self._learner(),
             self.envs,
             self.handles,
             progress,
@@ -90,10 +90,11 @@ class NetworkEngine(CompiledEngine):
         episodes = Episodes.of(self.log.episodes[: progress["logged_episodes"]])
         if not self._tell(episodes, n_steps):
             # As in the library, the last step is not learnt from, nor what belongs to it.
+            self.training.record()
             self.training.give_up_rollout()
             return False
         self.training.before_last_step(self.log_interval)
-        learn_from_last_step(learner, self.envs, progress)
+        learn_from_last_step(self._learner(), self.envs, progress)
         last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._take_over_counts(1, len(episodes.envs) - last_step)
         self.training.record()
@@ -123,8 +124,7 @@ class NetworkEngine(CompiledEngine):
         self.steps_at_once = max(1, min(int(fitting), 4 * self.steps_at_once))
 
     def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
-        if self.training.knows_progress:
-            self.agent._current_progress_remaining = float(self.progress[0]["remaining"])
+        self.training.take_over_progress(float(self.progress[0]["remaining"]))
         self._take_over_position()
         if n_episodes:
             self.training.count_episodes(n_episodes, self.log_interval)

@@ -24,7 +24,8 @@ from mdp.machine_code import called, inlined, kernel
 # Settings, under the library's names where it has one.
 RULES = np.dtype(
     [
-        ("gamma", np.float64),
+        ("gamma", np.float64),  # for what episodes lose that are cut off
+        ("buffer_gamma", np.float64),  # for advantages, which the library works out in its buffer
         ("gae_lambda", np.float64),
         ("ent_coef", np.float64),
         ("vf_coef", np.float64),
@@ -44,6 +45,7 @@ PLACE = np.dtype(
         ("step", np.int64),  # of the rollout
         ("n_rollouts", np.int64),
         ("n_updates", np.int64),  # epochs, as the library counts them
+        ("remaining", np.float64),  # share of the training that was left at the last one
         ("policy_gradient", np.float64),  # means over the last training
         ("value", np.float64),
         ("entropy", np.float64),
@@ -161,7 +163,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
         The number of minibatches.
     """
     place, rules = learner.place[0], learner.rules[0]
-    place.step = 0
+    place.step, place.remaining = 0, remaining
     place.n_rollouts += 1
     clip_range = schedule_value(rules.clip_range, remaining)
     clip_range_vf = schedule_value(rules.clip_range_vf, remaining)
@@ -186,13 +188,14 @@ def estimate_advantages(learner: Any, _: float, __: float) -> int:
     """Generalised advantage estimation (Schulman et al., 2016), from the last step backwards."""
     rollout, rules = learner.rollout, learner.rules[0]
     n_steps, n_envs = rollout.rewards.shape
+    gamma = rules.buffer_gamma
     for i in range(n_envs):
         advantage, next_value = 0.0, float(learner.last_values[i])
         goes_on = 1.0 - learner.starts[i]
         for step in range(n_steps - 1, -1, -1):
             value = float(rollout.values[step, i])
-            error = rollout.rewards[step, i] + rules.gamma * next_value * goes_on - value
-            advantage = error + rules.gamma * rules.gae_lambda * goes_on * advantage
+            error = rollout.rewards[step, i] + gamma * next_value * goes_on - value
+            advantage = error + gamma * rules.gae_lambda * goes_on * advantage
             rollout.advantages[step, i] = np.float32(advantage)
             rollout.returns[step, i] = np.float32(advantage + value)
             next_value, goes_on = value, 1.0 - rollout.episode_starts[step, i]

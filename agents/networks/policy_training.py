@@ -145,7 +145,8 @@ class PolicyTraining(NetworkTraining):
         return record_of(
             RULES,
             gamma=agent.gamma,
-            gae_lambda=agent.gae_lambda,
+            buffer_gamma=agent.rollout_buffer.gamma,
+            gae_lambda=agent.rollout_buffer.gae_lambda,
             ent_coef=agent.ent_coef,
             vf_coef=agent.vf_coef,
             max_grad_norm=agent.max_grad_norm,
@@ -191,17 +192,17 @@ class PolicyTraining(NetworkTraining):
     def schedules(self) -> dict[str, Schedule]:
         return {"learning_rate": self.agent.lr_schedule}
 
-    @property
-    def knows_progress(self) -> bool:
-        """At the end of a rollout."""
-        return bool(self.place["step"][0] == 0)
+    def take_over_progress(self, remaining: float) -> None:
+        """That of the end of the last rollout."""
+        self.agent._current_progress_remaining = float(self.place["remaining"][0])
 
     def give_up_rollout(self) -> None:
-        self.place["step"] = 0
+        self.place["step"] = self.place["n_rollouts"] = 0
 
     def read(self) -> None:
         agent, place = self.agent, self.place
         place["step"] = agent.collected
+        place["remaining"] = agent._current_progress_remaining
         place["n_updates"] = agent._n_updates
         self.held.starts[:] = agent._last_episode_starts
 
@@ -251,12 +252,12 @@ class PolicyTraining(NetworkTraining):
         agent, held, buffer = self.agent, self.held, self.agent.rollout_buffer
         agent.collected = 0
         self.read()
-        super().read_settings()
         actions = np.zeros(env.num_envs, np.int64)
         buffer.pos, buffer.full = 0, False
         callback.on_rollout_start()
         for step in range(agent.n_steps):
             self.place["step"] = step
+            super().read_settings()
             self.show(agent._last_obs)
             act_on_rows(self.learner, self.shown, actions)
             new_obs, rewards, dones, infos = env.step(actions.copy())

@@ -75,7 +75,6 @@ class QTraining(NetworkTraining):
     """
 
     heeds_budgets = True
-    knows_progress = True
 
     def __init__(
         self,
@@ -165,6 +164,9 @@ class QTraining(NetworkTraining):
     def read_settings(self) -> None:
         super().read_settings()
         self.held.rules[:] = self._rules()
+
+    def take_over_progress(self, remaining: float) -> None:
+        self.agent._current_progress_remaining = remaining
 
     def give_up_rollout(self) -> None:
         self.place["collected"] = self.place["collected_episodes"] = 0

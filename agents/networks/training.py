@@ -82,10 +82,9 @@ class NetworkTraining(ABC):
             wrong = shown[(shown < 0) | (shown >= self.seen.n)][0]
             raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
 
-    @property
     @abstractmethod
-    def knows_progress(self) -> bool:
-        """Whether the library would have worked out by now how much of the training remains."""
+    def take_over_progress(self, remaining: float) -> None:
+        """Let the agent know how much of the training remains, at the moments when it finds out."""
 
     @abstractmethod
     def give_up_rollout(self) -> None:
