@@ -18,6 +18,7 @@ from agents.networks.coverage import check_policy_agent
 from agents.networks.engine_setting import CompiledNetworks
 from agents.networks.library_networks import check_optimizer
 from agents.networks.policy_training import PolicyTraining, policy_networks, policy_training
+from agents.networks.python_rollouts import collect_rollout
 
 
 class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
@@ -61,7 +62,7 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         """Fill the rollout buffer; False once a callback asks to stop."""
         if self._training is None:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-        return self._training.collect(env, callback)
+        return collect_rollout(self._training, env, callback)
 
     def train(self) -> None:
         """Learn from the rollout buffer."""

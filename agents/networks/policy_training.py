@@ -8,11 +8,8 @@ from itertools import chain
 from typing import Any
 
 import numpy as np
-import torch as th
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
-from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.common.schedules import ScheduleRow
@@ -33,18 +30,14 @@ from agents.networks.policy_learner import (
     RULES,
     PolicyAgent,
     PolicyLearner,
-    Rollout,
-    act_on_rows,
     choose_randomly,
-    estimate_advantages,
     evaluate,
-    evaluate_rows,
     train,
 )
 from agents.networks.policy_updates import LOSSES, RolloutMinibatch
 from agents.networks.references import Reference, address_of
+from agents.networks.rollouts import Rollout, estimate_advantages
 from agents.networks.training import NetworkTraining, record_of, room_for_rows, row_of
-from mdp.array_types import Bools
 
 # How far a number may move that nothing bounds.
 UNBOUNDED = 1e30
@@ -164,7 +157,7 @@ class PolicyTraining(NetworkTraining):
         return _bound(FloatSchedule(schedule(self.agent._current_progress_remaining)))
 
     def read_settings(self) -> None:
-        super().read_settings()
+        self.read_generator()
         self.held.rules[:] = self._rules(_bound)
 
     def _rollout(self) -> Rollout:
@@ -242,68 +235,6 @@ class PolicyTraining(NetworkTraining):
         ends = self.place["step"][0] == self.agent.n_steps - 1
         if ends and log_interval is not None and iteration % log_interval == 0:
             self.agent.dump_logs(iteration)
-
-    def collect(self, env: VecEnv, callback: BaseCallback) -> bool:
-        """Fill the rollout buffer from environments in Python, in the library's order of events.
-
-        Returns:
-            False once a callback asks to stop.
-        """
-        agent, held, buffer = self.agent, self.held, self.agent.rollout_buffer
-        agent.collected = 0
-        self.read()
-        actions = np.zeros(env.num_envs, np.int64)
-        buffer.pos, buffer.full = 0, False
-        callback.on_rollout_start()
-        for step in range(agent.n_steps):
-            self.place["step"] = step
-            super().read_settings()
-            self.show(agent._last_obs)
-            act_on_rows(self.learner, self.shown, actions)
-            new_obs, rewards, dones, infos = env.step(actions.copy())
-            agent.num_timesteps += env.num_envs
-            callback.update_locals(
-                {
-                    "self": agent,
-                    "env": env,
-                    "rollout_buffer": buffer,
-                    "n_steps": step,
-                    "actions": actions,
-                    "values": th.tensor(held.rollout.values[step, :, np.newaxis]),
-                    "log_probs": th.tensor(held.rollout.log_probs[step]),
-                    "new_obs": new_obs,
-                    "rewards": rewards,
-                    "dones": dones,
-                    "infos": infos,
-                }
-            )
-            if not callback.on_step():
-                return False
-            agent._update_info_buffer(infos, dones)
-            held.rollout.rewards[step] = rewards + self._cut_off(dones, infos)
-            agent._last_obs, agent._last_episode_starts, held.starts[:] = new_obs, dones, dones
-            buffer.pos = step + 1
-        buffer.full = True
-        self._finish_rollout()
-        callback.on_rollout_end()
-        return True
-
-    def _finish_rollout(self) -> None:
-        self.show(self.agent._last_obs)
-        evaluate_rows(self.learner, self.shown, self.held.last_values)
-        estimate_advantages(self.learner, 0.0, 0.0)
-
-    def _cut_off(self, dones: Bools, infos: list[dict[str, Any]]) -> Singles:
-        """What would have come after episodes that ran out of time, shape (E,)."""
-        lost = np.zeros(len(dones), np.float32)
-        values = np.zeros(1, np.float32)
-        for i in np.flatnonzero(dones):
-            if infos[i].get("TimeLimit.truncated", False):
-                self.shown[:1] = np.reshape(infos[i]["terminal_observation"], (1, -1))
-                self.check_numbers(self.shown[:1])
-                evaluate_rows(self.learner, self.shown[:1], values)
-                lost[i] = np.float32(self.agent.gamma) * values[0]
-        return lost
 
     def train(self) -> None:
         """Learn from the rollout, where environments are Python's."""

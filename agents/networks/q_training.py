@@ -162,7 +162,7 @@ class QTraining(NetworkTraining):
         }
 
     def read_settings(self) -> None:
-        super().read_settings()
+        self.read_generator()
         self.held.rules[:] = self._rules()
 
     def take_over_progress(self, remaining: float) -> None:
@@ -211,7 +211,7 @@ class QTraining(NetworkTraining):
     def act(self, learning_starts: int) -> Ints:
         """Actions for the agent's present observations, where environments are Python's."""
         self.read()
-        super().read_settings()
+        self.read_generator()
         self.held.rules["learning_starts"] = learning_starts
         self.show(self.agent._last_obs)
         actions = np.zeros(len(self.shown), np.int64)

@@ -10,8 +10,10 @@ lies behind an address as well, so that it is compiled by itself, and once for a
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 from typing import Any, NamedTuple
 
+import numba
 import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
@@ -55,6 +57,11 @@ class Reference:
         self.held = held
         self._words = np.array(list(_words(held)), dtype=np.int64)
         self.address = int(self._words.ctypes.data)
+
+    @cached_property
+    def kind(self) -> ReferenceType:
+        """Its type, which takes longer to find out than most functions that are called with it."""
+        return ReferenceType(numba.typeof(self.held))
 
 
 def _words(value: Any) -> Iterator[int]:
@@ -101,7 +108,7 @@ class ReferenceType(types.Type):
 
 @typeof_impl.register(Reference)
 def _type_of(value: Reference, context: Any) -> ReferenceType:
-    return ReferenceType(typeof_impl(value.held, context))
+    return value.kind
 
 
 register_model(ReferenceType)(models.OpaqueModel)
@@ -143,7 +150,7 @@ def address_of(function: Any, reference: Reference) -> np.uintp:
         function: of a reference and two floating-point numbers, with a whole number as its result.
         reference: what it is to be called with.
     """
-    arguments = _type_of(reference, None), types.float64, types.float64
+    arguments = reference.kind, types.float64, types.float64
     code = function.get_compile_result(types.int64(*arguments))
     name = code.fndesc.llvm_cfunc_wrapper_name
     return np.uintp(code.library.get_pointer_to_function(name))

@@ -59,6 +59,9 @@ class NetworkTraining(ABC):
     @abstractmethod
     def read_settings(self) -> None:
         """Take over what a callback has changed."""
+
+    def read_generator(self) -> None:
+        """Draw from the agent's generator, which a callback may have replaced."""
         if self.agent.rng is not self.generator:
             self.generator = self.agent.rng
             self.held.rng[:] = handles_of([self.generator])
