@@ -33,6 +33,7 @@ from mdp.machine_code import internal
 
 # Numba ships no types.
 _typed_unbox: Any = unbox
+_typeof: Any = numba.typeof
 _typed_getattr: Any = lower_getattr_generic
 
 # All that is in a tuple is made of these.
@@ -61,7 +62,7 @@ class Reference:
     @cached_property
     def kind(self) -> ReferenceType:
         """Its type, which takes longer to find out than most functions that are called with it."""
-        return ReferenceType(numba.typeof(self.held))
+        return ReferenceType(_typeof(self.held))
 
 
 def _words(value: Any) -> Iterator[int]:
