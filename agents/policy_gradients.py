@@ -11,6 +11,7 @@ import stable_baselines3
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.signatures import full_signature
@@ -18,13 +19,23 @@ from agents.networks.coverage import check_policy_agent
 from agents.networks.engine_setting import CompiledNetworks
 from agents.networks.library_networks import check_optimizer
 from agents.networks.policy_training import PolicyTraining, policy_networks, policy_training
+from agents.networks.python_rollouts import collect_rollout
 
 
 class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
-    """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does."""
+    """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does.
+
+    Attributes:
+        collected: steps of the rollout that the compiled loop has under way.
+    """
 
     _training: PolicyTraining | None
     _shared_training: Callable[[], PolicyTraining]
+    _own = (*CompiledNetworks._own, "collected")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.collected = 0
+        super().__init__(*args, **kwargs)
 
     @property
     def minibatch_size(self) -> int | None:
@@ -35,6 +46,10 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         check_policy_agent(self)
         check_optimizer(self.policy.optimizer)
         policy_networks(self.policy, self._seen_in_python())
+
+    def _schedules(self) -> list[Schedule]:
+        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
+        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
 
     def _compiled_training(self, seen: Any) -> AbstractContextManager[PolicyTraining]:
         return policy_training(self, seen)
@@ -49,8 +64,9 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         """Fill the rollout buffer; False once a callback asks to stop."""
         if self._sharing is None:
             return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        rollout_buffer.pos, rollout_buffer.full = 0, False
         callback.on_rollout_start()
-        return self._shared_training().collect(env, callback)
+        return collect_rollout(self._shared_training(), env, callback)
 
     def train(self) -> None:
         """Learn from the rollout buffer."""

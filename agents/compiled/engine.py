@@ -38,7 +38,12 @@ class CompiledEngine:
         world: the compiled counterpart of its environments.
         callback: what is told of the steps.
         log_interval: episodes between two log records, or None.
+
+    Attributes:
+        counts_where_stopped: whether statistics hear of a step on which a callback ends training.
     """
+
+    counts_where_stopped = True
 
     def __init__(
         self, agent: Any, world: World, callback: BaseCallback, log_interval: int | None
@@ -151,7 +156,8 @@ class CompiledEngine:
         pass_over(self.callback, n_steps - 1, earlier)
         self.callback.update_locals(self._last_step(episodes, earlier, times))
         keep_going = self.callback.on_step()
-        self._update_statistics(episodes, earlier, len(episodes.envs), times)
+        if keep_going or self.counts_where_stopped:
+            self._update_statistics(episodes, earlier, len(episodes.envs), times)
         return keep_going
 
     def _update_statistics(

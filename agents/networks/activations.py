@@ -42,7 +42,9 @@ _ZERO, _ONE = np.float32(0), np.float32(1)
 @internal
 def tanh(x: Any) -> Any:
     """The hyperbolic tangent of a single-precision number."""
-    x = min(max(x, -_BOUND), _BOUND)
+    # What is not a number stays that.
+    x = _BOUND if x > _BOUND else x
+    x = -_BOUND if x < -_BOUND else x
     square = x * x
     top, bottom = _NUMERATOR[0], _DENOMINATOR[0]
     for coefficient in _NUMERATOR[1:]:
@@ -59,7 +61,8 @@ def activate(rows: Singles, bias: Singles, kind: int, slope: Any) -> None:
         row = rows[i]
         if kind == RELU:
             for j in range(len(row)):
-                row[j] = max(row[j] + bias[j], _ZERO)
+                x = row[j] + bias[j]
+                row[j] = _ZERO if x < _ZERO else x
         elif kind == TANH:
             for j in range(len(row)):
                 row[j] = tanh(row[j] + bias[j])

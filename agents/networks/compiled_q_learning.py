@@ -8,7 +8,9 @@ from typing import Any, ClassVar, Literal
 
 import stable_baselines3
 from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.type_aliases import Schedule
 
 from agents.networks.coverage import check_q_agent
 from agents.networks.engine_setting import CompiledNetworks
@@ -42,6 +44,9 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
         check_optimizer(self.policy.optimizer)
         q_network(self.q_net, self._seen_in_python())
 
+    def _schedules(self) -> list[Schedule]:
+        return [*super()._schedules(), self.exploration_schedule]
+
     def _compiled_training(self, seen: Any) -> AbstractContextManager[QTraining]:
         return q_training(self, seen)
 
@@ -50,8 +55,13 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
     ) -> tuple[NDArray[Any], NDArray[Any]]:
         if self._sharing is None:
             return super()._sample_action(learning_starts, action_noise, n_envs)
-        actions = self._shared_training().act()
+        actions = self._shared_training().act(learning_starts)
         return actions, actions
+
+    def _store_transition(self, replay_buffer: ReplayBuffer, *step: Any) -> None:
+        super()._store_transition(replay_buffer, *step)
+        if self._training is not None:
+            self._training.check_numbers(replay_buffer.next_observations[replay_buffer.pos - 1])
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""

@@ -10,6 +10,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer, Ro
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.dqn.policies import DQNPolicy
 
 from agents.compiled.compile_envs import NotCompilable
@@ -38,6 +39,9 @@ def _check_spaces(agent: Any) -> None:
     actions, observations = agent.action_space, agent.observation_space
     if not isinstance(actions, spaces.Discrete):
         raise NotCompilable(f"actions are {type(actions).__name__}, not Discrete")
+    for space in (actions, observations):
+        if isinstance(space, spaces.Discrete) and space.start != 0:
+            raise NotCompilable(f"{space} does not begin with 0")
     if isinstance(observations, spaces.Discrete):
         return
     if not isinstance(observations, spaces.Box):
@@ -58,6 +62,8 @@ def check_q_agent(agent: Any) -> None:
     buffer = agent.replay_buffer
     if type(buffer) not in {ReplayBuffer, NStepReplayBuffer} or buffer.optimize_memory_usage:
         raise NotCompilable("its replay buffer is of another kind")
+    if agent.n_envs > 1 and agent.train_freq.unit == TrainFrequencyUnit.EPISODE:
+        raise NotCompilable("train_freq counts the episodes of several environments")
     if agent.get_vec_normalize_env() is not None:
         raise NotCompilable("VecNormalize keeps what is not normalised in the replay buffer")
 

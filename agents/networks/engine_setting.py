@@ -13,11 +13,13 @@ from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.callback_horizons import unknown_callbacks
 from agents.common.setting_checks import check_option
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import compiled_schedule
+from agents.networks.library_networks import in_rows
 from agents.networks.matrix_products import one_thread
 from agents.networks.network_engine import NetworkEngine
 from agents.networks.network_worlds import network_world
@@ -67,6 +69,10 @@ class CompiledNetworks(BaseAlgorithm):
     @abstractmethod
     def _compiled_training(self, seen: Any) -> AbstractContextManager[NetworkTraining]:
         """Let the agent and compiled code share memory for a while."""
+
+    def _schedules(self) -> list[Schedule]:
+        """What a training in the compiled loop works out by itself."""
+        return [self.lr_schedule]
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
         """Train as the library's ``learn`` does, on the engine that was asked for."""
@@ -135,7 +141,8 @@ class CompiledNetworks(BaseAlgorithm):
             unknown = unknown_callbacks(callback) if known else ["a function"]
             if unknown:
                 raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
-        compiled_schedule(self.lr_schedule)
+        for schedule in self._schedules():
+            compiled_schedule(schedule)
         assert self.env is not None
         return network_world(self.env)
 
@@ -166,6 +173,10 @@ class CompiledNetworks(BaseAlgorithm):
             with one_thread(), self._compiled_training(seen) as training:
                 NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
         callback.on_training_end()
+
+    def get_parameters(self) -> dict[str, dict[str, Any]]:
+        """As the library's, also in the middle of a training."""
+        return {name: in_rows(state) for name, state in super().get_parameters().items()}
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *self._own]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -92,7 +93,10 @@ def _activation(module: nn.Module) -> tuple[int, float]:
     if type(module) not in _ACTIVATIONS:
         raise NotCompilable(f"a network has a layer of {type(module).__name__}")
     kind, parameter = _ACTIVATIONS[type(module)]
-    return kind, 0.0 if parameter is None else float(getattr(module, parameter))
+    slope = 0.0 if parameter is None else float(getattr(module, parameter))
+    if slope < 0:
+        raise NotCompilable(f"a network has a layer of {type(module).__name__} that falls")
+    return kind, slope
 
 
 def check_optimizer(optimizer: th.optim.Optimizer) -> None:
@@ -104,11 +108,16 @@ def check_optimizer(optimizer: th.optim.Optimizer) -> None:
     kind = type(optimizer)
     if kind not in {th.optim.Adam, th.optim.RMSprop, RMSpropTFLike}:
         raise NotCompilable(f"its optimizer is {kind.__name__}, not Adam or RMSprop")
-    for name, plain in _PLAIN.items():
-        if optimizer.defaults.get(name, plain) != plain:
-            raise NotCompilable(f"its optimizer has {name} {optimizer.defaults[name]}")
     if len(optimizer.param_groups) != 1:
         raise NotCompilable("its optimizer has several groups of parameters")
+    group = optimizer.param_groups[0]
+    for name, plain in _PLAIN.items():
+        if group.get(name, plain) != plain:
+            raise NotCompilable(f"its optimizer has {name} {group[name]}")
+    if not all(parameter.requires_grad for parameter in group["params"]):
+        raise NotCompilable("some of its parameters are frozen")
+    if any(parameter.dtype is not th.float32 for parameter in group["params"]):
+        raise NotCompilable("its parameters are not in single precision")
 
 
 class FlatTensors:
@@ -178,8 +187,9 @@ def shared_optimizer(
     for parameter in parameters:
         known[parameter]["step"] = th.from_numpy(n_steps)[0]
     vectors = [tensors.vector for tensors in means.values()]
-    momentum, smoothing = optimizer.defaults.get("betas", (0.0, optimizer.defaults.get("alpha")))
-    epsilon = optimizer.defaults["eps"]
+    group = optimizer.param_groups[0]
+    momentum, smoothing = group.get("betas", (0.0, group.get("alpha")))
+    epsilon = group["eps"]
     try:
         yield Optimizer(kind, momentum, smoothing, epsilon, vectors[0], vectors[-1], n_steps)
     finally:
@@ -187,6 +197,15 @@ def shared_optimizer(
             known[parameter] = _own_memory(known[parameter], kind)
         if not n_steps[0]:
             known.clear()
+
+
+def in_rows(state: Any) -> Any:
+    """What a ``state_dict`` holds, with tensors that lie in memory as the library lays them out."""
+    if isinstance(state, dict):
+        copied = copy(state)
+        copied.update({name: in_rows(value) for name, value in state.items()})
+        return copied
+    return state.contiguous() if isinstance(state, th.Tensor) else state
 
 
 def _own_memory(state: dict[str, Any], kind: int) -> dict[str, Any]:

@@ -37,6 +37,8 @@ class NetworkEngine(CompiledEngine):
         log_interval: episodes between two log records, or rollouts, or None.
     """
 
+    counts_where_stopped = False  # as in the library
+
     states: NetworkEnvStates
 
     def __init__(
@@ -50,17 +52,18 @@ class NetworkEngine(CompiledEngine):
         self.steps_at_once = 1
         self.has_begun = False
         self.in_loop = training.in_loop()
+        # Where rollouts are of a fixed length, episodes to train for do not move schedules.
+        self.total_timesteps = training.agent._total_timesteps
         super().__init__(training.agent, world, callback, log_interval)
 
     def _make_states(self) -> NetworkEnvStates:
         return NetworkEnvStates(self.agent.env, self.world, self.training.seen)
 
     def _learner(self) -> Any:
-        """The agent as compiled functions see it, with what the schedules say now."""
-        agent, progress = self.agent, self.progress[0]
+        """The agent as compiled functions see it, also after a callback has changed it."""
         for name, schedule in self.training.schedules().items():
-            progress[f"{name}_schedule"] = compiled_schedule(schedule)
-            progress[name] = schedule(agent._current_progress_remaining)
+            self.progress[0][f"{name}_schedule"] = compiled_schedule(schedule)
+        self.training.read_settings()
         self._take_generators()
         return self.in_loop
 
@@ -70,12 +73,12 @@ class NetworkEngine(CompiledEngine):
 
     def _run_block(self, total_timesteps: int) -> bool:
         self._begin_rollout()
-        learner, progress = self._learner(), self.progress[0]
+        progress = self.progress[0]
         limit = self._steps_allowed(total_timesteps)
         began = time.perf_counter()
         n_steps = run_block(
             self.world,
-            learner,
+            self._learner(),
             self.envs,
             self.handles,
             progress,
@@ -87,9 +90,12 @@ class NetworkEngine(CompiledEngine):
         self._note_speed(n_steps, time.perf_counter() - began)
         episodes = Episodes.of(self.log.episodes[: progress["logged_episodes"]])
         if not self._tell(episodes, n_steps):
-            return False  # as in the library, the last step is not learnt from
+            # As in the library, the last step is not learnt from, nor what belongs to it.
+            self.training.record()
+            self.training.give_up_rollout()
+            return False
         self.training.before_last_step(self.log_interval)
-        learn_from_last_step(learner, self.envs, progress)
+        learn_from_last_step(self._learner(), self.envs, progress)
         last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._take_over_counts(1, len(episodes.envs) - last_step)
         self.training.record()
@@ -122,7 +128,7 @@ class NetworkEngine(CompiledEngine):
         self.steps_at_once = max(1, min(int(fitting), 4 * self.steps_at_once))
 
     def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
-        self.agent._current_progress_remaining = float(self.progress[0]["remaining"])
+        self.training.take_over_progress(float(self.progress[0]["remaining"]))
         self._take_over_position()
         if n_episodes:
             self.training.count_episodes(n_episodes, self.log_interval)
@@ -133,12 +139,14 @@ class NetworkEngine(CompiledEngine):
 
     def _read(self) -> None:
         agent, progress = self.agent, self.progress[0]
-        for budget in members(self.callback):
-            if isinstance(budget, EpisodeBudget):
-                progress["episode_budget"] = budget.n_episodes
-                progress["budget_episodes"] = budget.episodes_seen
         progress["num_timesteps"] = agent.num_timesteps
-        progress["total_timesteps"] = agent._total_timesteps
+        progress["total_timesteps"] = self.total_timesteps
+        if self.training.heeds_budgets:
+            progress["total_timesteps"] = agent._total_timesteps
+            for budget in members(self.callback):
+                if isinstance(budget, EpisodeBudget):
+                    progress["episode_budget"] = budget.n_episodes
+                    progress["budget_episodes"] = budget.episodes_seen
         progress["remaining"] = agent._current_progress_remaining
         self.training.read()
         self.states.read()

@@ -122,4 +122,12 @@ class NetworkEnvStates(EnvStates):
         elif isinstance(self.seen, OwnVectors):
             self.records["vector"] = last_obs
         else:
-            self.records["obs"] = self.records["state"]
+            for record, shown in zip(self.records, last_obs, strict=True):
+                record["obs"] = self._state_of(shown.ravel(), int(record["state"]))
+
+    def _state_of(self, shown: Any, state: int) -> int:
+        """The state that looks like that: the present one, or one that the agent has stayed at."""
+        table = self.seen.table
+        if np.array_equal(table[state], shown):
+            return state
+        return int(np.argmax((table == shown).all(axis=1)))

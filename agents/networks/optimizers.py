@@ -17,7 +17,7 @@ from mdp.machine_code import vectorised
 ADAM, RMSPROP, RMSPROP_TENSORFLOW = range(3)
 
 # Moments of units that are dead would come so close to zero that processors take a hundred cycles
-# for each operation on them. What lies below counts as zero.
+# for each operation on them. What lies below counts as zero; what is not a number stays that.
 _TINY, _TINY_SQUARE = np.float32(1e-17), np.float32(1e-36)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
@@ -67,7 +67,8 @@ def _clipping(gradient: Singles, max_grad_norm: float) -> Any:
     total = _ZERO
     for i in range(len(gradient)):
         total += gradient[i] * gradient[i]
-    return np.float32(min(max_grad_norm / (math.sqrt(total) + 1e-6), 1.0))
+    scale = max_grad_norm / (math.sqrt(total) + 1e-6)
+    return _ONE if scale >= 1.0 else np.float32(scale)
 
 
 @vectorised
@@ -83,11 +84,11 @@ def _adam(
     mean, mean_square = optimizer.mean, optimizer.mean_square
     for i in range(len(flat)):
         slope = gradient[i] * scale
-        slope = slope if abs(slope) > _TINY else _ZERO
+        slope = _ZERO if abs(slope) <= _TINY else slope
         first = mean[i] + (slope - mean[i]) * rate
-        first = first if abs(first) > _TINY else _ZERO
+        first = _ZERO if abs(first) <= _TINY else first
         second = mean_square[i] * kept + slope * slope * square_rate
-        second = second if second > _TINY_SQUARE else _ZERO
+        second = _ZERO if second <= _TINY_SQUARE else second
         mean[i], mean_square[i] = first, second
         flat[i] -= step_size * first / (np.sqrt(second) * correction + epsilon)
 
@@ -103,8 +104,8 @@ def _rmsprop(
     mean_square = optimizer.mean_square
     for i in range(len(flat)):
         slope = gradient[i] * scale
-        slope = slope if abs(slope) > _TINY else _ZERO
+        slope = _ZERO if abs(slope) <= _TINY else slope
         second = mean_square[i] * kept + slope * slope * square_rate
-        second = second if second > _TINY_SQUARE else _ZERO
+        second = _ZERO if second <= _TINY_SQUARE else second
         mean_square[i] = second
         flat[i] -= step_size * slope / (np.sqrt(second + inside) + outside)

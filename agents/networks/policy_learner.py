@@ -17,14 +17,15 @@ from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.policy_updates import RolloutMinibatch, learn_from_rollout_minibatch
 from agents.networks.references import call
-from agents.networks.replay import show
+from agents.networks.rollouts import Rollout, pick_steps, shuffle
 from mdp.array_types import Ints
-from mdp.machine_code import called, inlined, kernel
+from mdp.machine_code import inlined, kernel
 
 # Settings, under the library's names where it has one.
 RULES = np.dtype(
     [
-        ("gamma", np.float64),
+        ("gamma", np.float64),  # for what episodes lose that are cut off
+        ("buffer_gamma", np.float64),  # for advantages, which the library works out in its buffer
         ("gae_lambda", np.float64),
         ("ent_coef", np.float64),
         ("vf_coef", np.float64),
@@ -44,41 +45,17 @@ PLACE = np.dtype(
         ("step", np.int64),  # of the rollout
         ("n_rollouts", np.int64),
         ("n_updates", np.int64),  # epochs, as the library counts them
+        ("remaining", np.float64),  # share of the training that was left at the last one
         ("policy_gradient", np.float64),  # means over the last training
         ("value", np.float64),
         ("entropy", np.float64),
         ("clipped", np.float64),
         ("kl", np.float64),  # over its last epoch
-        ("learning_rate", np.float64),
         ("expected", np.float64),  # value of the observation that was looked at last
         ("log_probability", np.float64),  # of the action that was drawn last
     ],
     align=True,
 )
-
-
-class Rollout(NamedTuple):
-    """The library's rollout buffer: T steps of E environments.
-
-    Attributes:
-        observations: shape (T, E, d); numbers of states have d = 1.
-        actions: shape (T, E, 1).
-        rewards: shape (T, E).
-        episode_starts: 1 where an episode began with the observation, shape (T, E).
-        values: of the observations, shape (T, E).
-        log_probs: of the actions, shape (T, E).
-        advantages: shape (T, E).
-        returns: what the values are to be, shape (T, E).
-    """
-
-    observations: Singles
-    actions: Singles
-    rewards: Singles
-    episode_starts: Singles
-    values: Singles
-    log_probs: Singles
-    advantages: Singles
-    returns: Singles
 
 
 class PolicyLearner(NamedTuple):
@@ -154,7 +131,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     """Learn from the whole rollout as often as there are epochs.
 
     Args:
-        learner: with the values of what the rollout ends with.
+        learner: with the advantages of the rollout.
         remaining: share of the training that is left.
         learning_rate: of the optimizer.
 
@@ -162,10 +139,8 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
         The number of minibatches.
     """
     place, rules = learner.place[0], learner.rules[0]
-    estimate_advantages(learner)
-    place.step = 0
+    place.step, place.remaining = 0, remaining
     place.n_rollouts += 1
-    place.learning_rate = learning_rate
     clip_range = schedule_value(rules.clip_range, remaining)
     clip_range_vf = schedule_value(rules.clip_range_vf, remaining)
     place.policy_gradient = place.value = place.entropy = place.clipped = 0.0
@@ -182,33 +157,6 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     place.entropy /= n_batches
     place.clipped /= n_batches
     return n_batches
-
-
-@called
-def estimate_advantages(learner: Any) -> None:
-    """Generalised advantage estimation (Schulman et al., 2016), from the last step backwards."""
-    rollout, rules = learner.rollout, learner.rules[0]
-    n_steps, n_envs = rollout.rewards.shape
-    for i in range(n_envs):
-        advantage, next_value = 0.0, float(learner.last_values[i])
-        goes_on = 1.0 - learner.starts[i]
-        for step in range(n_steps - 1, -1, -1):
-            value = float(rollout.values[step, i])
-            error = rollout.rewards[step, i] + rules.gamma * next_value * goes_on - value
-            advantage = error + rules.gamma * rules.gae_lambda * goes_on * advantage
-            rollout.advantages[step, i] = np.float32(advantage)
-            rollout.returns[step, i] = np.float32(advantage + value)
-            next_value, goes_on = value, 1.0 - rollout.episode_starts[step, i]
-
-
-@inlined
-def shuffle(numbers: Ints, handle: Any) -> None:
-    """Put 0, 1, ... into a random order (Fisher and Yates)."""
-    for i in range(len(numbers)):
-        numbers[i] = i
-    for i in range(len(numbers) - 1, 0, -1):
-        j = int(next_uniform(handle) * (i + 1))
-        numbers[i], numbers[j] = numbers[j], numbers[i]
 
 
 @inlined
@@ -239,21 +187,6 @@ def learn_for_an_epoch(
     return n_batches, goes_on
 
 
-@called
-def pick_steps(learner: Any, numbers: Ints) -> None:
-    """Copy these steps of the rollout into the minibatch."""
-    rollout, batch = learner.rollout, learner.batch
-    n_envs = rollout.rewards.shape[1]
-    for k in range(len(numbers)):
-        step, i = numbers[k] // n_envs, numbers[k] % n_envs
-        show(batch.states, k, rollout.observations[step, i], learner.policy.one_hot)
-        batch.actions[k] = int(rollout.actions[step, i, 0])
-        batch.log_probs[k] = rollout.log_probs[step, i]
-        batch.advantages[k] = rollout.advantages[step, i]
-        batch.returns[k] = rollout.returns[step, i]
-        batch.values[k] = rollout.values[step, i]
-
-
 class PolicyAgent(NamedTuple):
     """What the compiled loop asks.
 
@@ -262,6 +195,7 @@ class PolicyAgent(NamedTuple):
         seen: how observations are read, of `agents.networks.observations`.
         choose: the address of `choose_randomly`.
         evaluate: that of `evaluate`.
+        estimate: that of `estimate_advantages`.
         train: that of `train`.
     """
 
@@ -269,6 +203,7 @@ class PolicyAgent(NamedTuple):
     seen: Any
     choose: np.uintp
     evaluate: np.uintp
+    estimate: np.uintp
     train: np.uintp
 
     @inlined
@@ -290,6 +225,7 @@ class PolicyAgent(NamedTuple):
         if learner.place[0].step == len(learner.rollout.rewards):
             for i in range(len(envs)):
                 learner.last_values[i] = np.float32(value_at(self, envs[i], BEFORE))
+            call(self.estimate, learner, 0.0, 0.0)
             call(self.train, learner, progress.remaining, progress.learning_rate)
 
 
@@ -311,11 +247,12 @@ def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
     rollout.values[step, i] = np.float32(env.value)
     rollout.log_probs[step, i] = np.float32(env.log_probability)
     rollout.episode_starts[step, i] = learner.starts[i]
-    reward = env.reward
+    reward = np.float32(env.reward)
     if env.done and not env.terminated:
         # The episode was cut off: what would have come is a part of the reward.
-        reward += learner.rules[0].gamma * value_at(agent, env, AFTER)
-    rollout.rewards[step, i] = np.float32(reward)
+        gamma = np.float32(learner.rules[0].gamma)
+        reward += gamma * np.float32(value_at(agent, env, AFTER))
+    rollout.rewards[step, i] = reward
     learner.starts[i] = np.float32(env.done)
 
 

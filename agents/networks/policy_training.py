@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from itertools import chain
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import explained_variance
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
 
 from agents.common.callback_horizons import NEVER, Horizon
+from agents.common.schedules import ScheduleRow
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.networks.library_networks import (
@@ -31,17 +30,14 @@ from agents.networks.policy_learner import (
     RULES,
     PolicyAgent,
     PolicyLearner,
-    Rollout,
-    act_on_rows,
     choose_randomly,
     evaluate,
-    evaluate_rows,
     train,
 )
 from agents.networks.policy_updates import LOSSES, RolloutMinibatch
 from agents.networks.references import Reference, address_of
+from agents.networks.rollouts import Rollout, estimate_advantages
 from agents.networks.training import NetworkTraining, record_of, room_for_rows, row_of
-from mdp.array_types import Bools
 
 # How far a number may move that nothing bounds.
 UNBOUNDED = 1e30
@@ -88,6 +84,9 @@ class PolicyTraining(NetworkTraining):
         optimizer: what moves them.
     """
 
+    # The library's rollouts take what remains from the steps to do.
+    heeds_budgets = False
+
     def __init__(
         self,
         agent: Any,
@@ -104,7 +103,7 @@ class PolicyTraining(NetworkTraining):
         single = make_inputs(actor, 1)
         self.recorded = 0
         self.held = PolicyLearner(
-            self._rules(),
+            self._rules(self._bound_now),
             record_of(PLACE),
             record_of(LOSSES),
             actor,
@@ -133,22 +132,33 @@ class PolicyTraining(NetworkTraining):
         self.shown = room_for_rows(single, seen, agent.n_envs)
         self.place = self.held.place
 
-    def _rules(self) -> Any:
+    def _rules(self, bound: Callable[[Schedule | None], ScheduleRow]) -> Any:
         agent = self.agent
         target_kl = getattr(agent, "target_kl", None)
         return record_of(
             RULES,
             gamma=agent.gamma,
-            gae_lambda=agent.gae_lambda,
+            buffer_gamma=agent.rollout_buffer.gamma,
+            gae_lambda=agent.rollout_buffer.gae_lambda,
             ent_coef=agent.ent_coef,
             vf_coef=agent.vf_coef,
             max_grad_norm=agent.max_grad_norm,
             target_kl=np.inf if target_kl is None else target_kl,
             normalize_advantage=agent.normalize_advantage,
             n_epochs=getattr(agent, "n_epochs", 1),
-            clip_range=_bound(getattr(agent, "clip_range", None)),
-            clip_range_vf=_bound(getattr(agent, "clip_range_vf", None)),
+            clip_range=tuple(bound(getattr(agent, "clip_range", None))),
+            clip_range_vf=tuple(bound(getattr(agent, "clip_range_vf", None))),
         )
+
+    def _bound_now(self, schedule: Schedule | None) -> ScheduleRow:
+        """What any schedule of a bound says at the moment, as one that does not change."""
+        if schedule is None:
+            return _bound(None)
+        return _bound(FloatSchedule(schedule(self.agent._current_progress_remaining)))
+
+    def read_settings(self) -> None:
+        self.read_generator()
+        self.held.rules[:] = self._rules(_bound)
 
     def _rollout(self) -> Rollout:
         buffer = self.agent.rollout_buffer
@@ -168,23 +178,31 @@ class PolicyTraining(NetworkTraining):
         )
 
     def in_loop(self) -> PolicyAgent:
-        functions = (choose_randomly, evaluate, train)
+        functions = (choose_randomly, evaluate, estimate_advantages, train)
         addresses = (address_of(function, self.learner) for function in functions)
         return PolicyAgent(self.learner, self.seen, *addresses)
 
     def schedules(self) -> dict[str, Schedule]:
         return {"learning_rate": self.agent.lr_schedule}
 
+    def take_over_progress(self, remaining: float) -> None:
+        """That of the end of the last rollout."""
+        self.agent._current_progress_remaining = float(self.place["remaining"][0])
+
+    def give_up_rollout(self) -> None:
+        self.place["step"] = self.place["n_rollouts"] = 0
+
     def read(self) -> None:
         agent, place = self.agent, self.place
-        place["step"] = 0 if agent.rollout_buffer.full else agent.rollout_buffer.pos
+        place["step"] = agent.collected
+        place["remaining"] = agent._current_progress_remaining
         place["n_updates"] = agent._n_updates
         self.held.starts[:] = agent._last_episode_starts
 
     def write(self) -> None:
-        super().write()
         agent, place = self.agent, self.place[0]
         agent._n_updates = int(place["n_updates"])
+        agent.collected = int(place["step"])
         agent._last_episode_starts = self.held.starts.astype(bool)
         buffer = agent.rollout_buffer
         buffer.full = bool(place["n_rollouts"]) and place["step"] == 0
@@ -204,7 +222,8 @@ class PolicyTraining(NetworkTraining):
         for n_more in range(_MOST_ROLLOUTS):
             if (iteration + n_more) % log_interval == 0:
                 break
-        return Horizon(in_rollout + n_more * self.agent.n_steps, NEVER)
+        # What is logged then is of the training before, which has to be told by itself.
+        return Horizon(in_rollout + max(n_more - 1, 0) * self.agent.n_steps, NEVER)
 
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
         """Nothing: it logs by rollouts."""
@@ -216,60 +235,11 @@ class PolicyTraining(NetworkTraining):
         if ends and log_interval is not None and iteration % log_interval == 0:
             self.agent.dump_logs(iteration)
 
-    def collect(self, env: VecEnv, callback: BaseCallback) -> bool:
-        """Fill the rollout buffer from environments in Python, in the library's order of events.
-
-        It has begun: callbacks have been told.
-
-        Returns:
-            False once a callback asks to stop.
-        """
-        agent, held, place = self.agent, self.held, self.place
-        place["step"] = 0
-        actions = np.zeros(env.num_envs, np.int64)
-        for step in range(agent.n_steps):
-            place["step"] = step
-            self._show(agent._last_obs)
-            act_on_rows(self.learner, self.shown, actions)
-            new_obs, rewards, dones, infos = env.step(actions.copy())
-            agent.num_timesteps += env.num_envs
-            callback.update_locals(
-                {
-                    "actions": actions,
-                    "new_obs": new_obs,
-                    "rewards": rewards,
-                    "dones": dones,
-                    "infos": infos,
-                }
-            )
-            if not callback.on_step():
-                return False
-            agent._update_info_buffer(infos, dones)
-            held.rollout.rewards[step] = rewards + self._cut_off(dones, infos)
-            agent._last_obs, held.starts[:] = new_obs, dones
-        self._show(agent._last_obs)
-        evaluate_rows(self.learner, self.shown, held.last_values)
-        callback.on_rollout_end()
-        return True
-
-    def _show(self, observations: Any) -> None:
-        self.shown[:] = observations.reshape(self.shown.shape)
-
-    def _cut_off(self, dones: Bools, infos: list[dict[str, Any]]) -> Singles:
-        """What would have come after episodes that ran out of time, shape (E,)."""
-        lost = np.zeros(len(dones), np.float32)
-        values = np.zeros(len(dones), np.float32)
-        for i in np.flatnonzero(dones):
-            if infos[i].get("TimeLimit.truncated", False):
-                self.shown[:] = np.reshape(infos[i]["terminal_observation"], -1)
-                evaluate_rows(self.learner, self.shown[:1], values[:1])
-                lost[i] = self.agent.gamma * values[0]
-        return lost
-
     def train(self) -> None:
         """Learn from the rollout, where environments are Python's."""
         agent = self.agent
         self.place["n_updates"] = agent._n_updates
+        self.held.rules[:] = self._rules(self._bound_now)
         remaining = agent._current_progress_remaining
         train(self.learner, remaining, float(agent.lr_schedule(remaining)))
         self.write()
@@ -280,10 +250,12 @@ class PolicyTraining(NetworkTraining):
         if place["n_rollouts"] == self.recorded:
             return
         self.recorded = place["n_rollouts"]
+        if np.isnan(self.held.losses["total"][0]):
+            raise ValueError("training has diverged: its losses are not numbers any more")
         buffer, log = agent.rollout_buffer, agent.logger
         explained = explained_variance(buffer.values.ravel(), buffer.returns.ravel())
         remaining = agent._current_progress_remaining
-        log.record("train/learning_rate", place["learning_rate"])
+        agent._update_learning_rate(agent.policy.optimizer)
         log.record("train/explained_variance", explained)
         log.record("train/entropy_loss", place["entropy"])
         log.record("train/value_loss", place["value"])
@@ -301,10 +273,10 @@ class PolicyTraining(NetworkTraining):
             log.record("train/clip_range_vf", agent.clip_range_vf(remaining))
 
 
-def _bound(schedule: Schedule | None) -> tuple[float, ...]:
+def _bound(schedule: Schedule | None) -> ScheduleRow:
     """The schedule of a bound as compiled code reads it.
 
     Raises:
         NotCompilable: if it is a Python function.
     """
-    return tuple(compiled_schedule(UNBOUNDED if schedule is None else schedule))  # type: ignore[arg-type]
+    return compiled_schedule(FloatSchedule(UNBOUNDED) if schedule is None else schedule)

@@ -27,6 +27,7 @@ RULES = np.dtype(
         ("largest_error", np.float64),  # from which on the loss is a straight line
         ("target_kind", np.int64),
         ("n_steps", np.int64),
+        ("handles_timeouts", np.bool_),  # as episodes that would have gone on
         ("learning_starts", np.int64),
         ("train_freq", np.int64),
         ("counts_episodes", np.bool_),  # rather than steps, for train_freq
@@ -50,7 +51,7 @@ PLACE = np.dtype(
         ("explores", np.bool_),
         ("losses", np.float64),  # sum over the last training
         ("n_losses", np.int64),
-        ("learning_rate", np.float64),  # of the last training
+        ("learning_rate", np.float64),  # of that training
     ],
     align=True,
 )
@@ -200,7 +201,8 @@ def store(learner: Any, seen: Any, env: Any, i: int) -> None:
     replay.actions[position, i, 0] = env.action
     replay.rewards[position, i] = np.float32(env.reward)
     replay.dones[position, i] = np.float32(env.done)
-    replay.timeouts[position, i] = np.float32(env.done and not env.terminated)
+    cut_off = env.done and not env.terminated and learner.rules[0].handles_timeouts
+    replay.timeouts[position, i] = np.float32(cut_off)
 
 
 @inlined

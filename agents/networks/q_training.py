@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
+from stable_baselines3.common.utils import update_learning_rate
 
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.compiled.generators import handles_of
@@ -73,6 +74,8 @@ class QTraining(NetworkTraining):
         optimizer: what moves them.
     """
 
+    heeds_budgets = True
+
     def __init__(
         self,
         agent: Any,
@@ -83,6 +86,7 @@ class QTraining(NetworkTraining):
         optimizer: Optimizer,
     ) -> None:
         super().__init__(agent, seen)
+        self.recorded = agent._n_updates
         layers, n = network.layers, agent.batch_size
         single = make_inputs(layers, 1)
         self.held = QLearner(
@@ -125,6 +129,7 @@ class QTraining(NetworkTraining):
             largest_error=agent.largest_error,
             target_kind=_TARGETS[agent.target_kind],
             n_steps=n_steps,
+            handles_timeouts=buffer.handle_timeout_termination,
             learning_starts=agent.learning_starts,
             train_freq=agent.train_freq.frequency,
             counts_episodes=agent.train_freq.unit == TrainFrequencyUnit.EPISODE,
@@ -156,6 +161,16 @@ class QTraining(NetworkTraining):
             "learning_rate": self.agent.lr_schedule,
         }
 
+    def read_settings(self) -> None:
+        self.read_generator()
+        self.held.rules[:] = self._rules()
+
+    def take_over_progress(self, remaining: float) -> None:
+        self.agent._current_progress_remaining = remaining
+
+    def give_up_rollout(self) -> None:
+        self.place["collected"] = self.place["collected_episodes"] = 0
+
     def read(self) -> None:
         agent, place = self.agent, self.place
         place["position"], place["full"] = agent.replay_buffer.pos, agent.replay_buffer.full
@@ -164,7 +179,6 @@ class QTraining(NetworkTraining):
         place["collected"], place["collected_episodes"] = agent.collected
 
     def write(self) -> None:
-        super().write()
         agent, place = self.agent, self.place[0]
         buffer = agent.replay_buffer
         buffer.pos, buffer.full = int(place["position"]), bool(place["full"])
@@ -187,15 +201,18 @@ class QTraining(NetworkTraining):
 
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
         agent = self.agent
-        before = agent._episode_num
-        agent._episode_num += n_episodes
-        if log_interval is not None and agent._episode_num // log_interval > before // log_interval:
-            agent.dump_logs()
+        agent.logger.record("rollout/exploration_rate", agent.exploration_rate)
+        for _ in range(n_episodes):
+            agent._episode_num += 1
+            if log_interval is not None and agent._episode_num % log_interval == 0:
+                agent.dump_logs()
 
-    def act(self) -> Ints:
+    def act(self, learning_starts: int) -> Ints:
         """Actions for the agent's present observations, where environments are Python's."""
         self.read()
-        self.shown[:] = self.agent._last_obs.reshape(self.shown.shape)
+        self.read_generator()
+        self.held.rules["learning_starts"] = learning_starts
+        self.show(self.agent._last_obs)
         actions = np.zeros(len(self.shown), np.int64)
         act_on_rows(self.learner, self.shown, self.agent.num_timesteps, actions)
         return actions
@@ -203,20 +220,27 @@ class QTraining(NetworkTraining):
     def train(self, n_updates: int) -> None:
         """Learn from minibatches of the replay buffer, where environments are Python's."""
         self.read()
-        train(self.learner, float(n_updates), self._learning_rate())
-        self.write()
-        self.record()
+        self.read_settings()
+        agent = self.agent
+        learning_rate = float(agent.lr_schedule(agent._current_progress_remaining))
+        train(self.learner, float(n_updates), learning_rate)
+        agent._n_updates += n_updates
+        self._record_training()
 
     def before_last_step(self, log_interval: int | None) -> None:
-        """Nothing: it logs by episodes."""
+        """Training on that step comes after what is logged at the end of an episode."""
+        self._record_training()
 
     def record(self) -> None:
-        agent, place = self.agent, self.place[0]
-        agent.logger.record("rollout/exploration_rate", agent.exploration_rate)
-        if place["n_losses"]:
-            agent.logger.record("train/n_updates", agent._n_updates, exclude="tensorboard")
-            agent.logger.record("train/loss", place["losses"] / place["n_losses"])
-            agent.logger.record("train/learning_rate", place["learning_rate"])
+        self.agent.logger.record("rollout/exploration_rate", self.agent.exploration_rate)
+        self._record_training()
 
-    def _learning_rate(self) -> float:
-        return float(self.agent.lr_schedule(self.agent._current_progress_remaining))
+    def _record_training(self) -> None:
+        agent, place = self.agent, self.place[0]
+        if agent._n_updates == self.recorded:
+            return
+        self.recorded = agent._n_updates
+        agent.logger.record("train/n_updates", agent._n_updates, exclude="tensorboard")
+        agent.logger.record("train/loss", place["losses"] / place["n_losses"])
+        agent.logger.record("train/learning_rate", float(place["learning_rate"]))
+        update_learning_rate(agent.policy.optimizer, float(place["learning_rate"]))

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import update_learning_rate
 
 from agents.common.callback_horizons import NEVER, Horizon
+from agents.compiled.generators import handles_of
 from agents.networks.observations import Numbers
 from agents.networks.perceptron import Inputs
+from agents.networks.references import Reference
 
 
 class NetworkTraining(ABC):
@@ -22,16 +23,22 @@ class NetworkTraining(ABC):
         seen: how its networks see compiled environments.
 
     Attributes:
-        learner: the agent as compiled functions see it.
-        place: how far the training is, a record alone in an array.
+        learner: the agent as compiled functions see it, by reference.
+        held: the same itself.
+        shown: observations of environments in Python, shape (n_envs, d).
+        heeds_budgets: whether a number of episodes to train for moves the schedules.
     """
 
-    learner: Any
-    place: Any
+    learner: Reference
+    held: Any
+    shown: Any
+    heeds_budgets: ClassVar[bool]
 
     def __init__(self, agent: Any, seen: Any) -> None:
         self.agent = agent
         self.seen = seen
+        # A handle does not keep it alive.
+        self.generator = agent.rng
 
     @abstractmethod
     def in_loop(self) -> Any:
@@ -42,14 +49,49 @@ class NetworkTraining(ABC):
         """What compiled code works out after each step, by the names in its record."""
 
     @abstractmethod
+    def read_settings(self) -> None:
+        """Take over what a callback has changed."""
+
+    def read_generator(self) -> None:
+        """Draw from the agent's generator, which a callback may have replaced."""
+        if self.agent.rng is not self.generator:
+            self.generator = self.agent.rng
+            self.held.rng[:] = handles_of([self.generator])
+
+    def show(self, observations: Any) -> None:
+        """Take observations of environments in Python, of as many numbers as there is room for.
+
+        Raises:
+            ValueError: if one lies outside of its space, where no weights are.
+        """
+        self.shown[:] = np.reshape(observations, self.shown.shape)
+        self.check_numbers(self.shown)
+
+    def check_numbers(self, shown: Any) -> None:
+        """Make sure that numbers of states are within their space; anything goes for vectors.
+
+        Raises:
+            ValueError: if they are not.
+        """
+        if isinstance(self.seen, Numbers) and not (shown.min() >= 0 and shown.max() < self.seen.n):
+            wrong = shown[(shown < 0) | (shown >= self.seen.n)][0]
+            raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
+
+    @abstractmethod
+    def take_over_progress(self, remaining: float) -> None:
+        """Let the agent know how much of the training remains, at the moments when it finds out."""
+
+    @abstractmethod
+    def give_up_rollout(self) -> None:
+        """Forget how much was collected since the last training."""
+
+    @abstractmethod
     def read(self) -> None:
         """Begin where the agent is."""
 
+    @abstractmethod
     def write(self) -> None:
         """Let the agent know where compiled code is."""
-        learning_rate = float(self.place["learning_rate"][0])
-        if learning_rate > 0:
-            update_learning_rate(self.agent.policy.optimizer, learning_rate)
 
     def until_end(self, total_timesteps: int) -> int:
         """Steps of every environment until the training is over."""

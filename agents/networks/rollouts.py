@@ -1,0 +1,81 @@
+"""The library's rollout buffer, whose own arrays are used: advantages, and minibatches of it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from agents.compiled.generators import next_uniform
+from agents.networks.matrix_products import Singles
+from agents.networks.replay import show
+from mdp.array_types import Ints
+from mdp.machine_code import called, inlined, kernel
+
+
+class Rollout(NamedTuple):
+    """The library's rollout buffer: T steps of E environments.
+
+    Attributes:
+        observations: shape (T, E, d); numbers of states have d = 1.
+        actions: shape (T, E, 1).
+        rewards: shape (T, E).
+        episode_starts: 1 where an episode began with the observation, shape (T, E).
+        values: of the observations, shape (T, E).
+        log_probs: of the actions, shape (T, E).
+        advantages: shape (T, E).
+        returns: what the values are to be, shape (T, E).
+    """
+
+    observations: Singles
+    actions: Singles
+    rewards: Singles
+    episode_starts: Singles
+    values: Singles
+    log_probs: Singles
+    advantages: Singles
+    returns: Singles
+
+
+@kernel
+def estimate_advantages(learner: Any, _: float, __: float) -> int:
+    """Generalised advantage estimation (Schulman et al., 2016), from the last step backwards."""
+    rollout, rules = learner.rollout, learner.rules[0]
+    n_steps, n_envs = rollout.rewards.shape
+    gamma = rules.buffer_gamma
+    for i in range(n_envs):
+        advantage, next_value = 0.0, float(learner.last_values[i])
+        goes_on = 1.0 - learner.starts[i]
+        for step in range(n_steps - 1, -1, -1):
+            value = float(rollout.values[step, i])
+            error = rollout.rewards[step, i] + gamma * next_value * goes_on - value
+            advantage = error + gamma * rules.gae_lambda * goes_on * advantage
+            rollout.advantages[step, i] = np.float32(advantage)
+            rollout.returns[step, i] = np.float32(advantage + value)
+            next_value, goes_on = value, 1.0 - rollout.episode_starts[step, i]
+    return 0
+
+
+@inlined
+def shuffle(numbers: Ints, handle: Any) -> None:
+    """Put 0, 1, ... into a random order (Fisher and Yates)."""
+    for i in range(len(numbers)):
+        numbers[i] = i
+    for i in range(len(numbers) - 1, 0, -1):
+        j = int(next_uniform(handle) * (i + 1))
+        numbers[i], numbers[j] = numbers[j], numbers[i]
+
+
+@called
+def pick_steps(learner: Any, numbers: Ints) -> None:
+    """Copy these steps of the rollout into the minibatch."""
+    rollout, batch = learner.rollout, learner.batch
+    n_envs = rollout.rewards.shape[1]
+    for k in range(len(numbers)):
+        step, i = numbers[k] // n_envs, numbers[k] % n_envs
+        show(batch.states, k, rollout.observations[step, i], learner.policy.one_hot)
+        batch.actions[k] = int(rollout.actions[step, i, 0])
+        batch.log_probs[k] = rollout.log_probs[step, i]
+        batch.advantages[k] = rollout.advantages[step, i]
+        batch.returns[k] = rollout.returns[step, i]
+        batch.values[k] = rollout.values[step, i]
