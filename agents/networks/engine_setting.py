@@ -22,9 +22,9 @@ from agents.compiled.learning_algorithm import compiled_schedule
 from agents.networks.library_networks import in_rows
 from agents.networks.matrix_products import one_thread
 from agents.networks.network_engine import NetworkEngine
+from agents.networks.network_training import NetworkTraining
 from agents.networks.network_worlds import network_world
 from agents.networks.observations import Numbers, OwnVectors
-from agents.networks.training import NetworkTraining
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
 

@@ -20,8 +20,8 @@ from agents.compiled.env_state import COMPENSATED_SUM
 from agents.compiled.episodes import Episodes
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import learn_from_last_step, run_block
+from agents.networks.network_training import NetworkTraining
 from agents.networks.network_worlds import NetworkEnvStates
-from agents.networks.training import NetworkTraining
 
 # Between two blocks signals are seen to, and displays move.
 SECONDS_PER_BLOCK = 0.2

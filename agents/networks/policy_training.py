@@ -22,6 +22,7 @@ from agents.networks.library_networks import (
     shared_parameters,
 )
 from agents.networks.matrix_products import Singles
+from agents.networks.network_training import NetworkTraining, record_of, room_for_rows, row_of
 from agents.networks.observations import Numbers
 from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import make_inputs, make_outputs, n_parameters
@@ -37,7 +38,6 @@ from agents.networks.policy_learner import (
 from agents.networks.policy_updates import LOSSES, RolloutMinibatch
 from agents.networks.references import Reference, address_of
 from agents.networks.rollouts import Rollout, estimate_advantages
-from agents.networks.training import NetworkTraining, record_of, room_for_rows, row_of
 
 # How far a number may move that nothing bounds.
 UNBOUNDED = 1e30

@@ -14,7 +14,7 @@ from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.q_updates import best_of, follow, learn_from_minibatch
 from agents.networks.references import call
-from agents.networks.replay import Minibatch, Replay, draw_minibatch
+from agents.networks.replay_batches import Minibatch, Replay, draw_minibatch
 from mdp.array_types import Ints
 from mdp.machine_code import inlined, kernel
 

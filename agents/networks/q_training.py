@@ -20,6 +20,7 @@ from agents.networks.library_networks import (
     shared_parameters,
 )
 from agents.networks.matrix_products import Singles
+from agents.networks.network_training import NetworkTraining, record_of, room_for_rows, row_of
 from agents.networks.observations import Numbers
 from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import make_inputs, make_outputs
@@ -34,8 +35,7 @@ from agents.networks.q_learner import (
 )
 from agents.networks.q_updates import DOUBLE, ONLINE_NETWORK, TARGET_NETWORK
 from agents.networks.references import Reference, address_of
-from agents.networks.replay import Minibatch, Replay
-from agents.networks.training import NetworkTraining, record_of, room_for_rows, row_of
+from agents.networks.replay_batches import Minibatch, Replay
 from mdp.array_types import Ints
 
 _TARGETS = {"double_q": DOUBLE, "online": ONLINE_NETWORK, "target": TARGET_NETWORK}
