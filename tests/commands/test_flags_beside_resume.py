@@ -14,6 +14,7 @@ ALLOWED = {
 }
 OTHERS = {
     "--eval-freq": "5",
+    "--eval-episodes": "5",
     "--hyperparams": "gamma:0.9",
     "--env-kwargs": "a:1",
     "--eval-env-kwargs": "a:1",

@@ -64,6 +64,7 @@ def write_run(planned, evaluations, episodes=((10, 1.0),) * 10, known=True, **in
         "engine": "compiled",
     }
     run.info_path.write_text(json.dumps(record | info))
+    run.model_path.touch()
 
 
 def results_of(study, root, finals, **options):

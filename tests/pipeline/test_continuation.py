@@ -126,11 +126,12 @@ def test_normalisation_can_be_turned_off(normalised, tmp_path):
 def test_the_end_is_judged_on_the_statistics_of_the_end(tmp_path, monkeypatch):
     judged = []
 
-    def note(model, env, n_episodes, seed, deterministic=True):
-        judged.append(round(env.obs_rms.count))
+    def note(self, model):
+        judged.append(round(self.env.obs_rms.count))
         raise RuntimeError("judged")
 
-    monkeypatch.setattr("pipeline.finishing.evaluate", note)
+    evaluator = "pipeline.evaluation.evaluation_budget.SampledEvaluator"
+    monkeypatch.setattr(f"{evaluator}.at_the_end", note)
     with pytest.raises(RuntimeError, match="judged"):
         train_to(tmp_path, "a2c", {**A2C, "normalize": True}, eval_freq=80)
     assert judged == [202]
