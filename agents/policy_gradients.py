@@ -70,10 +70,10 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
 
     def train(self) -> None:
         """Learn from the rollout buffer."""
-        if self._training is None:
+        if self._sharing is None:
             super().train()
         else:
-            self._training.train()
+            self._shared_training().train()
 
 
 class PPO(CompiledPolicyGradient, stable_baselines3.PPO):

@@ -65,10 +65,10 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
-        if self._training is None:
+        if self._sharing is None:
             self._train_in_python(gradient_steps, batch_size)
         else:
-            self._training.train(gradient_steps)
+            self._shared_training().train(gradient_steps)
 
     def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
         """The same in the library's way, or the agent's own."""

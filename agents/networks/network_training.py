@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,6 +11,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.compiled.generators import handles_of
+from agents.networks.library_networks import Network
 from agents.networks.observations import Numbers
 from agents.networks.perceptron import Inputs
 from agents.networks.references import Reference
@@ -21,6 +23,7 @@ class NetworkTraining(ABC):
     Args:
         agent: the agent.
         seen: how its networks see compiled environments.
+        networks: those that are trained, in the order of the flat vector.
 
     Attributes:
         learner: the agent as compiled functions see it, by reference.
@@ -34,9 +37,10 @@ class NetworkTraining(ABC):
     shown: Any
     heeds_budgets: ClassVar[bool]
 
-    def __init__(self, agent: Any, seen: Any) -> None:
+    def __init__(self, agent: Any, seen: Any, networks: Sequence[Network]) -> None:
         self.agent = agent
         self.seen = seen
+        self.networks = networks
         # A handle does not keep it alive.
         self.generator = agent.rng
 

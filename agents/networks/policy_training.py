@@ -95,7 +95,7 @@ class PolicyTraining(NetworkTraining):
         flat: Singles,
         optimizer: Optimizer,
     ) -> None:
-        super().__init__(agent, seen)
+        super().__init__(agent, seen, networks)
         actor, critic = (network.layers for network in networks)
         n_steps = agent.n_steps * agent.n_envs
         size = min(agent.minibatch_size or n_steps, n_steps)

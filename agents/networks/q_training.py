@@ -85,7 +85,7 @@ class QTraining(NetworkTraining):
         target: Singles,
         optimizer: Optimizer,
     ) -> None:
-        super().__init__(agent, seen)
+        super().__init__(agent, seen, [network])
         self.recorded = agent._n_updates
         layers, n = network.layers, agent.batch_size
         single = make_inputs(layers, 1)

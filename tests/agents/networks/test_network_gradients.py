@@ -147,8 +147,8 @@ def train_q_agents(name, observations, place, n_updates, n_envs=2, **kwargs):
     rng.bit_generator.state = ours.rng.bit_generator.state
     with ours._learning_compiled():
         ours.train(n_updates, ours.batch_size)
-        held = ours._training.held
-        slopes = as_library(ours._training.networks, held.gradient, names)
+        held = ours._shared_training().held
+        slopes = as_library(ours._shared_training().networks, held.gradient, names)
     with pytest.MonkeyPatch.context() as patch:
         draw_as_compiled(patch, theirs, rng)
         theirs.train(n_updates, theirs.batch_size)
@@ -255,11 +255,11 @@ def train_policy_agents(name, observations, n_envs=2, **kwargs):
         model._setup_learn(1)
         last_values, dones = fill_rollout(model, seed=1)
     with ours._learning_compiled():
-        held = ours._training.held
+        held = ours._shared_training().held
         held.last_values[:], held.starts[:] = last_values, dones
-        estimate_advantages(ours._training.learner, 0.0, 0.0)
+        estimate_advantages(ours._shared_training().learner, 0.0, 0.0)
         ours.train()
-        slopes = as_library(ours._training.networks, held.gradient, names)
+        slopes = as_library(ours._shared_training().networks, held.gradient, names)
     with pytest.MonkeyPatch.context() as patch:
         shuffle_as_compiled(patch, theirs, rng)
         theirs.rollout_buffer.compute_returns_and_advantage(th.as_tensor(last_values), dones)
@@ -359,9 +359,9 @@ def test_a2c_after_100_updates(optimizer, normalize, observations):
         for model in (ours, theirs):
             last_values, dones = fill_rollout(model, seed)
         with ours._learning_compiled():
-            held = ours._training.held
+            held = ours._shared_training().held
             held.last_values[:], held.starts[:] = last_values, dones
-            estimate_advantages(ours._training.learner, 0.0, 0.0)
+            estimate_advantages(ours._shared_training().learner, 0.0, 0.0)
             ours.train()
         buffer = theirs.rollout_buffer
         buffer.compute_returns_and_advantage(th.as_tensor(last_values), dones)
@@ -385,7 +385,7 @@ def test_returns_over_several_steps(n_steps, place):
     rng = np.random.default_rng()
     rng.bit_generator.state = model.rng.bit_generator.state
     with model._learning_compiled():
-        held = model._training.held
+        held = model._shared_training().held
         # Where all values are zero, rewards stay what they were.
         held.target[:] = 0
         model.train(1, 400)
