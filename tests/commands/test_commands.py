@@ -95,7 +95,8 @@ def test_sampled_evaluation_where_the_model_is_not_known(type_command, tmp_path)
     final = json.loads((run / "run.json").read_text())["final"]
     assert (final["exact"], final["n_episodes"]) == (False, 100)
     n_evaluations, n_episodes = np.load(run / "evaluations.npz")["results"].shape
-    assert n_evaluations == 20
+    # Twenty moments, of which those are left out that there are no steps for.
+    assert 10 < n_evaluations <= 20
     assert n_episodes in (5, 10, 20)
 
 

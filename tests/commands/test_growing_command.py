@@ -33,7 +33,7 @@ class Fragile(gym.Env):
         return 0, float(self.np_random.random()), True, False, {}
 
 
-gym.register("Fragile-v0", Fragile)
+gym.register("Brittle-v0", Fragile)
 '''
 BANDITS = """
 title: Two bandits
@@ -111,16 +111,16 @@ def test_it_grows_until_decided_also_when_it_is_stopped_between(
 
 def test_runs_that_fail_are_tried_once_and_do_not_hold_a_study_up(type_command, tmp_path):
     (tmp_path / "fragile.py").write_text(WALK)
-    words = ["--env", "Fragile-v0", "--gym-packages", "fragile", "--algos", "qlearning", "sarsa"]
+    words = ["--env", "Brittle-v0", "--gym-packages", "fragile", "--algos", "qlearning", "sarsa"]
     words += ["--seeds", 6, "--until-decided", "--max-seeds", 7, "-n", 20, "-j", 2, "-f", "s"]
     code, out, _ = type_command(*words)
     assert code == 1
     assert out.count("thin ice; see ") == 2
-    assert "Fragile-v0, look 1 of 2: 1 of 1 pairs is undecided" in out
+    assert "Brittle-v0, look 1 of 2: 1 of 1 pairs is undecided" in out
     assert "qlearning and sarsa go on to 7 seeds" in out
     assert last_line(out) == (
         "14 runs, where 7 seeds of each agent would be 14; "
-        "undecided: qlearning and sarsa on Fragile-v0"
+        "undecided: qlearning and sarsa on Brittle-v0"
     )
 
 
