@@ -88,7 +88,8 @@ def test_a_run_folder_is_whole(type_command, tmp_path):
 
 
 def test_sampled_evaluation_where_the_model_is_not_known(type_command, tmp_path):
-    code, out, _ = type_command("train.py", "--algo", "angle", "--env", "CartPole-v1", "-n", "1000")
+    words = ["--algo", "angle", "--env", "CartPole-v1", "-n", "1000", "--seed", "0"]
+    code, out, _ = type_command("train.py", *words)
     assert code == 0
     assert "over 100 episodes" in out
     run = tmp_path / "logs" / "angle" / "CartPole-v1_1"
@@ -96,8 +97,7 @@ def test_sampled_evaluation_where_the_model_is_not_known(type_command, tmp_path)
     assert (final["exact"], final["n_episodes"]) == (False, 100)
     n_evaluations, n_episodes = np.load(run / "evaluations.npz")["results"].shape
     # Twenty moments, of which those are left out that there are no steps for.
-    assert 10 < n_evaluations <= 20
-    assert n_episodes in (5, 10, 20)
+    assert (n_evaluations, n_episodes) == (19, 5)
 
 
 def test_the_same_seed_gives_the_same_run(type_command, tmp_path):
