@@ -116,7 +116,7 @@ def _cluster(
             root,
             command,
             limits,
-            n_jobs=args.jobs,
+            n_runs=args.jobs,
             is_told=args.insecure_cluster,
             warm_ups=compiled[0],
             tell=say,

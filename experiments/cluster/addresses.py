@@ -60,11 +60,13 @@ class JobQueue:
     Attributes:
         system: its name in dask-jobqueue.
         settings: what dask-jobqueue is told of it.
+        n_cores: of each job, as many runs at once.
         file: where that stands.
     """
 
     system: str
     settings: dict[str, Any]
+    n_cores: int
     file: Path
 
 
@@ -165,4 +167,7 @@ def _job_queue(path: Path, systems: tuple[str, ...]) -> JobQueue:
         raise UserError(f"{path}: {shown(system)} is none of {', '.join(systems)}")
     if not isinstance(settings, dict) or not {"cores", "memory"} <= settings.keys():
         raise UserError(f"{path}: {system}: say how many cores and how much memory a job has")
-    return JobQueue(system, settings, path)
+    cores = settings["cores"]
+    if not isinstance(cores, int) or isinstance(cores, bool) or cores < 1:
+        raise UserError(f"{path}: {system}: cores must be a whole number, not {shown(cores)}")
+    return JobQueue(system, settings, cores, path)

@@ -56,8 +56,9 @@ def packed(answer: Answer) -> bytes:
         "kind": answer.kind,
         "reason": answer.reason[:LONGEST_TEXT],
         "details": answer.details[-LONGEST_TEXT:],
-        "files": files
-        and [[name, len(data), _digest(data)] for name, data in sorted(files.items())],
+        "files": None
+        if files is None
+        else [[name, len(data), _digest(data)] for name, data in sorted(files.items())],
     }
     text = json.dumps(head).encode()
     contents = [files[name] for name in sorted(files)] if files else []

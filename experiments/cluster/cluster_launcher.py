@@ -48,7 +48,7 @@ def cluster_launcher(
     command: str,
     limits: RunLimits = NO_LIMITS,
     *,
-    n_jobs: int = 0,
+    n_runs: int = 0,
     is_told: bool = False,
     warm_ups: str = "[]",
     tell: Callable[[str], object] = str,
@@ -60,7 +60,7 @@ def cluster_launcher(
         root: the study's folder.
         command: the command that asked for it, noted in every run folder.
         limits: what each run may take.
-        n_jobs: for how many runs at once jobs are to be started, in a queue.
+        n_runs: for how many runs at once jobs are to be started, in a queue.
         is_told: whether the user has said that a scheduler open to the network will do.
         warm_ups: what workers are to compile once, see `experiments.warm_ups`.
         tell: told where the dashboard is.
@@ -68,8 +68,8 @@ def cluster_launcher(
     Raises:
         UserError: if there is no such cluster.
     """
-    plugin, wanted = Supervisors(warm_ups), n_jobs if isinstance(cluster, JobQueue) else 0
-    with probing(root) as probe, opened(cluster, n_jobs, is_told) as (connect, replace_jobs):
+    plugin, wanted = Supervisors(warm_ups), n_runs if isinstance(cluster, JobQueue) else 0
+    with probing(root) as probe, opened(cluster, n_runs, is_told) as (connect, replace_jobs):
         launcher = ClusterLauncher(probe, command, limits, wanted)
         prepare = partial(launcher.prepare, plugin)
         launcher.connection = connection = Connection(connect, prepare, is_told)
@@ -215,7 +215,7 @@ class ClusterLauncher:
         elif task.status == "error":
             error = task.exception()
             if isinstance(error, KilledWorker):
-                sent.lose()
+                sent.lose(sent.worker in self._left)
             else:
                 sent.refuse(one_line(error))
         else:

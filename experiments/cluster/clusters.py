@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -38,29 +39,37 @@ def checked_cluster(text: str, is_told: bool) -> Cluster:
 
 @contextlib.contextmanager
 def opened(
-    cluster: Cluster, n_jobs: int, is_told: bool
+    cluster: Cluster, n_runs: int, is_told: bool
 ) -> Iterator[tuple[Connect, Callable[[], object]]]:
     """Have a scheduler while the ``with`` statement runs.
 
     Args:
         cluster: which.
-        n_jobs: for how many runs at once jobs are to be started.
+        n_runs: for how many runs at once jobs are to be started.
         is_told: whether the user has said that an open one will do.
 
     Yields:
         What makes a client of it; and what is to be called now and then, so that jobs that have
         ended are replaced.
     """
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters, the launcher tells
+    _be_quiet()
     if isinstance(cluster, SchedulerAddress):
         yield lambda: _client_of(cluster, is_told), _nothing
     elif isinstance(cluster, LocalWorkers):
         with _local(cluster.n_workers) as local:
             yield lambda: Client(local, set_as_default=False), _nothing
     else:
+        n_jobs = math.ceil(n_runs / cluster.n_cores)
         with opened_queue(cluster) as queue:
-            queue.scale(n_jobs)
-            yield lambda: Client(queue, set_as_default=False), lambda: queue.scale(n_jobs)
+            queue.scale(jobs=n_jobs)
+            yield lambda: Client(queue, set_as_default=False), lambda: queue.scale(jobs=n_jobs)
+
+
+def _be_quiet() -> None:
+    """Let the library log nothing: what matters, the launcher tells."""
+    for name in ("distributed", *logging.root.manager.loggerDict):
+        if name.partition(".")[0] in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL)
 
 
 def _nothing() -> None:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import math
-import shlex
+import re
+import signal
 import warnings
+from types import ModuleType
 from typing import Any
 
 import dask
-from dask.utils import parse_timedelta
 from distributed.security import Security
 
 from experiments.cluster.addresses import JobQueue
@@ -29,6 +29,8 @@ QUEUES = {
 SHARE_FOR_LEAVING = 0.1
 MOST_FOR_LEAVING = 300.0  # seconds
 
+_WALLTIME = re.compile(r"(?:(\d{1,4})-)?(\d{1,4}):(\d\d):(\d\d)")
+
 
 def has_certificates(security: Security) -> bool:
     """Whether Dask's configuration names what TLS takes to prove oneself."""
@@ -40,7 +42,7 @@ def opened_queue(queue: JobQueue) -> Any:
     """Jobs whose scheduler is in this process; with certificates of its own, if none are given."""
     settings = {**queue.settings, **_retiring(queue)}
     dask.config.set({f"jobqueue.{queue.system}": {**_defaults(queue.system), **settings}})
-    kind = getattr(importlib.import_module("dask_jobqueue"), QUEUES[queue.system])
+    kind = getattr(_library(), QUEUES[queue.system])
     security = Security()
     if not has_certificates(security):
         security = Security.temporary()
@@ -53,8 +55,17 @@ def opened_queue(queue: JobQueue) -> Any:
         raise UserError(f"{queue.file}: {one_line(error)}") from error
 
 
+def _library() -> ModuleType:
+    """Dask-jobqueue; importing it takes Ctrl-C for itself, which is given back."""
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        return importlib.import_module("dask_jobqueue")
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _defaults(system: str) -> dict[str, Any]:
-    importlib.import_module("dask_jobqueue")
+    _library()
     found: dict[str, Any] = dask.config.get(f"jobqueue.{system}")
     return found
 
@@ -63,32 +74,13 @@ def _retiring(queue: JobQueue) -> dict[str, Any]:
     """What lets workers retire before their job is ended, where the file does not say it."""
     words = queue.settings.get("worker-extra-args") or []
     walltime = queue.settings.get("walltime", _defaults(queue.system).get("walltime"))
-    if any(str(word).startswith("--lifetime") for word in words) or walltime is None:
+    if not isinstance(walltime, str | None):  # YAML takes 04:00:00 for a number in base 60
+        raise UserError(f"{queue.file}: {queue.system}: put walltime in quotes, as '04:00:00'")
+    parts = _WALLTIME.fullmatch(walltime or "")
+    if parts is None or any(str(word).startswith("--lifetime") for word in words):
         return {}
-    seconds = _seconds(str(walltime), queue)
-    leaving = min(SHARE_FOR_LEAVING * seconds, MOST_FOR_LEAVING)
-    times = [math.floor(seconds - leaving), math.floor(leaving / 2)]
-    added = shlex.split("--lifetime {}s --lifetime-stagger {}s".format(*times))
+    days, hours, minutes, seconds = (int(part or 0) for part in parts.groups())
+    whole = 86400 * days + 3600 * hours + 60 * minutes + seconds
+    leaving = min(SHARE_FOR_LEAVING * whole, MOST_FOR_LEAVING)
+    added = ["--lifetime", f"{whole - leaving:.0f}s", "--lifetime-stagger", f"{leaving / 2:.0f}s"]
     return {"worker-extra-args": [*words, *added]}
-
-
-def _seconds(walltime: str, queue: JobQueue) -> float:
-    """A time such as ``1-12:00:00``, ``04:00:00`` or ``90``, which is minutes."""
-    days, _, rest = walltime.rpartition("-")
-    parts = rest.split(":")
-    try:
-        numbers = [float(part) for part in parts]
-        if days:
-            hours = numbers + [0.0] * (3 - len(numbers))
-            return float(days) * 86400 + hours[0] * 3600 + hours[1] * 60 + hours[2]
-        if len(numbers) == 1:
-            return numbers[0] * 60
-        return sum(number * 60**power for power, number in enumerate(reversed(numbers)))
-    except ValueError:
-        pass
-    try:
-        found: float = parse_timedelta(walltime)
-        return found
-    except (ValueError, KeyError) as error:
-        where = f"{queue.file}: {queue.system}"
-        raise UserError(f"{where}: walltime must be such as 04:00:00, not {walltime!r}") from error

@@ -50,13 +50,16 @@ class SentRun:
             worker: its address.
             has_left: whether the one before it left in good order.
         """
-        if self.worker is not None and not has_left:
-            self.lose()
+        self.lose(has_left)
         self.worker = worker
 
-    def lose(self) -> None:
-        """Note that the worker that had begun was lost, if one had."""
-        if self.worker is not None:
+    def lose(self, has_left: bool) -> None:
+        """Note that the worker that had begun is gone, if one had.
+
+        Args:
+            has_left: whether it left in good order.
+        """
+        if self.worker is not None and not has_left:
             self.n_lost += 1
             self.reason = f"the worker that did it was lost {self.n_lost} times ({self.worker})"
         self.worker = None
