@@ -41,6 +41,9 @@ def has_certificates(security: Security) -> bool:
 def opened_queue(queue: JobQueue) -> Any:
     """Jobs whose scheduler is in this process; with certificates of its own, if none are given."""
     settings = {**queue.settings, **_retiring(queue)}
+    words = settings.get("worker-extra-args") or []
+    if not any("dashboard" in str(word) for word in words):
+        settings["worker-extra-args"] = [*words, "--no-dashboard"]  # it would be open to all
     dask.config.set({f"jobqueue.{queue.system}": {**_defaults(queue.system), **settings}})
     kind = getattr(_library(), QUEUES[queue.system])
     security = Security()
