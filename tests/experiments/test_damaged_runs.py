@@ -5,6 +5,7 @@ import runpy
 import shutil
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +13,11 @@ import pytest
 from rich.console import Console
 
 import compare
+from commands.places import Place
 from commands.study_output import repair, run_study
 from experiments.bandit_batches import STATISTICS_FILE
 from experiments.drafts import draft_path
+from experiments.launching import local_launcher
 from experiments.repair import move_damaged_aside
 from experiments.run_figures import read_value_maps
 from experiments.run_in_child import do_run
@@ -222,7 +225,8 @@ def compare_again(capsys):
 
     def again(study, planned, root):
         console = Console(width=400)
-        code = run_study(console, study, planned, root, "c", n_workers=1, with_page=False)
+        place = Place(partial(local_launcher, root, "c", 1), "here", lambda _: None)
+        code = run_study(console, study, planned, root, "c", place, with_page=False)
         return code, capsys.readouterr().out
 
     return again
