@@ -89,9 +89,7 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
     root.mkdir(parents=True, exist_ok=True)
     opened = open_storage(root, storage)
     name = tuning.study.name
-    study = open_study(
-        name, root, opened, make_sampler(tuning), asked, is_cost=tuning.is_cost
-    )
+    study = open_study(name, root, opened, make_sampler(tuning), asked, is_cost=tuning.is_cost)
     return OpenTuning(tuning, root, study, TrialQueue(study, root, n_trials), suggestions)
 
 
@@ -99,6 +97,5 @@ def _as_json(suggestions: Suggestions) -> dict[str, Any]:
     from optuna.distributions import distribution_to_json
 
     return {
-        name: distribution_to_json(kind)
-        for name, kind in suggestions.space.distributions().items()
+        name: distribution_to_json(kind) for name, kind in suggestions.space.distributions().items()
     }

@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.planned_runs import PlannedRun
-from experiments.study_spec import METRICS, AgentSpec, StudySpec
+from experiments.study_spec import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.file_digests import DamagedFileError
 from tuning.entry_files import entry_text
 from tuning.judging import UnjudgedError, judged, outcome_of
@@ -74,7 +74,7 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(entry_text(tuning, each.entry, ()), encoding="utf-8")
         agents.append(AgentSpec(each.label, tuning.agent.algo, conf_file=path))
-    metric = tuning.figure if tuning.figure in METRICS else "final"
+    metric = tuning.figure if tuning.figure in METRICS else "final"  # of scores and costs too
     return replace(
         tuning.study,
         name=FOLDER,
@@ -85,7 +85,7 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
         agents=tuple(agents),
         first_seed=tuning.first_retest_seed,
         n_seeds=tuning.retest_seeds,
-        metric=metric,
+        metric=cast(Metric, metric),
     )
 
 
@@ -183,9 +183,7 @@ def _retested(
 ) -> Retested:
     runs = [run for run in analysis.results.planned if run.agent == label]
     figures = _figures(tuning, runs)
-    held_out = (
-        judged(figures, tuning.objective, is_cost=tuning.is_cost) if figures else None
-    )
+    held_out = judged(figures, tuning.objective, is_cost=tuning.is_cost) if figures else None
     agent = _of_label(environment, label)
     return Retested(
         label=label,
@@ -211,6 +209,12 @@ def _figures(tuning: TuningSpec, runs: Sequence[PlannedRun]) -> list[float]:
 def _of_label(environment: EnvironmentAnalysis | None, label: str) -> AgentAnalysis | None:
     agents = () if environment is None else environment.agents
     return next((agent for agent in agents if agent.agent == label), None)
+
+
+def interval_of(tuning: TuningSpec) -> str:
+    """What the intervals are of: there are none for quartiles and times to a threshold."""
+    statistic = "interquartile mean" if tuning.objective == "iqm" else "mean"
+    return f"{statistic} of {tuning.figure if tuning.figure in METRICS else 'score'}"
 
 
 def _interval(tuning: TuningSpec, agent: AgentAnalysis | None) -> Estimate:
