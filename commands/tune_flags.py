@@ -14,6 +14,7 @@ from commands.flag_values import (
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, program_name
+from tuning.pruning import PRUNERS
 from tuning.tuning_spec import FIGURES, OBJECTIVES, SAMPLERS
 
 TRIALS = whole_number(1, 100_000)
@@ -85,7 +86,7 @@ def _add_search_flags(parser: argparse.ArgumentParser) -> None:
     )
     add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
     add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
-    add("--pruner", default="auto", help="what ends hopeless trials (auto), or none")
+    add("--pruner", choices=tuple(PRUNERS), default="auto", help="what ends hopeless trials (auto)")
     add(
         "--n-startup-trials",
         type=whole_number(0, 100_000),

@@ -123,8 +123,8 @@ class Outcome:
     Attributes:
         retested: the settings that the search began with, then the others, the best in the search
             first.
-        winner: of the others, the best on the other seeds, where it is not worse than those that
-            the search began with; None where all are.
+        winner: of the others, the best on the other seeds, where it is better there than those that
+            the search began with, and no verdict says otherwise; None where all are.
         optimism: by how much the best of the search was better there than on the other seeds; None
             where it was not run again.
         reason: why there is no winner; empty where there is one.
@@ -235,7 +235,7 @@ def _verdict(environment: EnvironmentAnalysis | None, label: str) -> str:
 
 
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
-    """The best on other seeds, unless it is worse there than what the search began with."""
+    """The best on other seeds, unless it is no better there than what the search began with."""
     shipped, *others = retested
     there = [each for each in others if each.held_out is not None]
     if not there:
@@ -244,6 +244,6 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     best = max(there, key=lambda each: sign * (each.held_out or 0.0))
     if shipped.held_out is None:
         return None, "the shipped settings did not run"
-    if best.verdict == "worse" or sign * ((best.held_out or 0.0) - shipped.held_out) < 0:
-        return None, "none is as good as the shipped settings on other seeds"
+    if best.verdict == "worse" or sign * ((best.held_out or 0.0) - shipped.held_out) <= 0:
+        return None, "none is better than the shipped settings on other seeds"
     return best, ""
