@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from experiments.execution import RunFailure
+from experiments.launching import RunFailure
 from experiments.planned_runs import PlannedRun
 from pipeline.signs_of_life import (
     SECONDS_BETWEEN_LINES,
@@ -116,10 +116,10 @@ class StudyProgress:
 
     def _figures(self) -> str:
         seconds = time.monotonic() - self.started
-        text = f"{self.n_ended} of {self.n_missing} runs in {_duration(seconds)}"
+        text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
         if 0 < self.n_ended < self.n_missing:
             left = seconds / self.n_ended * (self.n_missing - self.n_ended)
-            text += f", about {_duration(left)} left"
+            text += f", about {duration(left)} left"
         return text
 
     def _table(self) -> Table:
@@ -137,7 +137,8 @@ class StudyProgress:
         return table
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time in hours, minutes and seconds, as far as they matter."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

@@ -1,0 +1,87 @@
+"""Where the trials of a tuning are kept: a file of its own, or what ``--storage`` names."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+from urllib.parse import urlsplit
+
+from pipeline.errors import UserError, one_line, shown
+
+if TYPE_CHECKING:
+    from optuna.storages import BaseStorage
+
+OWN_FILE = "trials.db"
+SECONDS_TO_WAIT = 120  # for others who write into the same SQLite file
+_JOURNAL = "journal:"
+_GRPC = "grpc"
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://)", re.IGNORECASE)
+_SECRET = re.compile(r"(?<=://)([^\s/@:]*):[^\s/@]*@")
+_ANY_PORT = 13000  # of Optuna's proxy
+_DATABASES = ("sqlite", "postgresql", "mysql", "mariadb")
+KNOWN = "a file for a journal, sqlite:///FILE, postgresql://..., mysql://..., grpc://HOST:PORT"
+
+
+def open_storage(root: Path, given: str | None) -> BaseStorage:
+    """The storage of a tuning.
+
+    Args:
+        root: the folder of the tuning.
+        given: what ``--storage`` says; None for a SQLite file in that folder.
+
+    Raises:
+        UserError: if it cannot be opened.
+    """
+    if given is None:
+        return _database(f"sqlite:///{root / OWN_FILE}")
+    scheme = _SCHEME.match(given)
+    try:
+        if scheme is None:
+            return _journal(Path(given.removeprefix(_JOURNAL)))
+        if scheme[0].lower() == _GRPC:
+            return _proxy(given)
+        if scheme[0].partition("+")[0].lower() not in _DATABASES:
+            raise UserError(f"--storage: {shown(without_secret(given))} is none: {KNOWN}")
+        return _database(given)
+    except ImportError as error:
+        raise UserError(f"--storage: {one_line(error)}: it has to be installed") from error
+
+
+def without_secret(text: str) -> str:
+    """The text with the password of each address in it left out."""
+    return _SECRET.sub(r"\1:***@", text)
+
+
+def _journal(path: Path) -> BaseStorage:
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    backend = JournalFileBackend(str(path), lock_obj=JournalFileOpenLock(str(path)))
+    return JournalStorage(backend)
+
+
+def _proxy(url: str) -> BaseStorage:
+    from optuna.storages import GrpcStorageProxy
+
+    parts = urlsplit(url)
+    if not parts.hostname:
+        raise UserError(f"--storage: which machine? {shown(url)} names none: grpc://HOST:PORT")
+    return GrpcStorageProxy(host=parts.hostname, port=parts.port or _ANY_PORT)
+
+
+def _database(url: str) -> BaseStorage:
+    from optuna.exceptions import StorageInternalError
+    from optuna.storages import RDBStorage
+    from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+
+    options = {}
+    if url.startswith("sqlite"):
+        options = {"connect_args": {"timeout": SECONDS_TO_WAIT}}
+    try:
+        # Optuna fills braces in.
+        return RDBStorage(url.replace("{", "{{").replace("}", "}}"), engine_kwargs=options)
+    except (SQLAlchemyError, StorageInternalError, ArgumentError, RuntimeError) as error:
+        reason = without_secret(one_line(error).partition("(Background on")[0].strip())
+        raise UserError(f"--storage {without_secret(url)}: cannot be opened: {reason}") from error

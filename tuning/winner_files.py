@@ -1,0 +1,71 @@
+"""The settings that won, as a file that says where they come from."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pipeline.files import write_text
+from tuning.entry_files import entry_text
+from tuning.retesting import Outcome, Retested
+from tuning.tuning_spec import CHEAPER_IS_BETTER, TuningSpec
+
+FILE = "winner.yml"
+
+_NAMES = {
+    "mean": "mean",
+    "iqm": "interquartile mean",
+    "lower": "lower quartile",
+}
+
+
+def write_winner(
+    tuning: TuningSpec, root: Path, outcome: Outcome, entry: Mapping[str, Any], n_trials: int
+) -> Path:
+    """Write the winner's entry, as `hyperparams/` and ``--conf-file`` take it; the file."""
+    path = root / FILE
+    write_text(path, entry_text(tuning, entry, provenance(tuning, outcome, n_trials)))
+    return path
+
+
+def remove_winner(root: Path) -> None:
+    """Remove the winner of a search that has gone on since and has none now."""
+    (root / FILE).unlink(missing_ok=True)
+
+
+def provenance(tuning: TuningSpec, outcome: Outcome, n_trials: int) -> list[str]:
+    """Where the winner's settings come from, in lines."""
+    winner, shipped = outcome.winner, outcome.retested[0]
+    assert winner is not None
+    seeds, held_out = tuning.study.seeds, tuning.held_out
+    others = len(outcome.retested) - 1
+    chosen = f", the best of {others} that were run again" if others > 1 else ""
+    return [
+        f"Tuned by tune.py on {time.strftime('%Y-%m-%d')}: trial {winner.number} of {n_trials} "
+        f"({tuning.sampler}), {_words(tuning)}",
+        f"over the seeds {seeds.start} to {seeds.stop - 1}: {_figure(winner.in_search)}.",
+        f"On the seeds {held_out.start} to {held_out.stop - 1}, which the search has not seen"
+        f"{chosen}: {_held_out(winner)};",
+        f"the settings before, there: {_held_out(shipped)}. Verdict: {winner.verdict}.",
+    ]
+
+
+def _words(tuning: TuningSpec) -> str:
+    lower = "upper quartile" if tuning.figure in CHEAPER_IS_BETTER else _NAMES["lower"]
+    name = lower if tuning.objective == "lower" else _NAMES[tuning.objective]
+    return f"{name} of {tuning.figure}"
+
+
+def _figure(value: float | None) -> str:
+    return "nothing" if value is None else f"{value:.4g}"
+
+
+def _held_out(each: Retested) -> str:
+    """The figure, and the interval of the mean."""
+    found, text = each.interval, _figure(each.held_out)
+    if math.isnan(found.low):
+        return text
+    return f"{text} (95 % interval {found.low:.4g} to {found.high:.4g}, {each.n_runs} runs)"
