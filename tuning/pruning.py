@@ -123,14 +123,15 @@ def cannot_win(scores: Scores, others: Sequence[Scores]) -> bool:
     return sum(scores.values()) + missing * perfect < total - 1e-9 * max(1.0, abs(total))
 
 
-def by_number_of_seeds(scores: Scores, others: Sequence[Scores]) -> bool:
-    """What the number of seeds of a whole trial calls for."""
-    many = len(_best(others)) >= SEEDS_FOR_RANKS
-    return (worse_by_ranks if many else below_median)(scores, others)
+def no_chance(scores: Scores, others: Sequence[Scores]) -> bool:
+    """Whether the trial cannot win, or has many seeds to come and loses by ranks."""
+    if cannot_win(scores, others):
+        return True
+    return len(_best(others)) >= SEEDS_FOR_RANKS and worse_by_ranks(scores, others)
 
 
 PRUNERS: Mapping[str, Callable[[Scores, Sequence[Scores]], bool]] = {
-    "auto": by_number_of_seeds,
+    "auto": no_chance,
     "none": never,
     "bound": cannot_win,
     "median": below_median,
