@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 from urllib.parse import urlsplit
 
 from pipeline.errors import UserError, one_line, shown
@@ -35,17 +35,32 @@ def open_storage(root: Path, given: str | None) -> BaseStorage:
     """
     if given is None:
         return _database(f"sqlite:///{root / OWN_FILE}")
-    scheme = _SCHEME.match(given)
     try:
-        if scheme is None:
-            return _journal(Path(given.removeprefix(_JOURNAL)))
-        if scheme[0].lower() == _GRPC:
-            return _proxy(given)
-        if scheme[0].partition("+")[0].lower() not in _DATABASES:
-            raise UserError(f"--storage: {shown(without_secret(given))} is none: {KNOWN}")
-        return _database(given)
+        match kind_of(given):
+            case "journal":
+                return _journal(Path(given.removeprefix(_JOURNAL)))
+            case "proxy":
+                return _proxy(given)
+            case "database":
+                return _database(given)
     except ImportError as error:
-        raise UserError(f"--storage: {one_line(error)}: it has to be installed") from error
+        lacking = one_line(error).partition(".")[0]
+        raise UserError(f"--storage {without_secret(given)}: {lacking}: install one") from error
+
+
+def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
+    """What a storage is by its name.
+
+    Raises:
+        UserError: if it is none.
+    """
+    scheme = _SCHEME.match(given)
+    if scheme is None:
+        return "journal"
+    name = scheme[0].partition("+")[0].lower()
+    if name not in (*_DATABASES, _GRPC):
+        raise UserError(f"--storage: {shown(without_secret(given))} is none: {KNOWN}")
+    return "proxy" if name == _GRPC else "database"
 
 
 def without_secret(text: str) -> str:
