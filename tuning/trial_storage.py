@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
 from pipeline.errors import UserError, one_line, shown
@@ -34,7 +34,7 @@ def open_storage(root: Path, given: str | None) -> BaseStorage:
         UserError: if it cannot be opened.
     """
     if given is None:
-        return _database(f"sqlite:///{root / OWN_FILE}")
+        return _own_file(root / OWN_FILE)
     try:
         match kind_of(given):
             case "journal":
@@ -68,6 +68,16 @@ def without_secret(text: str) -> str:
     return _SECRET.sub(r"\1:***@", text)
 
 
+def _own_file(path: Path) -> BaseStorage:
+    """A SQLite file. In an address, some signs of its path would mean something else."""
+    import sqlite3
+
+    def connect() -> sqlite3.Connection:
+        return sqlite3.connect(path, timeout=SECONDS_TO_WAIT, check_same_thread=False)
+
+    return _opened(f"sqlite:///{OWN_FILE}", {"creator": connect}, str(path))
+
+
 def _journal(path: Path) -> BaseStorage:
     from optuna.storages import JournalStorage
     from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
@@ -87,16 +97,20 @@ def _proxy(url: str) -> BaseStorage:
 
 
 def _database(url: str) -> BaseStorage:
-    from optuna.exceptions import StorageInternalError
-    from optuna.storages import RDBStorage
-    from sqlalchemy.exc import ArgumentError, SQLAlchemyError
-
     options = {}
     if url.startswith("sqlite"):
         options = {"connect_args": {"timeout": SECONDS_TO_WAIT}}
+    # Optuna fills braces in.
+    return _opened(url.replace("{", "{{").replace("}", "}}"), options, without_secret(url))
+
+
+def _opened(url: str, options: dict[str, Any], name: str) -> BaseStorage:
+    from optuna.exceptions import StorageInternalError
+    from optuna.storages import RDBStorage
+    from sqlalchemy.exc import SQLAlchemyError
+
     try:
-        # Optuna fills braces in.
-        return RDBStorage(url.replace("{", "{{").replace("}", "}}"), engine_kwargs=options)
-    except (SQLAlchemyError, StorageInternalError, ArgumentError, RuntimeError) as error:
+        return RDBStorage(url, engine_kwargs=options)
+    except (SQLAlchemyError, StorageInternalError, RuntimeError) as error:
         reason = without_secret(one_line(error).partition("(Background on")[0].strip())
-        raise UserError(f"--storage {without_secret(url)}: cannot be opened: {reason}") from error
+        raise UserError(f"--storage {name}: cannot be opened: {reason}") from error
