@@ -29,6 +29,7 @@ COMMANDS = {
     "train": "train an agent on an environment",
     "enjoy": "watch a trained agent",
     "compare": "compare agents over seeds, and write a page",
+    "tune": "search for an agent's settings, and test them on other seeds",
     "inspect": "say what a model file holds, and run nothing of it",
 }
 

@@ -129,10 +129,10 @@ class StudyProgress:
 
     def _figures(self) -> str:
         seconds = time.monotonic() - self.started
-        text = f"{self.n_ended} of {self.n_missing} runs in {_duration(seconds)}"
+        text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
         if 0 < self.n_ended < self.n_missing:
             left = seconds / self.n_ended * (self.n_missing - self.n_ended)
-            text += f", about {_duration(left)} left"
+            text += f", about {duration(left)} left"
         words = self._launcher.words if self._launcher is not None else ""
         text += f", {words}" if words else ""
         n_failed = self.failed.total()
@@ -153,7 +153,8 @@ class StudyProgress:
         return table
 
 
-def _duration(seconds: float) -> str:
+def duration(seconds: float) -> str:
+    """A time in hours, minutes and seconds, as far as they matter."""
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:

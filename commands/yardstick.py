@@ -35,6 +35,10 @@ def _carry_out(command: str) -> int:
         from commands import inspect_model
 
         return inspect_model.main()
+    if command == "tune":
+        from commands import tune_agent
+
+        return tune_agent.main()
     from commands import compare_agents
 
     return compare_agents.main()

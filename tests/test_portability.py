@@ -20,6 +20,7 @@ PACKAGES = [
     "agents",
     "pipeline",
     "experiments",
+    "tuning",
     "report",
     "commands",
 ]

@@ -6,7 +6,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from typing import Any, get_args
 
 from pipeline.errors import UserError, shown, unknown
 from pipeline.settings.coercion import ScheduleSpec, coerce
@@ -80,6 +80,9 @@ def algorithm_parameters(cls: type) -> dict[str, inspect.Parameter]:
 def _annotated(parameter: inspect.Parameter) -> inspect.Parameter:
     """The argument, with what its default says where it has no annotation."""
     default = parameter.default
+    if set(get_args(parameter.annotation)) == {float, Callable}:
+        # A number or a function of no said kind: sb3-contrib's TQC means a schedule.
+        return parameter.replace(annotation=float | Callable[[float], float])
     if parameter.annotation is not parameter.empty or isinstance(default, bool):
         return parameter
     kinds: dict[type, Any] = {

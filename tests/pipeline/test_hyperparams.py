@@ -22,7 +22,11 @@ from pipeline.errors import UserError
 from pipeline.settings.action_noise import action_noise, check_action_noise
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
 from pipeline.settings.coercion import ScheduleSpec, coerce, parse_schedule
-from pipeline.settings.constructor_arguments import RANGES, constructor_parameters
+from pipeline.settings.constructor_arguments import (
+    RANGES,
+    algorithm_parameters,
+    constructor_parameters,
+)
 from pipeline.settings.hyperparam_entries import (
     NoEntryError,
     entry_names,
@@ -55,6 +59,7 @@ ZOO_ENTRIES = [
 PPO = constructor_parameters(sb3.PPO)
 DQN = constructor_parameters(sb3.DQN)
 TD3 = constructor_parameters(sb3.TD3)
+TQC = algorithm_parameters(load_algorithm("tqc"))
 QLEARNING = constructor_parameters(load_algorithm("qlearning"))
 
 
@@ -446,6 +451,9 @@ def test_an_agents_own_noise_is_its_own() -> None:
         (PPO, "learning_rate", "1e-4", 1e-4),
         (PPO, "learning_rate", 1, 1.0),
         (PPO, "learning_rate", "lin_1e-3", ScheduleSpec("linear", 1e-3, 0.0)),
+        # Whose annotation does not say what the function takes.
+        (TQC, "learning_rate", "lin_1e-3", ScheduleSpec("linear", 1e-3, 0.0)),
+        (TQC, "learning_rate", 1, 1.0),
         (PPO, "clip_range_vf", None, None),
         (PPO, "n_steps", 1e3, 1000),
         (PPO, "n_steps", "1e3", 1000),

@@ -1,0 +1,165 @@
+"""One driver of a tuning, from the first trial to the file with the winner."""
+
+from __future__ import annotations
+
+import _thread
+import shlex
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+
+from commands.parsing import called_as
+from commands.study_output import conclude, do_missing, read, say
+from commands.tune_output import (
+    print_entry,
+    print_opened,
+    print_outcome,
+    print_search,
+    print_winner,
+)
+from commands.tune_progress import TuningProgress
+from experiments.child_processes import stop_all
+from experiments.launching import Launchers
+from experiments.study_plan import plan
+from pipeline.folder_lock import FolderInUseError, folder_lock
+from pipeline.signs_of_life import doing
+from tuning.opening import OpenTuning
+from tuning.record import write_record
+from tuning.retesting import (
+    FOLDER,
+    Candidate,
+    Outcome,
+    best_trials,
+    chosen_for_retest,
+    concluded,
+    retest_study,
+)
+from tuning.searching import Search
+from tuning.winner_files import FILE as WINNER
+from tuning.winner_files import remove_winner, write_winner
+
+
+@dataclass(frozen=True)
+class How:
+    """How a tuning is done.
+
+    Attributes:
+        launchers: of a folder, where its runs are done.
+        where: the same, in words.
+        command: the command that asked for it.
+        deadline: when the search begins no further run, by `time.monotonic`.
+        with_page: draw figures and write pages.
+    """
+
+    launchers: Callable[[Path], Launchers]
+    where: str
+    command: str
+    deadline: float
+    with_page: bool
+
+
+def drive(console: Console, place: OpenTuning, how: How) -> int:
+    """Search, run the best again, and say what came of it; the exit code."""
+    with place.queue:
+        print_opened(console, place, how.where)
+        _search(console, place, how)
+    print_search(console, place)
+    try:
+        return _judge(console, place, how)
+    except FolderInUseError as error:
+        say(console, f"another driver does the re-test: {error}")
+        return 0
+
+
+def _search(console: Console, place: OpenTuning, how: How) -> None:
+    def ended() -> dict[int, float | None]:
+        trials = [trial for trial in place.queue.trials() if trial.state.is_finished()]
+        return {t.number: t.value if t.state.name == "COMPLETE" else None for t in trials}
+
+    tuning, queue = place.tuning, place.queue
+    if queue.is_done:
+        return
+    progress = TuningProgress(console, queue.n_trials, ended, is_cost=tuning.is_cost)
+    with progress, how.launchers(place.root)() as launcher:
+        Search(
+            tuning,
+            place.root,
+            queue,
+            place.suggestions,
+            launcher,
+            place.hopeless,
+            progress,
+            how.deadline,
+        ).run()
+
+
+def _judge(console: Console, place: OpenTuning, how: How) -> int:
+    """Run the best again, and write down what won."""
+    tuning = place.tuning
+    ranked = best_trials(place.queue.trials(), is_cost=tuning.is_cost)
+    candidates = chosen_for_retest(ranked, tuning.retest)
+    if not candidates:
+        if tuning.retest:
+            say(console, "no settings but the shipped ones were judged to the end: no re-test")
+        write_record(place, None, how.command, None)
+        return 0
+    root = place.root / FOLDER
+    lost = partial(_give_way, console, root)
+    with folder_lock(root, lost, partial(say, console)):
+        code, outcome = _retested(console, place, how, ranked, candidates)
+        winner = next((c for c in candidates if _is(c, outcome)), None)
+        path = None
+        if winner is None:
+            remove_winner(place.root)
+        else:
+            n_trials = place.queue.n_trials
+            path = write_winner(tuning, place.root, outcome, winner.entry, n_trials)
+        write_record(place, outcome, how.command, None if path is None else WINNER)
+    print_outcome(console, place, outcome)
+    if winner is not None and path is not None:
+        print_winner(console, outcome, path, _use(place, path))
+        print_entry(console, winner.entry, place.suggestions.shipped)
+    return code
+
+
+def _use(place: OpenTuning, path: Path) -> str:
+    """How to train with what won."""
+    tuning = place.tuning
+    words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id]
+    return f"{called_as('train')} {shlex.join([*words, '--conf-file', str(path)])}"
+
+
+def _is(candidate: Candidate, outcome: Outcome) -> bool:
+    return outcome.winner is not None and outcome.winner.number == candidate.number
+
+
+def _retested(
+    console: Console,
+    place: OpenTuning,
+    how: How,
+    ranked: list[Candidate],
+    candidates: list[Candidate],
+) -> tuple[int, Outcome]:
+    """The exit code, and what the re-test shows."""
+    from experiments.analysis import analyse
+    from experiments.looking import take_looks
+
+    root = place.root / FOLDER
+    study = retest_study(place.tuning, place.root, candidates)
+    planned = plan(study, root)
+    failures = do_missing(console, planned, root, how.launchers(root), how.where)
+    results = read(console, study, planned, root)
+    code = conclude(console, results, failures, how.command, with_page=how.with_page)
+    with doing(console, "judging the winner") as activity:
+        analysis = analyse(results, activity.at, take_looks(results))
+        return code, concluded(place.tuning, ranked, candidates, analysis)
+
+
+def _give_way(console: Console, root: Path) -> None:
+    say(console, f"{root}: another driver has taken this one for dead; this one stops")
+    stop_all()
+    _thread.interrupt_main(signal.SIGTERM)

@@ -1,0 +1,110 @@
+"""What ``tune.py`` prints of a search and its re-test, and the files that it writes."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from commands.study_output import say
+from commands.study_progress import duration
+from tuning.opening import OpenTuning
+from tuning.retesting import Outcome, Retested
+from tuning.trial_queue import FAILURE, FIGURES, SECONDS
+
+
+def print_opened(console: Console, place: OpenTuning, where: str) -> None:
+    """Say what there is to do."""
+    tuning, space = place.tuning, place.suggestions.space
+    n_there = sum(trial.state.is_finished() for trial in place.queue.trials())
+    say(
+        console,
+        f"{place.queue.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them "
+        f"there already; {place.suggestions.n_free} settings to choose; {where}, in {place.root}",
+    )
+    for name in space.widened:
+        say(console, f"{name}: the search space is widened to hold the shipped value")
+
+
+def print_search(console: Console, place: OpenTuning) -> None:
+    """Say what the search has cost, and what it has found."""
+    trials, tuning = place.queue.trials(), place.tuning
+    states = Counter(
+        "failed" if FAILURE in trial.user_attrs else _STATES.get(trial.state.name, "to do")
+        for trial in trials
+    )
+    n_runs = sum(len(trial.user_attrs.get(FIGURES, {})) for trial in trials)
+    seconds = sum(float(trial.user_attrs.get(SECONDS, 0.0)) for trial in trials)
+    counts = ", ".join(f"{count} {state}" for state, count in states.items())
+    say(
+        console,
+        f"{len(trials)} trials: {counts}; {n_runs} of {len(trials) * len(tuning.seeds)} runs, "
+        f"{duration(seconds)} of training",
+    )
+
+
+_STATES = {"COMPLETE": "judged to the end", "PRUNED": "ended early", "FAIL": "failed"}
+
+
+def print_outcome(console: Console, place: OpenTuning, outcome: Outcome) -> None:
+    """Print what the re-test shows: a table, and what follows from it."""
+    tuning = place.tuning
+    held_out = tuning.held_out
+    console.print()
+    table = Table(
+        box=None,
+        pad_edge=False,
+        title=f"re-test on the seeds {held_out.start} to {held_out.stop - 1}",
+        title_justify="left",
+    )
+    for heading in ("settings", "in the search", "on other seeds", "95 % interval", "is", "runs"):
+        table.add_column(heading)
+    for each in outcome.retested:
+        table.add_row(*_cells(each))
+    console.print(table, highlight=False)
+    if outcome.optimism is not None:
+        say(
+            console,
+            "optimism of the search, its best there less the same on other seeds: "
+            f"{round(outcome.optimism, 9):+.4g}",
+        )
+    if outcome.winner is None:
+        say(console, f"no winner: {outcome.reason}; they stay as they are")
+
+
+def _cells(each: Retested) -> list[str]:
+    interval = each.interval
+    ends = "" if math.isnan(interval.low) else f"{interval.low:.4g} to {interval.high:.4g}"
+    return [
+        each.label,
+        _figure(each.in_search),
+        _figure(each.held_out),
+        ends,
+        each.verdict,
+        str(each.n_runs),
+    ]
+
+
+def _figure(value: float | None) -> str:
+    return "" if value is None else f"{value:.4g}"
+
+
+def print_winner(console: Console, outcome: Outcome, path: Path, how: str) -> None:
+    """Say which settings won, and where they are."""
+    assert outcome.winner is not None
+    say(console, f"winner: {outcome.winner.label}, in {path}: {how}")
+
+
+def print_entry(console: Console, entry: Mapping[str, Any], shipped: Mapping[str, Any]) -> None:
+    """Print what settings differ in from those that the search began with."""
+    for key in _differing(entry, shipped):
+        say(console, f"  {key}: {entry.get(key, 'left out')} (was {shipped.get(key, 'left out')})")
+
+
+def _differing(entry: Mapping[str, Any], shipped: Mapping[str, Any]) -> Sequence[str]:
+    return [key for key in {**shipped, **entry} if entry.get(key) != shipped.get(key)]

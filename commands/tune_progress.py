@@ -1,0 +1,124 @@
+"""What a person watching a search sees: a line that moves, or one now and then."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from types import TracebackType
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from commands.study_progress import duration
+from pipeline.signs_of_life import (
+    SECONDS_BETWEEN_LINES,
+    SECONDS_BETWEEN_LOOKS,
+    Heartbeat,
+    Silence,
+    can_move,
+)
+
+# To read all trials takes time, where there are many.
+SECONDS_BETWEEN_QUESTIONS = 5.0
+
+
+class TuningProgress:
+    """How far a search is, and the best that was found.
+
+    Args:
+        console: where to.
+        n_trials: how many there are to be.
+        ended: says what the trials were judged that have ended, other drivers' among them, by
+            number; None for those that were ended early.
+        is_cost: whether the lower value is the better.
+    """
+
+    def __init__(
+        self,
+        console: Console,
+        n_trials: int,
+        ended: Callable[[], dict[int, float | None]],
+        *,
+        is_cost: bool,
+    ) -> None:
+        self.console, self.n_trials, self.is_cost = console, n_trials, is_cost
+        self._ended, self._asked_at = ended, time.monotonic()
+        self.values = ended()
+        self.n_before = len(self.values)
+        self.n_runs = 0
+        self.started = time.monotonic()
+        self.silence = Silence(SECONDS_BETWEEN_LINES)
+        self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
+        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
+
+    def __enter__(self) -> TuningProgress:
+        if self.live is not None:
+            self.live.start()
+        self.heart.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.heart.stop()
+        if self.live is not None:
+            self._draw()
+            self.live.stop()
+        if isinstance(error, KeyboardInterrupt):
+            self._say(f"{self.figures()}; the same command goes on")
+
+    def run_ended(self) -> None:
+        """Count a run that has ended."""
+        self.n_runs += 1
+        if time.monotonic() > self._asked_at + SECONDS_BETWEEN_QUESTIONS:
+            self.values, self._asked_at = self._ended(), time.monotonic()
+        self.look()
+
+    def trial_ended(self, number: int, value: float | None, reason: str) -> None:
+        """Count a trial that has ended; one that is the best so far gets a line that stays."""
+        best = self.best()
+        self.values[number] = value
+        if reason:
+            self._say(f"trial {number} failed: {reason}")
+        elif value is not None and (best is None or self._is_better(value, best[1])):
+            self._say(f"trial {number}: {value:.4g}, the best so far")
+
+    def _is_better(self, value: float, other: float) -> bool:
+        return value < other if self.is_cost else value > other
+
+    def best(self) -> tuple[int, float] | None:
+        """The best trial and what it was judged; None before there is any."""
+        judged = [(number, value) for number, value in self.values.items() if value is not None]
+        sign = 1 if self.is_cost else -1
+        return min(judged, key=lambda each: (sign * each[1], each[0]), default=None)
+
+    def look(self) -> None:
+        """Show how far it is, also while no run ends."""
+        if self.live is not None:
+            self._draw()
+        elif self.silence.is_too_long:
+            self._say(self.figures())
+
+    def _draw(self) -> None:
+        if self.live is not None:
+            self.live.update(Text(self.figures()), refresh=True)
+
+    def _say(self, line: str) -> None:
+        self.silence.end()
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def figures(self) -> str:
+        """How far it is, in a line."""
+        seconds = time.monotonic() - self.started
+        ended, new = len(self.values), len(self.values) - self.n_before
+        text = f"{ended} of {self.n_trials} trials, {self.n_runs} runs in {duration(seconds)}"
+        best = self.best()
+        if best is not None:
+            text += f"; best {best[1]:.4g} (trial {best[0]})"
+        if new > 0 and ended < self.n_trials:
+            text += f"; about {duration(seconds / new * (self.n_trials - ended))} left"
+        return text

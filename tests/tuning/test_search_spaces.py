@@ -1,0 +1,337 @@
+"""Search spaces: read strictly, asked by Optuna, and back from settings."""
+
+import math
+
+import gymnasium as gym
+import optuna
+import pytest
+from optuna.trial import FixedTrial
+
+from agents import ALGORITHMS, load_algorithm
+from pipeline.errors import UserError
+from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
+from pipeline.settings.components import wrapper_factory
+from pipeline.settings.hyperparam_entries import entry_names, read_hyperparams
+from pipeline.settings.hyperparams import split
+from pipeline.settings.strict_yaml import read_yaml
+from tuning import search_spaces
+from tuning.dimensions import same
+from tuning.search_spaces import corners, read_search_space
+
+FOLDER = search_spaces._FOLDER
+NOTHING_TO_SEARCH = {"optimal", "random", "angle", "mabwiser_thompson"}
+SEARCHED = [name for name in ALGORITHMS if name not in NOTHING_TO_SEARCH]
+
+DQN_SPACE = """
+default:
+  learning_rate: {low: 0.001, high: 0.1, scale: log, forms: [constant, linear, exponential]}
+  gamma: {low: 0.9, high: 0.999, scale: log_below_one, forms: [constant, 1.0]}
+  batch_size: {low: 32, high: 128, scale: powers_of_two}
+  n_steps: {low: 1, high: 5}
+  updates:
+    sets: {few: {train_freq: 16, gradient_steps: 1}, many: {train_freq: 4, gradient_steps: 8}}
+  max_grad_norm: [1, 10]
+  exploration_fraction: {low: 0.1, high: 0.9, when: {max_grad_norm: 10}}
+  policy_kwargs.net_arch: {choices: {small: [32], large: [64, 64]}}
+  train_env_wrapper:
+    choices: {plain: null, tenth: {envs.wrappers.ScaleReward: {scale: 0.1}}}
+Taxi-v4:
+  n_steps: null
+  max_grad_norm: [2, 20]
+  exploration_fraction: {low: 0.1, high: 0.2}
+"""
+
+
+class Masked(gym.Env):
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def action_masks(self):
+        return [False, True]
+
+    def step(self, action):
+        return 1, 0.0, True, False, {}
+
+
+@pytest.fixture
+def space(tmp_path):
+    return read(tmp_path, DQN_SPACE)
+
+
+def read(tmp_path, text, env_id="Foo-v0", algo="dqn"):
+    path = tmp_path / "space.yml"
+    path.write_text(text, encoding="utf-8")
+    return read_search_space(algo, env_id, path)
+
+
+def shipped(algo):
+    """The entries of an agent's files, both of settings and of spaces, by environment."""
+    names = [*entry_names(algo), *(set(read_yaml(FOLDER / f"{algo}.yml")) - {"default"})]
+    names = list(dict.fromkeys(names))
+    entries = {name: read_hyperparams(algo, name) for name in names}
+    return {**entries, "Unknown-v0": read_hyperparams(algo, "Unknown-v0")}
+
+
+# --- the files that come with the project ---------------------------------------------------------
+
+
+def test_every_agent_has_a_file():
+    assert {path.name for path in FOLDER.iterdir()} == {f"{name}.yml" for name in ALGORITHMS}
+
+
+@pytest.mark.parametrize("algo", sorted(NOTHING_TO_SEARCH))
+def test_an_agent_without_settings_is_refused(algo):
+    with pytest.raises(UserError, match=f"nothing to search for {algo}"):
+        read_search_space(algo, "CartPole-v1")
+
+
+# Ranges are chosen so that what ships lies inside, but for what no range should hold.
+WIDENED = {("qrdqn", "FrozenLake-v1"): ("policy_kwargs.net_arch",)}  # no hidden layer
+
+
+@pytest.mark.parametrize("algo", SEARCHED)
+def test_shipped_settings_are_a_trial_and_come_back(algo):
+    for env_id, entry in shipped(algo).items():
+        space = read_search_space(algo, env_id).including(entry)
+        assert space.widened == WIDENED.get((algo, env_id), ())
+        params = space.params_of(entry)
+        assert params.keys() <= space.distributions().keys()
+        again = space.merged(entry, space.suggest(FixedTrial(params)))
+        before, after = space._flat(entry), space._flat(again)
+        for key in space.keys:
+            # What is left out now exists under a condition that is not met.
+            assert same(after[key], before[key]) or key not in again
+        assert {*again} - {*entry} <= {key.partition(".")[0] for key in space.keys}
+
+
+@pytest.mark.parametrize("algo", SEARCHED)
+def test_an_agent_takes_every_end_and_every_choice(algo):
+    algorithm = load_algorithm(algo)
+    env = environment_for(algo)
+    for env_id in [*read_yaml(FOLDER / f"{algo}.yml"), "Unknown-v0"]:
+        entry = read_hyperparams(algo, env_id)
+        space = read_search_space(algo, env_id)
+        for number, settings in enumerate(corners(space)):
+            read = split(space.merged(entry, settings))
+            for key in ("env_wrapper", "train_env_wrapper"):
+                wrapper_factory(getattr(read, key), where=key)
+            given = {"policy": default_policy(algorithm, is_dict=False), **read.algorithm}
+            kwargs = build_algorithm_kwargs(algorithm, given, algo)
+            if number < 2 and env_id == "Unknown-v0":
+                algorithm(env=env, **{**kwargs, **one_transition(kwargs)})
+    env.close()
+
+
+def one_transition(kwargs):
+    """Room for replay takes time to make, and its size is checked already."""
+    return {"buffer_size": 10} if "buffer_size" in kwargs else {}
+
+
+def environment_for(algo):
+    makers = [
+        lambda i=i: gym.make(i) for i in ("FrozenLake-v1", "GaussianBandit-v0", "Pendulum-v1")
+    ]
+    for make in [*makers, Masked]:
+        env = make()
+        if ALGORITHMS[algo].env_misfit(env) == "":
+            return env
+        env.close()
+    raise LookupError(algo)
+
+
+# --- settings and parameters ----------------------------------------------------------------------
+
+
+def test_what_optuna_chooses_becomes_settings(space):
+    params = {
+        "learning_rate_form": "exponential",
+        "learning_rate": 0.05,
+        "learning_rate_final_share": 0.1,
+        "gamma_form": "constant",
+        "one_minus_gamma": 0.005,
+        "log2_batch_size": 6,
+        "n_steps": 3,
+        "updates": "many",
+        "max_grad_norm": 10,
+        "exploration_fraction": 0.25,
+        "policy_kwargs.net_arch": "large",
+        "train_env_wrapper": "tenth",
+    }
+    settings = space.suggest(FixedTrial(params))
+    assert settings == {
+        "learning_rate": "exp_0.05_0.005",
+        "gamma": 0.995,
+        "batch_size": 64,
+        "n_steps": 3,
+        "train_freq": 4,
+        "gradient_steps": 8,
+        "max_grad_norm": 10,
+        "exploration_fraction": 0.25,
+        "policy_kwargs": {"net_arch": [64, 64]},
+        "train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 0.1}},
+    }
+    assert close(space.params_of(settings), params)
+    assert params.keys() == space.distributions().keys()
+
+
+def test_what_does_not_exist_is_not_asked_for_and_leaves_the_entry(space):
+    params = {
+        "learning_rate_form": "linear",
+        "learning_rate": 0.05,
+        "gamma_form": 1.0,
+        "log2_batch_size": 5,
+        "n_steps": 1,
+        "updates": "few",
+        "max_grad_norm": 1,
+        "policy_kwargs.net_arch": "small",
+        "train_env_wrapper": "plain",
+    }
+    settings = space.suggest(FixedTrial(params))
+    assert (settings["learning_rate"], settings["gamma"]) == ("lin_0.05", 1.0)
+    assert "exploration_fraction" not in settings
+    entry = {
+        "n_timesteps": 10,
+        "exploration_fraction": 0.5,
+        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.ReLU)",
+    }
+    merged = space.merged(entry, settings)
+    assert "exploration_fraction" not in merged
+    assert merged["policy_kwargs"] == {"net_arch": [32], "activation_fn": "nn.ReLU"}
+    assert merged["n_timesteps"] == 10
+    assert space.params_of(merged) == params
+
+
+def test_an_environments_entry_changes_the_default(tmp_path):
+    space = read(tmp_path, DQN_SPACE, "module:Taxi-v4")
+    ranges = space.distributions()
+    assert "n_steps" not in ranges
+    assert ranges["max_grad_norm"].choices == (2, 20)
+    assert ranges["exploration_fraction"].high == 0.2
+    assert ranges["log2_batch_size"].high == 7
+
+
+def test_every_setting_leads_back_to_itself(space):
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(0))
+    for _ in range(200):
+        trial = study.ask()
+        settings = space.suggest(trial)
+        params = space.params_of(settings)
+        assert close(params, trial.params)
+        assert space.suggest(FixedTrial(params)) == settings
+
+
+def close(first, second):
+    """Equal, but for the digits after the sixth."""
+    return first.keys() == second.keys() and all(
+        math.isclose(value, second[name], rel_tol=1e-5)
+        if isinstance(value, float)
+        else value == second[name]
+        for name, value in first.items()
+    )
+
+
+def test_settings_outside_widen_the_space(space):
+    entry = {
+        "learning_rate": 0.5,
+        "gamma": 0.5,
+        "batch_size": 100,
+        "train_freq": 2,
+        "gradient_steps": 2,
+        "max_grad_norm": 5,
+        "train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": 7}},
+    }
+    with pytest.raises(UserError, match=r"learning_rate: the search space does not hold 0\.5"):
+        space.params_of(entry)
+    wider = space.including(entry)
+    params = wider.params_of(entry)
+    assert params["learning_rate"] == 0.5
+    assert params["one_minus_gamma"] == 0.5
+    assert params["batch_size_form"] == 100
+    assert params["updates"] == params["train_env_wrapper"] == "shipped"
+    assert params["max_grad_norm"] == 5
+    assert params["policy_kwargs.net_arch"] == "shipped"
+    again = wider.merged(entry, wider.suggest(FixedTrial(params)))
+    assert again == {**entry, "n_steps": 1, "policy_kwargs": {"net_arch": None}}
+    assert wider.widened == (
+        "learning_rate",
+        "gamma",
+        "batch_size",
+        "updates",
+        "max_grad_norm",
+        "policy_kwargs.net_arch",
+        "train_env_wrapper",
+    )
+    assert wider.including(entry) == wider
+
+
+@pytest.mark.parametrize("rate", [0, 0.0123456789, "lin_0.05_0.001", "1e-3", -1, None])
+def test_whatever_ships_can_be_said(space, rate):
+    entry = {"learning_rate": rate, "max_grad_norm": 1, "policy_kwargs": {"net_arch": [32]}}
+    wider = space.including(entry)
+    assert same(wider.suggest(FixedTrial(wider.params_of(entry)))["learning_rate"], rate)
+
+
+def test_a_grid_goes_from_end_to_end(space):
+    grid = space.grid(3)
+    assert grid.keys() == space.distributions().keys()
+    assert grid["learning_rate"] == [0.001, 0.01, 0.1]
+    assert grid["one_minus_gamma"] == pytest.approx([0.001, 0.01, 0.1])
+    assert grid["log2_batch_size"] == [5, 6, 7]
+    assert grid["n_steps"] == [1, 3, 5]
+    assert grid["gamma_form"] == ["constant", 1.0]
+    for name, values in grid.items():
+        for value in values:
+            assert space.distributions()[name]._contains(
+                space.distributions()[name].to_internal_repr(value)
+            )
+
+
+# --- mistakes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[1]", "must map environment ids"),
+        ("default: 3", "must map environment ids"),
+        ("CartPole-v1: {gamma: [0.9, 1.0]}", "no entry for 'Foo-v0', and no default"),
+        ("default: {lerning_rate: {low: 0.1, high: 1.0}}", "did you mean 'learning_rate'"),
+        ("default: {gamma: {lo: 0.1, high: 1.0}}", "gamma: unknown key 'lo': did you mean 'low'"),
+        ("default: {gamma: {low: 0.1}}", "gamma: high is missing"),
+        ("default: {gamma: {low: 0.9, high: 0.1}}", "low must be below high"),
+        ("default: {gamma: {low: 0.9, high: 1.5}}", "gamma must be between 0 and 1, not 1.5"),
+        ("default: {gamma: {low: 0.0, high: 0.5, scale: log}}", "needs low above 0"),
+        ("default: {gamma: {low: 0.5, high: 1.0, scale: log_below_one}}", "needs high below 1"),
+        ("default: {gamma: {low: 0.5, high: 0.9, scale: logg}}", "did you mean 'log'"),
+        ("default: {batch_size: {low: 30, high: 64, scale: powers_of_two}}", "powers of two"),
+        ("default: {batch_size: {low: 2.5, high: 3.5}}", "batch_size must be a whole number"),
+        ("default: {gamma: {low: 0.1, high: 0.9, forms: [linaer]}}", "one of constant, linear"),
+        ("default: {gamma: {low: 0.1, high: 0.9, forms: [constant, [1]]}}", "single values"),
+        ("default: {gamma: 0.9}", "gamma must be a list of values, or map low and high"),
+        ("default: {gamma: [0.9]}", "two values at least"),
+        ("default: {train_freq: [[1, episode], 4]}", "needs a name, as in choices"),
+        ("default: {gamma: [0.9, 0.8], tau: {low: 0.1, high: 1.0, when: {gama: 0.9}}}", "'gamma'"),
+        ("default: {gamma: [0.9, 0.8], tau: {low: 0.1, high: 1.0, when: {gamma: 1}}}", "no value"),
+        ("default: {gamma: {low: 0.1, high: 0.9, final_share: [1, 0]}}", "final_share must be two"),
+        ("default: {seed: [1, 2]}", "seed is set by --seed"),
+        ("default: {n_steps: [1, 2], n_steps: [2, 3]}", "appears twice"),
+        ("default: {policy_kwargs.x: !!python/name:os.system [1, 2]}", "not allowed"),
+    ],
+)
+def test_a_mistake_is_one_line_that_says_where(tmp_path, text, message):
+    with pytest.raises(UserError) as error:
+        read(tmp_path, text)
+    assert message in str(error.value)
+    assert "space.yml" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_an_agent_of_ones_own_brings_its_file(tmp_path):
+    with pytest.raises(UserError, match="--search-space FILE"):
+        read_search_space("mine", "CartPole-v1")
+    with pytest.raises(UserError, match="there is no such file"):
+        read_search_space("dqn", "CartPole-v1", tmp_path / "none.yml")

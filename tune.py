@@ -1,0 +1,10 @@
+"""Search for an agent's hyperparameters: ``python tune.py --env Warehouse-v0 --algo ppo``."""
+
+try:
+    from commands.parsing import run_command
+    from commands.tune_agent import main
+except KeyboardInterrupt:  # before there is anything to be stopped
+    raise SystemExit(130) from None
+
+if __name__ == "__main__":
+    run_command(main)

@@ -1,0 +1,104 @@
+"""A tuning that is ready: everything checked, and what keeps its trials open."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agents import ALGORITHMS
+from experiments.planned_runs import PlannedRun
+from experiments.study_plan import check_settings, plan
+from pipeline.errors import UserError
+from tuning.pruning import is_hopeless
+from tuning.samplers import make_sampler
+from tuning.search_spaces import read_search_space
+from tuning.study_opening import open_study
+from tuning.suggesting import Suggestions
+from tuning.trial_queue import FIGURES, TrialQueue, turn
+from tuning.trial_storage import open_storage
+from tuning.tuning_spec import AUTO, TuningSpec
+
+if TYPE_CHECKING:
+    from optuna import Study
+
+
+@dataclass(frozen=True)
+class OpenTuning:
+    """A tuning, and where it is.
+
+    Attributes:
+        tuning: what is asked for.
+        root: its folder.
+        study: of Optuna.
+        queue: its trials.
+        suggestions: what they try.
+    """
+
+    tuning: TuningSpec
+    root: Path
+    study: Study
+    queue: TrialQueue
+    suggestions: Suggestions
+
+    def hopeless(self, number: int, figures: Mapping[int, float]) -> bool:
+        """Whether a trial has no more hope to be the best, by its seeds so far."""
+        sign = -1.0 if self.tuning.is_cost else 1.0
+        others = {
+            trial.number: {int(k): sign * v for k, v in trial.user_attrs.get(FIGURES, {}).items()}
+            for trial in self.queue.trials()
+            if trial.number != number
+        }
+        scores = {seed: sign * figure for seed, figure in figures.items()}
+        return is_hopeless(scores, list(others.values()), self.tuning.pruner)
+
+
+def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
+    """A run of the agent as it is without the search.
+
+    Raises:
+        UserError: if it cannot be trained so.
+    """
+    study = replace(tuning.study, n_seeds=1)
+    planned = plan(study, root)
+    check_settings(study, planned)
+    return planned[0]
+
+
+def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:
+    """Check what is asked for, and open what keeps its trials.
+
+    Args:
+        tuning: what is asked for.
+        root: its folder; it is made, where there is nothing to complain of.
+        storage: what ``--storage`` says.
+
+    Raises:
+        UserError: if it cannot be done so, or is not what was begun under this name.
+    """
+    run = shipped_run(tuning, root)
+    if tuning.figure == AUTO:
+        is_bandit = ALGORITHMS[tuning.agent.algo].for_bandits
+        tuning = replace(tuning, figure="regret" if is_bandit else "score")
+    agent = tuning.agent
+    space = read_search_space(agent.algo, tuning.environment.env_id, tuning.search_space)
+    suggestions = Suggestions(tuning, space, run.spec.saved_hyperparams)
+    if not suggestions.n_free:
+        raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
+    n_trials = suggestions.n_trials
+    asked = tuning.identity(suggestions.shipped, _as_json(suggestions))
+    root.mkdir(parents=True, exist_ok=True)
+    with turn(root):  # of several that make a file's tables at once, all but one would fail
+        opened = open_storage(root, storage)
+    name = tuning.study.name
+    study = open_study(name, root, opened, make_sampler(tuning), asked, is_cost=tuning.is_cost)
+    return OpenTuning(tuning, root, study, TrialQueue(study, root, n_trials), suggestions)
+
+
+def _as_json(suggestions: Suggestions) -> dict[str, Any]:
+    from optuna.distributions import distribution_to_json
+
+    return {
+        name: distribution_to_json(kind) for name, kind in suggestions.space.distributions().items()
+    }

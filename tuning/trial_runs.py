@@ -1,0 +1,33 @@
+"""The runs of a trial: one for each seed, in folders that equal settings share."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from experiments.planned_runs import PlannedRun
+from experiments.study_plan import plan
+from experiments.study_spec import AgentSpec
+from pipeline.json_text import json_text
+from tuning.tuning_spec import TuningSpec
+
+
+def name_of(entry: Mapping[str, Any]) -> str:
+    """What settings are called: the same for the same, in whatever order they stand."""
+    text = json_text({key: entry[key] for key in sorted(entry)})
+    return f"settings-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
+    """One run of a trial.
+
+    Raises:
+        UserError: if an agent cannot be trained so.
+    """
+    agent = AgentSpec(name_of(entry), tuning.agent.algo, dict(entry), tuned=False)
+    study = replace(tuning.study, agents=(agent,), first_seed=seed, n_seeds=1)
+    (planned,) = plan(study, root)
+    return planned
