@@ -10,7 +10,7 @@ from pipeline.errors import OTHER_NAMES, did_you_mean
 from pipeline.settings.constructor_arguments import RANGES
 from pipeline.settings.hyperparams import SPECIAL_KEYS
 
-_NO_SEARCH = "hyperparameters are not searched for here; a study compares settings: see compare"
+_SEARCH = "the command tune searches for hyperparameters, by the same flags: see tune --help"
 _NO_WANDB = "Weights & Biases is not supported; -tb DIR writes TensorBoard logs"
 
 # Flags of rl_zoo3's train and enjoy that are not here, and why.
@@ -20,20 +20,20 @@ INSTEAD: Mapping[str, str] = {
             "-optimize",
             "--optimize-hyperparameters",
             "--n-trials",
-            "--max-total-trials",
             "--no-optim-plots",
             "--n-jobs",
             "--sampler",
             "--pruner",
             "--n-startup-trials",
-            "--n-evaluations",
             "--optimization-log-path",
             "--storage",
             "--study-name",
-            "--trial-id",
+            "--max-total-trials",
         ),
-        _NO_SEARCH,
+        _SEARCH,
     ),
+    "--n-evaluations": "how often to evaluate is said in steps: --eval-freq",
+    "--trial-id": "what tune finds is a file: --conf-file logs/tuning/.../winner.yml",
     **dict.fromkeys(
         (
             "--track",

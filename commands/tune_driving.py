@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import shlex
 import signal
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -120,10 +121,16 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
         write_record(place, outcome, how.command, None if path is None else WINNER)
     print_outcome(console, place, outcome)
     if winner is not None and path is not None:
-        use = f"use it with {called_as('train')} --conf-file, or put it into hyperparams/"
-        print_winner(console, outcome, path, use)
+        print_winner(console, outcome, path, _use(place, path))
         print_entry(console, winner.entry, place.suggestions.shipped)
     return code
+
+
+def _use(place: OpenTuning, path: Path) -> str:
+    """How to train with what won."""
+    tuning = place.tuning
+    words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id]
+    return f"{called_as('train')} {shlex.join([*words, '--conf-file', str(path)])}"
 
 
 def _is(candidate: Candidate, outcome: Outcome) -> bool:

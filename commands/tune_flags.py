@@ -14,6 +14,7 @@ from commands.flag_values import (
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, program_name
+from tuning.pruning import PRUNERS
 from tuning.tuning_spec import FIGURES, OBJECTIVES, SAMPLERS
 
 TRIALS = whole_number(1, 100_000)
@@ -35,8 +36,8 @@ def build_parser() -> argparse.ArgumentParser:
     """The flags; those of runs mean what they mean to train and compare, the others to rl_zoo3."""
     parser = OneLineParser(
         prog=program_name(),
-        description="Search for an agent's hyperparameters, each setting judged over several seeds; "
-        "run the best again on other seeds, and write down what is not worse than before.",
+        description="Search for an agent's hyperparameters, each setting judged over several "
+        "seeds; run the best again on other seeds, and write down what is not worse than before.",
         epilog=as_called(EPILOG),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -85,7 +86,7 @@ def _add_search_flags(parser: argparse.ArgumentParser) -> None:
     )
     add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
     add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
-    add("--pruner", default="auto", help="what ends hopeless trials (auto), or none")
+    add("--pruner", choices=tuple(PRUNERS), default="auto", help="what ends hopeless trials (auto)")
     add(
         "--n-startup-trials",
         type=whole_number(0, 100_000),
@@ -117,9 +118,7 @@ def _add_retest_flags(parser: argparse.ArgumentParser) -> None:
         metavar="K",
         help="run the best K again on other seeds, beside the shipped settings (3; 0 for none)",
     )
-    add(
-        "--retest-seeds", type=SEEDS, default=20, metavar="N", help="on how many other seeds (20)"
-    )
+    add("--retest-seeds", type=SEEDS, default=20, metavar="N", help="on how many other seeds (20)")
     add(
         "--first-retest-seed",
         type=FIRST_SEED,
@@ -142,9 +141,7 @@ def _add_run_flags(parser: argparse.ArgumentParser) -> None:
     )
     add("-conf", "--conf-file", type=filled, metavar="YAML", help="begin with another file's entry")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
-    add(
-        "--gym-packages", nargs="+", type=filled, default=[], metavar="MODULE", help=MODULES_HELP
-    )
+    add("--gym-packages", nargs="+", type=filled, default=[], metavar="MODULE", help=MODULES_HELP)
     add("--eval-freq", type=COUNT, metavar="N", help="steps between two evaluations")
     add("--eval-episodes", type=COUNT, metavar="N", help="episodes of each that is sampled (20)")
     add(
@@ -175,9 +172,15 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         help="name of the tuning and its folder (default: ENV_AGENT)",
     )
     add(
-        *("-f", "--log-folder"),
+        *("-f", "--log-folder", "--optimization-log-path"),
+        dest="log_folder",
         type=filled,
         default="logs/tuning",
         help="folder above all tunings (logs/tuning)",
     )
-    add("--no-report", action="store_true", help="tables alone: no figures and no page")
+    add(
+        *("--no-report", "--no-optim-plots"),
+        dest="no_report",
+        action="store_true",
+        help="tables alone: no figures and no page",
+    )

@@ -24,8 +24,8 @@ def print_opened(console: Console, place: OpenTuning, where: str) -> None:
     n_there = sum(trial.state.is_finished() for trial in place.queue.trials())
     say(
         console,
-        f"{place.queue.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them there "
-        f"already; {place.suggestions.n_free} settings to choose; {where}, in {place.root}",
+        f"{place.queue.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them "
+        f"there already; {place.suggestions.n_free} settings to choose; {where}, in {place.root}",
     )
     for name in space.widened:
         say(console, f"{name}: the search space is widened to hold the shipped value")
@@ -97,7 +97,7 @@ def _figure(value: float | None) -> str:
 def print_winner(console: Console, outcome: Outcome, path: Path, how: str) -> None:
     """Say which settings won, and where they are."""
     assert outcome.winner is not None
-    say(console, f"winner: {outcome.winner.label}, in {path}; {how}")
+    say(console, f"winner: {outcome.winner.label}, in {path}: {how}")
 
 
 def print_entry(console: Console, entry: Mapping[str, Any], shipped: Mapping[str, Any]) -> None:

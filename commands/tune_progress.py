@@ -119,6 +119,6 @@ class TuningProgress:
         best = self.best()
         if best is not None:
             text += f"; best {best[1]:.4g} (trial {best[0]})"
-        if 0 < new and ended < self.n_trials:
+        if new > 0 and ended < self.n_trials:
             text += f"; about {duration(seconds / new * (self.n_trials - ended))} left"
         return text

@@ -104,9 +104,7 @@ def _kind(space: Mapping[str, Number]) -> str:
     return ",".join(sorted(space))
 
 
-def _of_generation(
-    trials: Sequence[FrozenTrial], kind: str, generation: int
-) -> list[FrozenTrial]:
+def _of_generation(trials: Sequence[FrozenTrial], kind: str, generation: int) -> list[FrozenTrial]:
     wanted = f"{kind}:{generation}"
     return [trial for trial in trials if trial.system_attrs.get(GENERATION) == wanted]
 

@@ -90,8 +90,8 @@ def judged(figures: Sequence[float], objective: Objective, *, is_cost: bool) -> 
 
     Args:
         figures: of its runs, at least one.
-        objective: ``mean``; ``iqm``, the mean of the middle half; ``lower``, the quarter below which
-            the worst lie.
+        objective: ``mean``; ``iqm``, the mean of the middle half; ``lower``, the quarter below
+            which the worst lie.
         is_cost: whether the lower figure is the better; ``lower`` is then the quarter above which
             the worst lie.
     """

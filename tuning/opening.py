@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from agents import ALGORITHMS
 from experiments.planned_runs import PlannedRun
 from experiments.study_plan import check_settings, plan
 from pipeline.errors import UserError
@@ -15,7 +16,7 @@ from tuning.samplers import make_sampler
 from tuning.search_spaces import read_search_space
 from tuning.study_opening import open_study
 from tuning.suggesting import Suggestions
-from tuning.trial_queue import FIGURES, TrialQueue
+from tuning.trial_queue import FIGURES, TrialQueue, turn
 from tuning.trial_storage import open_storage
 from tuning.tuning_spec import AUTO, TuningSpec
 
@@ -78,7 +79,8 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
     """
     run = shipped_run(tuning, root)
     if tuning.figure == AUTO:
-        tuning = replace(tuning, figure="regret" if run.is_batch else "score")
+        is_bandit = ALGORITHMS[tuning.agent.algo].for_bandits
+        tuning = replace(tuning, figure="regret" if is_bandit else "score")
     agent = tuning.agent
     space = read_search_space(agent.algo, tuning.environment.env_id, tuning.search_space)
     suggestions = Suggestions(tuning, space, run.spec.saved_hyperparams)
@@ -87,11 +89,10 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
     n_trials = suggestions.n_trials
     asked = tuning.identity(suggestions.shipped, _as_json(suggestions))
     root.mkdir(parents=True, exist_ok=True)
-    opened = open_storage(root, storage)
+    with turn(root):  # of several that make a file's tables at once, all but one would fail
+        opened = open_storage(root, storage)
     name = tuning.study.name
-    study = open_study(
-        name, root, opened, make_sampler(tuning), asked, is_cost=tuning.is_cost
-    )
+    study = open_study(name, root, opened, make_sampler(tuning), asked, is_cost=tuning.is_cost)
     return OpenTuning(tuning, root, study, TrialQueue(study, root, n_trials), suggestions)
 
 
@@ -99,6 +100,5 @@ def _as_json(suggestions: Suggestions) -> dict[str, Any]:
     from optuna.distributions import distribution_to_json
 
     return {
-        name: distribution_to_json(kind)
-        for name, kind in suggestions.space.distributions().items()
+        name: distribution_to_json(kind) for name, kind in suggestions.space.distributions().items()
     }

@@ -6,11 +6,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.planned_runs import PlannedRun
-from experiments.study_spec import METRICS, AgentSpec, StudySpec
+from experiments.study_spec import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.file_digests import DamagedFileError
 from tuning.entry_files import entry_text
 from tuning.judging import UnjudgedError, judged, outcome_of
@@ -74,7 +74,7 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(entry_text(tuning, each.entry, ()), encoding="utf-8")
         agents.append(AgentSpec(each.label, tuning.agent.algo, conf_file=path))
-    metric = tuning.figure if tuning.figure in METRICS else "final"
+    metric = tuning.figure if tuning.figure in METRICS else "final"  # of scores and costs too
     return replace(
         tuning.study,
         name=FOLDER,
@@ -85,7 +85,7 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
         agents=tuple(agents),
         first_seed=tuning.first_retest_seed,
         n_seeds=tuning.retest_seeds,
-        metric=metric,
+        metric=cast(Metric, metric),
     )
 
 
@@ -123,8 +123,8 @@ class Outcome:
     Attributes:
         retested: the settings that the search began with, then the others, the best in the search
             first.
-        winner: of the others, the best on the other seeds, where it is not worse than those that
-            the search began with; None where all are.
+        winner: of the others, the best on the other seeds, where it is better there than those that
+            the search began with, and no verdict says otherwise; None where all are.
         optimism: by how much the best of the search was better there than on the other seeds; None
             where it was not run again.
         reason: why there is no winner; empty where there is one.
@@ -183,9 +183,7 @@ def _retested(
 ) -> Retested:
     runs = [run for run in analysis.results.planned if run.agent == label]
     figures = _figures(tuning, runs)
-    held_out = (
-        judged(figures, tuning.objective, is_cost=tuning.is_cost) if figures else None
-    )
+    held_out = judged(figures, tuning.objective, is_cost=tuning.is_cost) if figures else None
     agent = _of_label(environment, label)
     return Retested(
         label=label,
@@ -213,6 +211,12 @@ def _of_label(environment: EnvironmentAnalysis | None, label: str) -> AgentAnaly
     return next((agent for agent in agents if agent.agent == label), None)
 
 
+def interval_of(tuning: TuningSpec) -> str:
+    """What the intervals are of: there are none for quartiles and times to a threshold."""
+    statistic = "interquartile mean" if tuning.objective == "iqm" else "mean"
+    return f"{statistic} of {tuning.figure if tuning.figure in METRICS else 'score'}"
+
+
 def _interval(tuning: TuningSpec, agent: AgentAnalysis | None) -> Estimate:
     if agent is None:
         return Estimate(math.nan, math.nan, math.nan, 0)
@@ -231,7 +235,7 @@ def _verdict(environment: EnvironmentAnalysis | None, label: str) -> str:
 
 
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
-    """The best on other seeds, unless it is worse there than what the search began with."""
+    """The best on other seeds, unless it is no better there than what the search began with."""
     shipped, *others = retested
     there = [each for each in others if each.held_out is not None]
     if not there:
@@ -240,6 +244,6 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     best = max(there, key=lambda each: sign * (each.held_out or 0.0))
     if shipped.held_out is None:
         return None, "the shipped settings did not run"
-    if best.verdict == "worse" or sign * ((best.held_out or 0.0) - shipped.held_out) < 0:
-        return None, "none is as good as the shipped settings on other seeds"
+    if best.verdict == "worse" or sign * ((best.held_out or 0.0) - shipped.held_out) <= 0:
+        return None, "none is better than the shipped settings on other seeds"
     return best, ""

@@ -215,9 +215,7 @@ class Search:
             self._end(each, value, "")
         elif each.trial.number and self.hopeless(each.trial.number, each.figures):
             with _lost_to_others():
-                each.trial.study.tell(
-                    each.trial, state=TrialState.PRUNED, skip_if_finished=True
-                )
+                each.trial.study.tell(each.trial, state=TrialState.PRUNED, skip_if_finished=True)
             self._end(each, None, "")
 
     def _fail(self, each: TrialUnderWay, reason: str) -> None:

@@ -75,7 +75,7 @@ def _difference(name: str, before: Any, asked: Mapping[str, Any]) -> str:
 def _flat(asked: object) -> dict[str, Any]:
     """Settings as they are called, hyperparameters and parts of the space among them."""
     flat: dict[str, Any] = {}
-    for key, value in (asked.items() if isinstance(asked, Mapping) else ()):
+    for key, value in asked.items() if isinstance(asked, Mapping) else ():
         if isinstance(value, Mapping):
             flat |= {f"{key} {inner}": item for inner, item in value.items()}
         else:

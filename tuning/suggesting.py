@@ -41,7 +41,8 @@ class Suggestions:
 
     def _settled(self) -> dict[str, Any]:
         """Parameters of settings that the user has fixed."""
-        given, settled = set(self.tuning.agent.settings), {}
+        given = set(self.tuning.agent.settings)
+        settled: dict[str, Any] = {}
         for entry in self.space.entries.values():
             if set(entry.dimension.keys) <= given:
                 names = entry.dimension.distributions()

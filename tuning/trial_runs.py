@@ -21,9 +21,7 @@ def name_of(entry: Mapping[str, Any]) -> str:
     return f"settings-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
-def planned_run(
-    tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int
-) -> PlannedRun:
+def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
     """One run of a trial.
 
     Raises:

@@ -36,8 +36,8 @@ class TuningSpec:
 
     Attributes:
         study: the agent, called `SHIPPED`, as it is without the search, the environment, and what
-            every run has in common. Its seeds are those of trials. What the agent's ``settings`` say
-            holds in every trial, whatever is suggested.
+            every run has in common. Its seeds are those of trials. What the agent's ``settings``
+            say holds in every trial, whatever is suggested.
         n_trials: how many settings to try.
         figure: what a run is judged by, one of `FIGURES`; or `AUTO`, until it is known what the
             runs are.

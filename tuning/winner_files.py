@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,16 +11,11 @@ from typing import Any
 
 from pipeline.files import write_text
 from tuning.entry_files import entry_text
-from tuning.retesting import Outcome, Retested
-from tuning.tuning_spec import CHEAPER_IS_BETTER, TuningSpec
+from tuning.retesting import Outcome, Retested, interval_of
+from tuning.tuning_spec import TuningSpec
 
 FILE = "winner.yml"
-
-_NAMES = {
-    "mean": "mean",
-    "iqm": "interquartile mean",
-    "lower": "lower quartile",
-}
+LONGEST_LINE = 100
 
 
 def write_winner(
@@ -43,29 +39,31 @@ def provenance(tuning: TuningSpec, outcome: Outcome, n_trials: int) -> list[str]
     seeds, held_out = tuning.study.seeds, tuning.held_out
     others = len(outcome.retested) - 1
     chosen = f", the best of {others} that were run again" if others > 1 else ""
-    return [
+    text = (
         f"Tuned by tune.py on {time.strftime('%Y-%m-%d')}: trial {winner.number} of {n_trials} "
-        f"({tuning.sampler}), {_words(tuning)}",
-        f"over the seeds {seeds.start} to {seeds.stop - 1}: {_figure(winner.in_search)}.",
-        f"On the seeds {held_out.start} to {held_out.stop - 1}, which the search has not seen"
-        f"{chosen}: {_held_out(winner)};",
-        f"the settings before, there: {_held_out(shipped)}. Verdict: {winner.verdict}.",
-    ]
+        f"({tuning.sampler}), {_words(tuning)} over the seeds {seeds.start} to {seeds.stop - 1}: "
+        f"{_figure(winner.in_search)}. On the seeds {held_out.start} to {held_out.stop - 1}, which "
+        f"the search has not seen{chosen}: {_held_out(tuning, winner)}; the settings before, "
+        f"there: {_held_out(tuning, shipped)}. Verdict: {winner.verdict}."
+    )
+    return textwrap.wrap(text, LONGEST_LINE - len("# "))
 
 
 def _words(tuning: TuningSpec) -> str:
-    lower = "upper quartile" if tuning.figure in CHEAPER_IS_BETTER else _NAMES["lower"]
-    name = lower if tuning.objective == "lower" else _NAMES[tuning.objective]
-    return f"{name} of {tuning.figure}"
+    lower = "upper quartile" if tuning.is_cost else "lower quartile"
+    names = {"mean": "mean", "iqm": "interquartile mean", "lower": lower}
+    return f"{names[tuning.objective]} of {tuning.figure}"
 
 
 def _figure(value: float | None) -> str:
     return "nothing" if value is None else f"{value:.4g}"
 
 
-def _held_out(each: Retested) -> str:
-    """The figure, and the interval of the mean."""
+def _held_out(tuning: TuningSpec, each: Retested) -> str:
+    """The figure, and an interval."""
     found, text = each.interval, _figure(each.held_out)
     if math.isnan(found.low):
         return text
-    return f"{text} (95 % interval {found.low:.4g} to {found.high:.4g}, {each.n_runs} runs)"
+    of_what = interval_of(tuning)
+    ends = f"{found.low:.4g} to {found.high:.4g}"
+    return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs)"
