@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from experiments.draft_runs import settle
 from experiments.drafts import draft_path, take_over
 from experiments.planned_runs import PlannedRun
-from experiments.repair import move_aside
-from experiments.replaced_runs import make_room
+from experiments.replaced_runs import make_room, move_aside
 from experiments.run_or_go_on import do_or_go_on
 from pipeline.file_digests import DamagedFileError
-from pipeline.files import put_in_place, sync_folders
+from pipeline.files import put_in_place, sync_together
 from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.signs_of_life import Heartbeat
 from pipeline.user_modules import import_again
@@ -34,6 +34,7 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
         do_or_go_on(planned, draft, command)
     finally:
         heart.stop()
+    settle(draft)
     _put_in_place(planned, draft)
 
 
@@ -49,4 +50,4 @@ def _put_in_place(planned: PlannedRun, draft: Path) -> None:
     except OSError:
         if not planned.is_finished:
             raise
-    sync_folders(*list(planned.path.parents)[:3])
+    sync_together([], list(planned.path.parents)[:3])

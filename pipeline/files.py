@@ -10,7 +10,8 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "E
 
 # Folders of others above one's own, and file systems that flush no folder.
 _CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
+
+SYNCED_AT_ONCE = 4
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
 _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
@@ -148,6 +151,18 @@ else:
             os.fsync(number)
         finally:
             os.close(number)
+
+
+def sync_together(files: Iterable[Path], folders: Iterable[Path]) -> None:
+    """Wait until the disk has files and the names in folders, which are asked for at once.
+
+    A disk that is asked for one after the other has to finish each before it hears of the next.
+    """
+    with ThreadPoolExecutor(SYNCED_AT_ONCE) as pool:
+        waits = [pool.submit(sync_file, path) for path in files]
+        waits += [pool.submit(sync_folders, folder) for folder in folders]
+    for wait in waits:
+        wait.result()
 
 
 def drafts_in(folder: Path) -> list[Path]:

@@ -11,7 +11,9 @@ import os
 import re
 import secrets
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +31,7 @@ from pipeline.files import (
     drafts_in,
     naming,
     put_in_place,
-    sync_file,
-    sync_folders,
+    sync_together,
     write_json,
 )
 from pipeline.liveness import is_alive, mark
@@ -180,12 +181,15 @@ class Run(RunFiles):
         info.pop(PROCESS, None)
         if info.get("state") == RUNNING:
             info[PROCESS] = mark()
-        write_json(self.info_path, sealed(info))
+        self._write_info(sealed(info))
+
+    def _write_info(self, info: dict[str, Any]) -> None:
+        write_json(self.info_path, info)
 
     def reopen(self) -> None:
         """Take out of ``run.json`` what came out so far: the run goes on."""
         info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
-        write_json(self.info_path, {**info, "state": RUNNING, PROCESS: mark()})
+        self._write_info({**info, "state": RUNNING, PROCESS: mark()})
 
     def keep_room(self) -> None:
         """Take the room on the disk that the run's last word needs."""
@@ -211,11 +215,14 @@ class Run(RunFiles):
         for draft in drafts_in(self.path):  # of a file that was not to be finished any more
             draft.unlink(missing_ok=True)
         digests = digests_of(self.path)
-        for name in digests:
-            sync_file(self.path / name)
-        inner = {(self.path / name).parent for name in digests}
-        sync_folders(*inner, *[self.path, *self.path.parents][:3])
+        self._wait_for_disk([self.path / name for name in digests])
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests})
+
+    def _wait_for_disk(self, files: Sequence[Path]) -> None:
+        """Wait until the disk has the files of the run, and the way to them."""
+        sync_together(
+            files, {*(path.parent for path in files), *[self.path, *self.path.parents][:3]}
+        )
 
     @property
     def files(self) -> RecordedFiles:
@@ -234,6 +241,23 @@ class Run(RunFiles):
                 folder.rmdir()
             except OSError:
                 return
+
+
+@dataclass(frozen=True)
+class ReadRun(Run):
+    """A run folder that is only read: all goes by what it said when it was first asked."""
+
+    @cached_property
+    def _info(self) -> dict[str, Any]:
+        return super().read_info()
+
+    def read_info(self) -> dict[str, Any]:
+        return self._info
+
+    @cached_property
+    def files(self) -> RecordedFiles:
+        """The files that the run left, each held against what it was then."""
+        return super().files
 
 
 def _renamed(draft: Path, path: Path) -> bool:

@@ -1,4 +1,7 @@
-"""Writing an agent, and what belongs to it, whole or not at all."""
+"""Writing an agent, and what belongs to it, whole or not at all.
+
+The disk has it for good when the next state of the training is saved, or the run is at its end.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from pipeline.files import lasting
+from pipeline.files import replacing
 from pipeline.finite_numbers import check_model
 
 
@@ -17,7 +20,7 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
         NotFiniteError: if there are nan or infinity in what it has learnt: what is there stays.
     """
     check_model(model)
-    with lasting(path) as draft:
+    with replacing(path) as draft:
         model.save(draft)
 
 
@@ -25,12 +28,12 @@ def save_normalization(model: BaseAlgorithm, path: Path) -> None:
     """Write the running statistics of VecNormalize, where the agent trains under one."""
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
-        with lasting(path) as draft:
+        with replacing(path) as draft:
             normalization.save(str(draft))
 
 
 def save_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
     """Write the replay buffer, where the agent has one."""
     if getattr(model, "replay_buffer", None) is not None:
-        with lasting(path) as draft:
+        with replacing(path) as draft:
             model.save_replay_buffer(draft)  # type: ignore[attr-defined]
