@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from experiments.execution import available_cores
+from experiments.launching import available_cores
 
 ROOT = Path(__file__).resolve().parent.parent
 N_RUNS = 2000

@@ -22,7 +22,7 @@ from typing import Any
 
 from _process_trees import timed
 
-from experiments.execution import available_cores
+from experiments.launching import available_cores
 from experiments.study_files import read_study
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -30,8 +30,8 @@ from pipeline.stopping import stops_noticed
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from experiments.launching import Launchers
     from experiments.planned_runs import PlannedRun
-    from experiments.run_limits import RunLimits
     from experiments.study_spec import StudySpec
 
 SEEDS = whole_number(1, 1_000_000)
@@ -173,13 +173,12 @@ def _compare(args: argparse.Namespace) -> int:
     study = study_spec(args)
     from commands.terminal import table_console
     from experiments.child_processes import end_server, stop_all
-    from experiments.run_limits import RunLimits
     from experiments.study_plan import plan
     from pipeline.folder_lock import folder_lock
 
     go_on_unread()
     root = Path(args.log_folder) / study.name
-    limits = RunLimits(study.run_timeout, study.run_memory)
+    how = _how(args, study, root)
     planned = plan(study, root)
     console = table_console()
     console.print(study.title, style="bold", markup=False, highlight=False)
@@ -193,8 +192,8 @@ def _compare(args: argparse.Namespace) -> int:
     with folder_lock(root, stop, say):
         try:
             if args.until_decided:
-                return _grow_study(args, study, root, console, limits)
-            return _do_study(args, study, planned, root, console, limits)
+                return _grow_study(args, study, root, console, how)
+            return _do_study(args, study, planned, root, console, how)
         except KeyboardInterrupt:
             end_server()
             raise
@@ -206,7 +205,7 @@ def _do_study(
     planned: Sequence[PlannedRun],
     root: Path,
     console: Console,
-    limits: RunLimits,
+    how: dict[str, Any],
 ) -> int:
     """Do a study with the seeds that it has, once it is known how often it was looked at."""
     from experiments.looks_file import read_looks
@@ -215,7 +214,7 @@ def _do_study(
     _prepare(args, study, planned, root, console)
     from commands.study_output import run_study
 
-    return run_study(console, study, planned, root, command_line(), limits=limits, **_how(args))
+    return run_study(console, study, planned, root, command_line(), **how)
 
 
 def _grow_study(
@@ -223,7 +222,7 @@ def _grow_study(
     study: StudySpec,
     root: Path,
     console: Console,
-    limits: RunLimits,
+    how: dict[str, Any],
 ) -> int:
     """Do a study with more and more seeds, as was settled before the first look."""
     from experiments.growing import counts_of, grown, settle, settled_looks
@@ -236,11 +235,18 @@ def _grow_study(
     settle(root, looks)
     from commands.growing_output import grow_study
 
-    return grow_study(console, study, counts, root, command_line(), limits=limits, **_how(args))
+    return grow_study(console, study, counts, root, command_line(), **how)
 
 
-def _how(args: argparse.Namespace) -> dict[str, Any]:
-    return {"n_workers": max(args.jobs, 0), "with_page": not args.no_report}
+def _how(args: argparse.Namespace, study: StudySpec, root: Path) -> dict[str, Any]:
+    from experiments.launching import available_cores, local_launcher
+    from experiments.run_limits import RunLimits
+
+    n_workers = max(args.jobs, 0) or available_cores()
+    limits = RunLimits(study.run_timeout, study.run_memory)
+    launchers: Launchers = partial(local_launcher, root, command_line(), n_workers, limits)
+    where = f"{n_workers} at once"
+    return {"launchers": launchers, "where": where, "with_page": not args.no_report}
 
 
 def _prepare(

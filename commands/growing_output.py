@@ -8,10 +8,8 @@ from pathlib import Path
 from rich.console import Console
 
 from commands.study_output import conclude, do_missing, read, say
-from experiments.child_processes import NO_LIMITS
-from experiments.execution import RunFailure
 from experiments.growing import Counts, Step, counts_after, grown, take_planned_looks
-from experiments.run_limits import RunLimits
+from experiments.launching import Launchers, RunFailure
 from experiments.study_plan import plan
 from experiments.study_spec import StudySpec
 from report.wording import enumeration, seeds
@@ -24,9 +22,9 @@ def grow_study(
     root: Path,
     command: str,
     *,
-    n_workers: int = 0,
+    launchers: Launchers,
+    where: str,
     with_page: bool = True,
-    limits: RunLimits = NO_LIMITS,
 ) -> int:
     """Do a study with more and more seeds until every pair is decided, and judge it at the end.
 
@@ -36,9 +34,9 @@ def grow_study(
         counts: how many seeds the agents are to have now.
         root: its folder, where the looks have been settled.
         command: the command that asked for it.
-        n_workers: runs at once; 0 for as many as there are cores.
+        launchers: where runs are done.
+        where: the same, in words.
         with_page: draw the figures and write the page, beside the tables.
-        limits: what each run may take.
 
     Returns:
         The exit code, as of `run_study`.
@@ -49,7 +47,7 @@ def grow_study(
         now = grown(study, counts)
         planned = plan(now, root, counts)
         given_up = {failure.planned.path for failure in failures}
-        failures += do_missing(console, planned, root, command, n_workers, limits, given_up)
+        failures += do_missing(console, planned, root, launchers, where, given_up)
         results = read(console, now, planned, root)
         steps = take_planned_looks(results)
         for step in steps:

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 
 from commands.study_progress import StudyProgress
-from experiments.child_processes import NO_LIMITS
-from experiments.execution import RunFailure, available_cores, execute
+from experiments.execution import execute
+from experiments.launching import Launchers, RunFailure
 from experiments.looks import Standing
 from experiments.planned_runs import PlannedRun
 from experiments.repair import move_damaged_aside
 from experiments.replaced_runs import move_replaced_aside
-from experiments.run_limits import RunLimits
 from experiments.study_results import LeftOut, StudyResults, read_results
 from experiments.study_spec import StudySpec
 from pipeline.signs_of_life import Activity, doing
@@ -33,9 +32,9 @@ def run_study(
     root: Path,
     command: str,
     *,
-    n_workers: int = 0,
+    launchers: Launchers,
+    where: str,
     with_page: bool = True,
-    limits: RunLimits = NO_LIMITS,
 ) -> int:
     """Do a study as planned, print the judgement, and write tables, figures and page.
 
@@ -45,14 +44,14 @@ def run_study(
         planned: its runs, whose settings have been checked.
         root: its folder.
         command: the command that asked for it.
-        n_workers: runs at once; 0 for as many as there are cores.
+        launchers: where runs are done.
+        where: the same, in words.
         with_page: draw the figures and write the page, beside the tables.
-        limits: what each run may take.
 
     Returns:
         The exit code: 0 if all runs are there and sound, else 1.
     """
-    failures = do_missing(console, planned, root, command, n_workers, limits)
+    failures = do_missing(console, planned, root, launchers, where)
     results = read(console, study, planned, root)
     return conclude(console, results, failures, command, with_page=with_page)
 
@@ -163,25 +162,23 @@ def do_missing(
     console: Console,
     planned: Sequence[PlannedRun],
     root: Path,
-    command: str,
-    n_workers: int,
-    limits: RunLimits,
+    launchers: Launchers,
+    where: str,
     given_up: Collection[Path] = (),
 ) -> list[RunFailure]:
     """Do the runs that are missing, but for those whose folders are given up; which failed."""
     _make_way(console, planned, root)
-    n_workers = n_workers or available_cores()
     missing = [run for run in planned if run.is_to_do and run.path not in given_up]
     done = [run for run in planned if run.is_finished]
     console.print(
-        f"{len(planned)} runs, {len(done)} of them there already; {n_workers} at once, in {root}",
+        f"{len(planned)} runs, {len(done)} of them there already; {where}, in {root}",
         markup=False,
         highlight=False,
     )
     with StudyProgress(console, planned, done) as progress:
         for run in done:
             progress.note_refusal(run)
-        return execute(missing, root, command, n_workers, progress.note, limits)
+        return execute(missing, root, launchers, progress.note)
 
 
 def _judge(

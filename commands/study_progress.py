@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from experiments.execution import RunFailure
+from experiments.launching import RunFailure
 from experiments.planned_runs import PlannedRun
 from pipeline.signs_of_life import (
     SECONDS_BETWEEN_LINES,

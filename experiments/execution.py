@@ -1,77 +1,39 @@
-"""Doing the runs of a study: those that are missing, over all cores, in the order of the plan."""
+"""Doing the runs of a study: those that are missing, in the order of the plan."""
 
 from __future__ import annotations
 
-import os
-import traceback
-from collections.abc import Callable, Sequence
-from concurrent.futures import Executor, as_completed
-from dataclasses import dataclass
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
-from experiments.child_processes import (
-    NO_LIMITS,
-    StoppedError,
-    TaskFailedError,
-    local_executor,
-    supervise,
-)
-from experiments.drafts import leave_drafts, make_folder, remove_dead_drafts, run_name
+from experiments.drafts import remove_dead_drafts, run_name
+from experiments.launching import Launcher, Launchers, RunFailure
 from experiments.planned_runs import PlannedRun
-from experiments.run_in_child import do_planned_run
-from experiments.run_limits import RunLimits
-from experiments.study_spec import file_name
-from pipeline.errors import one_line
-from pipeline.files import write_text
-from pipeline.plain_runs import is_plain
 
-
-@dataclass(frozen=True)
-class RunFailure:
-    """A run that failed.
-
-    Attributes:
-        planned: the run.
-        reason: why, in one line.
-        log: the file with the details; None where it could not be written.
-    """
-
-    planned: PlannedRun
-    reason: str
-    log: Path | None
-
+# Runs that are handed over at a time, for each that is done at once: enough that no worker waits
+# for the next, and few enough that a hundred thousand are no burden to whoever does them.
+WINDOW = 2
+# So that workers that have joined meanwhile do not wait until a run has ended.
+SECONDS_BETWEEN_LOOKS = 1.0
 
 Listener = Callable[[PlannedRun, RunFailure | None], None]
-
-
-def failure_log(root: Path, planned: PlannedRun) -> Path:
-    """Where the details of a run's failure are written; there until it is done after all."""
-    return root / "failures" / f"{file_name(planned.agent)}@{planned.path.name}.txt"
-
-
-def available_cores() -> int:
-    """The cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+Ended = tuple[PlannedRun, Future[RunFailure | None]]
 
 
 def execute(
-    runs: Sequence[PlannedRun],
-    root: Path,
-    command: str,
-    n_workers: int,
-    listener: Listener,
-    limits: RunLimits = NO_LIMITS,
+    runs: Sequence[PlannedRun], root: Path, launchers: Launchers, listener: Listener
 ) -> list[RunFailure]:
-    """Do the runs, each in a process of its own, but for plain ones, of which many share one.
+    """Do the runs.
 
     Args:
         runs: those to do.
         root: the study's folder.
-        command: the command that asked for it, noted in every run folder.
-        n_workers: how many at once.
+        launchers: where; it is opened only if there is something to do.
         listener: called for every run that has ended, with how it failed if it did.
-        limits: what each may take.
 
     Returns:
         Those that failed.
@@ -79,62 +41,37 @@ def execute(
     remove_dead_drafts(root, {run_name(run) for run in runs})
     if not runs:
         return []
-    with local_executor(min(n_workers, len(runs))) as executor:
-        failures = execute_on(executor, runs, root, command, listener, limits)
+    failures = []
+    with launchers() as launcher:
+        for planned, failure in _ended(launcher, runs):
+            listener(planned, failure)
+            if failure is not None:
+                failures.append(failure)
     remove_dead_drafts(root, {run_name(failure.planned) for failure in failures})
     return failures
 
 
-def execute_on(
-    executor: Executor,
-    runs: Sequence[PlannedRun],
-    root: Path,
-    command: str,
-    listener: Listener,
-    limits: RunLimits = NO_LIMITS,
-) -> list[RunFailure]:
-    """As `execute`, wherever the workers of ``executor`` are, if they share the folder."""
-    failures = []
-    futures = {executor.submit(_supervised_run, run, root, command, limits): run for run in runs}
-    for future in as_completed(futures):
-        failure = future.result()
-        listener(futures[future], failure)
-        if failure is not None:
-            failures.append(failure)
-    return failures
+def _ended(
+    launcher: Launcher, runs: Sequence[PlannedRun]
+) -> Iterator[tuple[PlannedRun, RunFailure | None]]:
+    """Each run when it has ended, with how it failed; a window of them is under way."""
+    ended: SimpleQueue[Ended] = SimpleQueue()
+    to_do, n_under_way = iter(runs), 0
+    while True:
+        room = WINDOW * max(launcher.n_workers, 1) - n_under_way
+        for planned in islice(to_do, max(room, 0)):
+            future = launcher.submit(planned)
+            n_under_way += 1
+            future.add_done_callback(partial(_note, ended, planned))
+        if not n_under_way:
+            return
+        with contextlib.suppress(Empty):
+            planned, future = ended.get(timeout=SECONDS_BETWEEN_LOOKS)
+            n_under_way -= 1
+            yield planned, future.result()
 
 
-def _kept(log: Path, details: str) -> Path | None:
-    """The file with the details; None where it cannot be written, as on a full disk."""
-    try:
-        make_folder(log.parent)
-        write_text(log, details)
-    except OSError:
-        return None
-    return log
-
-
-def _supervised_run(
-    planned: PlannedRun, root: Path, command: str, limits: RunLimits
-) -> RunFailure | None:
-    log, name = failure_log(root, planned), run_name(planned)
-    clean_up = partial(leave_drafts, root, name)
-    try:
-        supervise(
-            do_planned_run,
-            planned,
-            root,
-            command,
-            clean_up=clean_up,
-            limits=limits,
-            shares_process=is_plain(planned.spec) and not planned.is_batch,
-        )
-    except StoppedError:
-        return None
-    except TaskFailedError as error:
-        return RunFailure(planned, str(error), _kept(log, error.details))
-    except (OSError, EOFError, RuntimeError) as error:  # no room, process, thread or file left
-        reason = f"its process could not be started: {one_line(error)}"
-        return RunFailure(planned, reason, _kept(log, traceback.format_exc()))
-    log.unlink(missing_ok=True)
-    return None
+def _note(
+    ended: SimpleQueue[Ended], planned: PlannedRun, future: Future[RunFailure | None]
+) -> None:
+    ended.put((planned, future))

@@ -132,7 +132,7 @@ def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
     from experiments.analysis import analyse
     from experiments.drafts import draft_path
-    from experiments.execution import failure_log
+    from experiments.launching import failure_log
     from experiments.run_in_child import do_run
     from experiments.study_plan import plan
     from experiments.study_results import read_results

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.execution import failure_log
+from experiments.launching import failure_log
 from experiments.looks_file import read_looks
 from experiments.planned_runs import PlannedRun
 from experiments.run_versions import mixed_versions

@@ -10,7 +10,7 @@ from rich.console import Console
 
 import commands.study_progress as module
 from commands.study_progress import StudyProgress
-from experiments.execution import RunFailure
+from experiments.launching import RunFailure
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import signs_of_life

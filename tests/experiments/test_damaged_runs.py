@@ -5,6 +5,7 @@ import runpy
 import shutil
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import compare
 from commands.study_output import repair, run_study
 from experiments.bandit_batches import STATISTICS_FILE
 from experiments.drafts import draft_path
+from experiments.launching import local_launcher
 from experiments.repair import move_damaged_aside
 from experiments.run_figures import read_value_maps
 from experiments.run_in_child import do_run
@@ -222,7 +224,10 @@ def compare_again(capsys):
 
     def again(study, planned, root):
         console = Console(width=400)
-        code = run_study(console, study, planned, root, "c", n_workers=1, with_page=False)
+        launchers = partial(local_launcher, root, "c", 1)
+        code = run_study(
+            console, study, planned, root, "c", launchers=launchers, where="here", with_page=False
+        )
         return code, capsys.readouterr().out
 
     return again

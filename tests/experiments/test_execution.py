@@ -1,5 +1,6 @@
 """Doing the runs of a study: what each leaves behind, in what order, and on how many cores."""
 
+import contextlib
 import errno
 import json
 import os
@@ -8,10 +9,11 @@ from concurrent.futures import Future
 import pytest
 import yaml
 
-from experiments import execution, run_or_go_on
-from experiments.child_processes import StoppedError, TaskFailedError
+from experiments import execution, launching, run_or_go_on
+from experiments.child_processes import NO_LIMITS, StoppedError, TaskFailedError
 from experiments.drafts import draft_path, leave_drafts, run_name
-from experiments.execution import available_cores, execute, execute_on, failure_log
+from experiments.execution import WINDOW, execute
+from experiments.launching import available_cores, failure_log
 from experiments.run_in_child import do_planned_run, do_run
 from experiments.run_limits import RunLimits
 from experiments.study_plan import plan
@@ -114,14 +116,17 @@ class InPlace:
         return future
 
 
+def launchers_on(executor, root, limits=NO_LIMITS):
+    launcher = launching._LocalLauncher(executor, 1, root, "c", limits)
+    return lambda: contextlib.nullcontext(launcher)
+
+
 def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
     runs = runs_of(tmp_path, n_seeds=3)
     good, bad, stopped = runs
     log = failure_log(tmp_path, good)
     log.parent.mkdir()
     log.write_text("of an earlier try")
-
-    limits = RunLimits(seconds=9)
 
     def supervise(work, run, root, command, *, clean_up, limits, shares_process):
         assert shares_process
@@ -131,15 +136,11 @@ def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
         if run is stopped:
             raise StoppedError
 
-    monkeypatch.setattr("experiments.execution.supervise", supervise)
+    monkeypatch.setattr(launching, "supervise", supervise)
     told = {}
-    failures = execute_on(
-        InPlace(),
-        runs,
-        tmp_path,
-        "c",
-        lambda run, failure: told.setdefault(run.seed, failure),
-        limits,
+    launchers = launchers_on(InPlace(), tmp_path, RunLimits(seconds=9))
+    failures = execute(
+        runs, tmp_path, launchers, lambda run, failure: told.setdefault(run.seed, failure)
     )
     (failure,) = failures
     assert (failure.planned, failure.reason) == (bad, "thin ice")
@@ -150,12 +151,43 @@ def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
     assert failure.log.read_text() == "Traceback: thin ice\n"
 
 
-def test_nothing_to_do_starts_nothing(tmp_path, monkeypatch):
-    def never(n_workers):
-        pytest.fail("an executor was started")
+def test_nothing_to_do_starts_nothing(tmp_path):
+    def never(*_):
+        pytest.fail("a launcher was opened")
 
-    monkeypatch.setattr("experiments.execution.local_executor", never)
-    assert execute([], tmp_path, "c", 2, never) == []
+    assert execute([], tmp_path, never, never) == []
+
+
+class Growing:
+    """Has no worker at first, and two from the moment on at which it has been given something."""
+
+    n_workers = 0
+
+    def __init__(self):
+        self.given, self.most = [], 0
+
+    def submit(self, planned):
+        self.given.append(Future())
+        self.n_workers = 2
+        self.most = max(self.most, sum(not future.done() for future in self.given))
+        if len(self.given) >= 2 * WINDOW:
+            self.given[-2 * WINDOW].set_result(None)
+        return self.given[-1]
+
+
+def test_runs_are_handed_over_in_windows_as_wide_as_there_are_workers(tmp_path, monkeypatch):
+    monkeypatch.setattr(execution, "SECONDS_BETWEEN_LOOKS", 0.01)
+    runs, launcher, told = runs_of(tmp_path, n_seeds=9), Growing(), []
+
+    def listen(run, failure):
+        told.append(run)
+        if len(launcher.given) == len(runs):
+            for future in launcher.given:
+                future.done() or future.set_result(None)
+
+    assert execute(runs, tmp_path, lambda: contextlib.nullcontext(launcher), listen) == []
+    assert told == runs
+    assert launcher.most == 2 * WINDOW
 
 
 def test_a_record_is_whole(tmp_path):
@@ -182,8 +214,8 @@ def test_a_failure_whose_details_cannot_be_written_is_told_and_the_others_go_on(
     def failing(*args, **kwargs):
         raise error
 
-    monkeypatch.setattr(execution, "write_text", full)
-    monkeypatch.setattr(execution, "supervise", failing)
-    failure = execution._supervised_run(runs_of(tmp_path)[0], tmp_path, "compare.py", RunLimits())
+    monkeypatch.setattr(launching, "write_text", full)
+    monkeypatch.setattr(launching, "supervise", failing)
+    failure = launching._supervised(runs_of(tmp_path)[0], tmp_path, "compare.py", RunLimits())
     assert failure.reason.startswith(reason)
     assert failure.log is None

@@ -10,6 +10,7 @@ import threading
 import time
 import zipfile
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import gymnasium as gym
@@ -28,6 +29,7 @@ from experiments.child_processes import (
 )
 from experiments.drafts import draft_path
 from experiments.execution import execute
+from experiments.launching import local_launcher
 from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
 from experiments.study_plan import plan
@@ -157,6 +159,10 @@ def test_it_is_the_same_where_nothing_forks(chores, method, monkeypatch):
     assert shared(chores.who) == shared(chores.who)
 
 
+def one_at_a_time(root):
+    return root, partial(local_launcher, root, "c", 1), lambda *_: None
+
+
 def data_of(path):
     """The JSON of an agent, without the seconds that its last episodes took."""
     with zipfile.ZipFile(path) as archive:
@@ -200,7 +206,7 @@ def test_runs_in_one_process_leave_what_each_leaves_alone(tmp_path):
     """Of the last seed, whose runs come after all others, one of each agent."""
     together, alone = runs_of(tmp_path / "together"), runs_of(tmp_path / "alone")[-5::2]
     assert all(is_plain(run.spec) for run in together)
-    assert not execute(together, tmp_path / "together", "c", 1, lambda *_: None)
+    assert not execute(together, *one_at_a_time(tmp_path / "together"))
     with local_executor(1) as executor:
         for run in alone:
             draft = draft_path(tmp_path / "alone", run)
@@ -219,7 +225,7 @@ def test_seconds_of_runs_that_share_a_process_are_their_own(tmp_path):
     long = AgentSpec("long", "qlearning", tuned=False, settings={"n_timesteps": 6_000_000})
     lake = (EnvironmentSpec("lake", "FrozenLake-v1", {}),)
     runs = runs_of(tmp_path, 2, (short, long), lake)
-    execute(runs, tmp_path, "c", 1, lambda *_: None)
+    execute(runs, *one_at_a_time(tmp_path))
     taken = {"short": [], "long": []}
     for run in runs:
         taken[run.agent].append(run.run.read_info()["cpu_seconds"])
