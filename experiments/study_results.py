@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -79,7 +81,7 @@ class StudyResults:
     left_out: tuple[LeftOut, ...] = ()
     n_unchecked: int = 0
 
-    @property
+    @cached_property
     def finished(self) -> list[PlannedRun]:
         """The runs that the results are of."""
         damaged = {one.planned.path for one in self.left_out}
@@ -125,15 +127,43 @@ RUN_COLUMNS = (
 _FIGURES = ("success_rate", "exact", "optimum", "baseline", "gap", "score")
 
 
+class EarlyResults:
+    """What runs have to say, read when each has ended, while others are still under way.
+
+    Args:
+        study: whose runs they are.
+    """
+
+    def __init__(self, study: StudySpec) -> None:
+        self.study = study
+        self._found: dict[Path, RunResults] = {}
+
+    def read(self, planned: PlannedRun) -> None:
+        """Read a run that has just ended; one that is damaged is found to be so at the end."""
+        with contextlib.suppress(DamagedFileError):
+            found = read_run(self.study, planned)
+            if found is not None:
+                self._found[planned.path] = found
+
+    def of(self, planned: PlannedRun) -> RunResults | None:
+        """As `read_run`, where that was not done before."""
+        return self._found.get(planned.path) or read_run(self.study, planned)
+
+
 def read_results(
-    study: StudySpec, planned: Sequence[PlannedRun], root: Path, tell: Tell = tell_nobody
+    study: StudySpec,
+    planned: Sequence[PlannedRun],
+    root: Path,
+    tell: Tell = tell_nobody,
+    early: EarlyResults | None = None,
 ) -> StudyResults:
     """Read all runs that have finished; those whose files are damaged are left out."""
     rows, curves, done, left_out = [], [], [], []
+    early = early or EarlyResults(study)
     for place, run in enumerate(planned, start=1):
         tell(f"run {place:,} of {len(planned):,}")
         try:
-            found = read_run(study, run)
+            found = early.of(run)
         except DamagedFileError as error:
             left_out.append(LeftOut(run, str(error)))
             continue
