@@ -20,8 +20,8 @@ class DraftRun(Run):
     def _write_info(self, info: dict[str, Any]) -> None:
         write_text(self.info_path, json_text(info, indent=2) + "\n")
 
-    def _wait_for_disk(self, files: Sequence[Path]) -> None:
-        """Nothing: see `settle`."""
+    def _settle(self, files: Sequence[Path]) -> None:
+        """Nothing: `settle` does it, for ``run.json`` too."""
 
 
 def settle(draft: Path) -> None:

@@ -215,14 +215,17 @@ class Run(RunFiles):
         for draft in drafts_in(self.path):  # of a file that was not to be finished any more
             draft.unlink(missing_ok=True)
         digests = digests_of(self.path)
-        self._wait_for_disk([self.path / name for name in digests])
+        self._settle([self.path / name for name in digests])
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests})
 
-    def _wait_for_disk(self, files: Sequence[Path]) -> None:
-        """Wait until the disk has the files of the run, and the way to them."""
-        sync_together(
-            files, {*(path.parent for path in files), *[self.path, *self.path.parents][:3]}
-        )
+    def _settle(self, files: Sequence[Path]) -> None:
+        """Let the disk have all files but ``run.json``."""
+        self.wait_for_disk(files)
+
+    def wait_for_disk(self, files: Sequence[Path]) -> None:
+        """Wait until the disk has files of the run, and the way to them."""
+        way = [self.path, *self.path.parents][:3]
+        sync_together(files, {*(path.parent for path in files), *way})
 
     @property
     def files(self) -> RecordedFiles:

@@ -18,7 +18,7 @@ from agents.common.callback_horizons import Horizon
 from mdp.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
-from pipeline.files import sync_file, sync_together
+from pipeline.files import sync_file
 from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
 from pipeline.resuming.log_positions import Position, log_positions
@@ -220,8 +220,7 @@ class StateSaver(StopAtSafeMoment):
             if length - self.n_synced.get(name, 0) <= MOST_SYNCED:
                 sync_file(self.run.path / name)
             self.n_synced[name] = length
-        changed = self._files_changed(positions)
-        sync_together(changed, {self.run.path, *(path.parent for path in changed)})
+        self.run.wait_for_disk(self._files_changed(positions))
 
     def _files_changed(self, logs: Mapping[str, Position]) -> list[Path]:
         """The files of the run beside its logs and states that the disk may not have yet."""
