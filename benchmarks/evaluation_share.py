@@ -3,7 +3,7 @@
     python benchmarks/evaluation_share.py                  # as typed, some twenty minutes
     python benchmarks/evaluation_share.py -n 20000         # so many steps of each
 
-Each training is a process of its own: its settings from our files, its budget too unless ``-n`` says
+Each training is a process of its own: settings from our files, the budget too unless ``-n`` says
 another, and no flag for evaluation. Times are of processors. Evaluations go by steps, so that the
 same seed gives the same files on any machine; what they take of the time is what is shown here.
 """

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments.draft_runs import DraftRun
 from experiments.drafts import claim_draft, holds_state
 from experiments.planned_runs import PlannedRun
 from pipeline.broken_runs import is_of_the_machine
@@ -28,7 +27,7 @@ def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
             state if that is whole and of these very settings, and else begins anew.
         command: the command that asked for the study.
     """
-    run = DraftRun(draft, planned.run.env_name)
+    run = Run(draft, planned.run.env_name)
     keeping = _to_go_on_with(planned, run)
     if not keeping.goes_on:
         _begin_anew(planned, run)

@@ -29,6 +29,7 @@ from pipeline.file_digests import (
 )
 from pipeline.files import (
     drafts_in,
+    is_kept_later,
     naming,
     put_in_place,
     sync_together,
@@ -181,15 +182,12 @@ class Run(RunFiles):
         info.pop(PROCESS, None)
         if info.get("state") == RUNNING:
             info[PROCESS] = mark()
-        self._write_info(sealed(info))
-
-    def _write_info(self, info: dict[str, Any]) -> None:
-        write_json(self.info_path, info)
+        write_json(self.info_path, sealed(info))
 
     def reopen(self) -> None:
         """Take out of ``run.json`` what came out so far: the run goes on."""
         info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
-        self._write_info({**info, "state": RUNNING, PROCESS: mark()})
+        write_json(self.info_path, {**info, "state": RUNNING, PROCESS: mark()})
 
     def keep_room(self) -> None:
         """Take the room on the disk that the run's last word needs."""
@@ -215,12 +213,9 @@ class Run(RunFiles):
         for draft in drafts_in(self.path):  # of a file that was not to be finished any more
             draft.unlink(missing_ok=True)
         digests = digests_of(self.path)
-        self._settle([self.path / name for name in digests])
+        if not is_kept_later(self.path):
+            self.wait_for_disk([self.path / name for name in digests])
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests})
-
-    def _settle(self, files: Sequence[Path]) -> None:
-        """Let the disk have all files but ``run.json``."""
-        self.wait_for_disk(files)
 
     def wait_for_disk(self, files: Sequence[Path]) -> None:
         """Wait until the disk has files of the run, and the way to them."""

@@ -1,7 +1,4 @@
-"""Writing an agent, and what belongs to it, whole or not at all.
-
-The disk has it for good when the next state of the training is saved, or the run is at its end.
-"""
+"""Writing an agent, and what belongs to it, whole or not at all."""
 
 from __future__ import annotations
 
@@ -9,7 +6,7 @@ from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from pipeline.files import replacing
+from pipeline.files import lasting
 from pipeline.finite_numbers import check_model
 
 
@@ -20,7 +17,7 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
         NotFiniteError: if there are nan or infinity in what it has learnt: what is there stays.
     """
     check_model(model)
-    with replacing(path) as draft:
+    with lasting(path) as draft:
         model.save(draft)
 
 
@@ -28,12 +25,12 @@ def save_normalization(model: BaseAlgorithm, path: Path) -> None:
     """Write the running statistics of VecNormalize, where the agent trains under one."""
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
-        with replacing(path) as draft:
+        with lasting(path) as draft:
             normalization.save(str(draft))
 
 
 def save_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
     """Write the replay buffer, where the agent has one."""
     if getattr(model, "replay_buffer", None) is not None:
-        with replacing(path) as draft:
+        with lasting(path) as draft:
             model.save_replay_buffer(draft)  # type: ignore[attr-defined]

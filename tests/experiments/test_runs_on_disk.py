@@ -1,4 +1,4 @@
-"""Runs of a study while they are drafts: what the disk has, and when."""
+"""What the disk has of a run of a study, and when."""
 
 import os
 from pathlib import Path
