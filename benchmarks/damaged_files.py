@@ -32,6 +32,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from experiments.drafts import draft_path
 from experiments.planned_runs import PlannedRun
+from experiments.run_curves import joined
 from experiments.run_in_child import do_run
 from experiments.study_plan import plan
 from experiments.study_results import read_run
@@ -87,7 +88,7 @@ def as_compared(study: StudySpec, planned: PlannedRun) -> str | None:
     found = read_run(study, planned)
     if found is None:
         return None
-    curves = [curve.to_csv() for curve in found.curves]
+    curves = [joined([curve]).to_csv() for curve in found.curves]
     return repr(found.rows) + "".join(curves)
 
 

@@ -18,6 +18,7 @@ from commands.flag_values import (
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
 from commands.streams import go_on_unread
 from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.library_loading import loading_libraries
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
@@ -153,7 +154,7 @@ def _play(args: argparse.Namespace) -> int:
     console = TextConsole(highlight=False, quiet=args.verbose < 1)
     about = f"{found.spec.algo} on {found.spec.env_id}: {found.path}"
     console.print(about, markup=False, soft_wrap=True)
-    with doing(console, "loading the libraries"):
+    with doing(console, "loading the libraries"), loading_libraries():
         from commands.playing_output import PlayingRequest, play
         from pipeline.models.model_choice import with_statistics
 

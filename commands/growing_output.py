@@ -12,6 +12,7 @@ from commands.study_output import conclude, do_missing, read, say
 from experiments.growing import Counts, Step, counts_after, grown, take_planned_looks
 from experiments.launching import RunFailure
 from experiments.study_plan import plan
+from experiments.study_results import EarlyResults
 from experiments.study_spec import StudySpec
 from report.wording import enumeration, seeds
 
@@ -46,8 +47,14 @@ def grow_study(
         now = grown(study, counts)
         planned = plan(now, root, counts)
         given_up = {failure.planned.path for failure in failures}
+<<<<<<< HEAD
         failures += do_missing(console, planned, root, place, given_up)
         results = read(console, now, planned, root)
+=======
+        early = EarlyResults(now)
+        failures += do_missing(console, planned, root, launchers, where, early, given_up)
+        results = read(console, now, planned, root, early)
+>>>>>>> wt-c
         steps = take_planned_looks(results)
         for step in steps:
             if (step.environment, step.growth.n_looks) not in said:

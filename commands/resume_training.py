@@ -126,11 +126,12 @@ def _nothing_to_do(args: argparse.Namespace, run: Run, console: Console) -> int:
 def _carried_out(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console) -> Outcome:
     """What comes out of the run, from its newest state on."""
     from commands.run_output import print_line
+    from pipeline.library_loading import loading_libraries
     from pipeline.resuming.state_keeping import StateKeeping
     from pipeline.signs_of_life import doing
 
     say = partial(print_line, console)
-    with doing(console, "loading the libraries") as activity:
+    with doing(console, "loading the libraries") as activity, loading_libraries():
         with current().waiting(0.0):
             from pipeline.training import carry_out, prepare
 

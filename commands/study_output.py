@@ -16,7 +16,7 @@ from experiments.looks import Standing
 from experiments.planned_runs import PlannedRun
 from experiments.repair import move_damaged_aside
 from experiments.replaced_runs import move_replaced_aside
-from experiments.study_results import LeftOut, StudyResults, read_results
+from experiments.study_results import EarlyResults, LeftOut, StudyResults, read_results
 from experiments.study_spec import StudySpec
 from pipeline.signs_of_life import Activity, doing
 
@@ -50,17 +50,27 @@ def run_study(
     Returns:
         The exit code: 0 if all runs are there and sound, else 1.
     """
+<<<<<<< HEAD
     failures = do_missing(console, planned, root, place)
     results = read(console, study, planned, root)
+=======
+    early = EarlyResults(study)
+    failures = do_missing(console, planned, root, launchers, where, early)
+    results = read(console, study, planned, root, early)
+>>>>>>> wt-c
     return conclude(console, results, failures, command, with_page=with_page)
 
 
 def read(
-    console: Console, study: StudySpec, planned: Sequence[PlannedRun], root: Path
+    console: Console,
+    study: StudySpec,
+    planned: Sequence[PlannedRun],
+    root: Path,
+    early: EarlyResults,
 ) -> StudyResults:
-    """Read the runs that there are."""
+    """Read the runs that there are, but for those that were read early."""
     with doing(console, "reading the results") as activity:
-        return read_results(study, planned, root, activity.at)
+        return read_results(study, planned, root, activity.at, early)
 
 
 def conclude(
@@ -161,10 +171,19 @@ def do_missing(
     console: Console,
     planned: Sequence[PlannedRun],
     root: Path,
+<<<<<<< HEAD
     place: Place,
+=======
+    launchers: Launchers,
+    where: str,
+    early: EarlyResults,
+>>>>>>> wt-c
     given_up: Collection[Path] = (),
 ) -> list[RunFailure]:
-    """Do the runs that are missing, but for those whose folders are given up; which failed."""
+    """Do the runs that are missing, but for those whose folders are given up; which failed.
+
+    Each is read as soon as it has ended.
+    """
     _make_way(console, planned, root)
     missing = [run for run in planned if run.is_to_do and run.path not in given_up]
     done = [run for run in planned if run.is_finished]
@@ -176,7 +195,17 @@ def do_missing(
     with StudyProgress(console, planned, done) as progress:
         for run in done:
             progress.note_refusal(run)
+<<<<<<< HEAD
         return execute(missing, root, progress.watching(place.launchers), progress.note)
+=======
+
+        def note(planned: PlannedRun, failure: RunFailure | None) -> None:
+            progress.note(planned, failure)
+            if failure is None:
+                early.read(planned)
+
+        return execute(missing, root, launchers, note)
+>>>>>>> wt-c
 
 
 def _judge(

@@ -10,6 +10,7 @@ from commands.parsing import command_line, exit_code
 from commands.streams import go_on_unread
 from commands.train_flags import RESUMING, build_parser
 from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.library_loading import loading_libraries
 from pipeline.stopping import StopRequest, stops_noticed
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     # What is called here says for itself where it can be stopped; between its parts a stop would
     # leave a run folder that nobody works on.
     with stop.held():
-        with doing(console, "loading the libraries") as activity:
+        with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
                 from pipeline.resuming.state_keeping import StateKeeping
                 from pipeline.run_folder import INTERRUPTED

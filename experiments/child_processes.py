@@ -29,7 +29,7 @@ from experiments.run_limits import RunLimits
 from experiments.task_in_child import LEFT_TO_SUPERVISOR, answer_from_child
 from pipeline.stopping import current
 
-PRELOADED = ["experiments.run_in_child", "experiments.fork_server_imports"]
+PRELOADED = ["experiments.fork_server_imports"]
 
 # One thread in each process: small networks are slower with more, and runs go side by side.
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")

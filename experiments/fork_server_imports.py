@@ -11,20 +11,24 @@ import os
 
 from experiments.child_processes import OUR_OWN, WARM_UPS
 from experiments.task_in_child import leave_signals_to_supervisor
-from experiments.warm_ups import take_steps, train_aside
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
+from pipeline.library_loading import loading_libraries
 
 
 def _warm_up() -> None:
+    import experiments.run_in_child  # noqa: F401  # what children call
+    from experiments.warm_ups import take_steps, train_aside
+    from pipeline.settings.hyperparams import split
+    from pipeline.train_spec import TrainSpec
+
     raw = {"n_timesteps": 100}
     # Where it fails, as without room for temporary files, runs compile for themselves.
     with contextlib.suppress(Exception):
-        train_aside(TrainSpec("qlearning", "Warehouse-v0", split(raw), raw, 0))
+        train_aside(TrainSpec("qlearning", "Warehouse-v0", split(raw), raw, 0, eval_freq=50))
     take_steps(os.environ.pop(WARM_UPS, "[]"))
 
 
 leave_signals_to_supervisor()
 if os.environ.get("PYTHONSAFEPATH") == OUR_OWN:
     del os.environ["PYTHONSAFEPATH"]  # what a run starts is to find its modules as usual
-_warm_up()
+with loading_libraries():
+    _warm_up()

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from pipeline.file_digests import DamagedFileError
 from pipeline.json_text import plain
 from pipeline.run_files import environment_name
-from pipeline.run_folder import FINISHED, Run
+from pipeline.run_folder import FINISHED, ReadRun, Run
 from pipeline.train_spec import TrainSpec, completed
 
 # What a run of the same settings may differ in: where it is written, what is shown meanwhile, and
@@ -54,6 +55,10 @@ class PlannedRun:
     def run(self) -> Run:
         """The run folder."""
         return Run(self.path, environment_name(self.spec.env_id))
+
+    def read(self) -> ReadPlannedRun:
+        """The same, for what is asked of its folder from now on: the record is read once."""
+        return ReadPlannedRun(**{field.name: getattr(self, field.name) for field in fields(self)})
 
     @property
     def is_finished(self) -> bool:
@@ -122,6 +127,16 @@ class PlannedRun:
             raise DamagedFileError(path, "is missing")
         if not self.run.recorded_spec():
             raise DamagedFileError(path, "is damaged: it does not say what was asked for")
+
+
+@dataclass(frozen=True)
+class ReadPlannedRun(PlannedRun):
+    """One that goes by what its folder said when it was first asked."""
+
+    @cached_property
+    def run(self) -> Run:
+        """The run folder."""
+        return ReadRun(self.path, environment_name(self.spec.env_id))
 
 
 def _identity(spec: Mapping[str, Any]) -> Any:

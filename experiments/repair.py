@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.planned_runs import PlannedRun
+from experiments.replaced_runs import move_aside
 from experiments.study_results import LeftOut, read_run
 from experiments.study_spec import StudySpec
 from pipeline.file_digests import DamagedFileError
-from pipeline.files import put_in_place
 from pipeline.signs_of_life import Tell, tell_nobody
 
 
@@ -30,11 +29,3 @@ def move_damaged_aside(
         except DamagedFileError as error:
             moved.append((LeftOut(run, str(error)), move_aside(run.path)))
     return moved
-
-
-def move_aside(folder: Path) -> Path:
-    """Rename a folder to ``<its name>.damaged-<n>``, the first that is free; where it is now."""
-    names = (folder.with_name(f"{folder.name}.damaged-{n}") for n in itertools.count(1))
-    place = next(path for path in names if not path.exists())
-    put_in_place(folder, place)
-    return place

@@ -89,3 +89,11 @@ def _new_folder(root: Path) -> Path:
             place.mkdir(parents=True)
             return place
     raise AssertionError
+
+
+def move_aside(folder: Path) -> Path:
+    """Rename a folder to ``<its name>.damaged-<n>``, the first that is free; where it is now."""
+    names = (folder.with_name(f"{folder.name}.damaged-{n}") for n in itertools.count(1))
+    place = next(path for path in names if not path.exists())
+    put_in_place(folder, place)
+    return place

@@ -5,6 +5,7 @@ Runs of earlier versions recorded no digests: of these a file counts that has th
 
 from __future__ import annotations
 
+import csv
 import io
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 
 from mdp.array_types import Floats
@@ -58,32 +58,40 @@ def read_episodes(run: Run) -> Episodes:
     Raises:
         DamagedFileError: if a file of them is missing or changed, or holds anything else.
     """
-    tables = []
     files = run.files
     paths = files.matching("*.monitor.csv")
     if not paths:
         raise DamagedFileError(run.path / "0.monitor.csv", "is missing")
-    for path in paths:
-        table = _monitor_table(path, files.read(path))
-        # The environments are stepped together: all have done what one of them has.
-        table["step"] = len(paths) * table["l"].cumsum()
-        tables.append(table)
-    rows = pd.concat(tables).sort_values("step", kind="stable")
-    return Episodes(*(rows[name].to_numpy(dtype=np.float64) for name in ("step", "r", "t")))
+    tables = [_monitor_table(path, files.read(path)) for path in paths]
+    # The environments are stepped together: all have done what one of them has.
+    steps = np.concatenate([len(paths) * table[:, 1].cumsum() for table in tables])
+    order = np.argsort(steps, kind="stable")
+    rows = np.concatenate(tables)[order]
+    return Episodes(steps[order], rows[:, 0], rows[:, 2])
 
 
-def _monitor_table(path: Path, content: bytes) -> pd.DataFrame:
+def _monitor_table(path: Path, content: bytes) -> Floats:
+    """Return, length and time of each episode, shape (n, 3)."""
     try:
         if not content.startswith(b"#"):
             raise ValueError("it does not begin with Monitor's line of settings")
-        table = pd.read_csv(
-            io.BytesIO(content), skiprows=1, usecols=_COLUMNS, dtype=np.float64, engine="c"
-        )
+        table = _table_of(content)
     except (ValueError, OverflowError) as error:
         raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error
-    if not np.isfinite(table.to_numpy()).all() or (table["l"] < 1).any():
+    if not np.isfinite(table).all() or (table[:, 1] < 1).any():
         raise DamagedFileError(path, "is damaged: an episode has no return, length or time")
     return table
+
+
+def _table_of(content: bytes) -> Floats:
+    """The columns of the figures; others, which environments may add, are not looked at."""
+    _, names, rows = [*content.split(b"\n", 2), b"", b""][:3]
+    found = next(csv.reader([names.decode()]), [])
+    places = [found.index(name) for name in _COLUMNS]
+    if not rows.strip():
+        return np.empty((0, len(places)))
+    lines = io.BytesIO(rows)
+    return np.loadtxt(lines, delimiter=",", usecols=places, comments=None, quotechar='"', ndmin=2)
 
 
 def read_evaluations(run: Run) -> tuple[Floats, Floats]:

@@ -6,11 +6,10 @@ from pathlib import Path
 
 from experiments.drafts import draft_path, take_over
 from experiments.planned_runs import PlannedRun
-from experiments.repair import move_aside
-from experiments.replaced_runs import make_room
+from experiments.replaced_runs import make_room, move_aside
 from experiments.run_or_go_on import do_or_go_on
 from pipeline.file_digests import DamagedFileError
-from pipeline.files import put_in_place, sync_folders
+from pipeline.files import kept_later, put_in_place, settle, sync_together
 from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.signs_of_life import Heartbeat
 from pipeline.user_modules import import_again
@@ -31,9 +30,11 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     heart = Heartbeat(lambda: give_sign(draft), SECONDS_BETWEEN_SIGNS)
     heart.start()
     try:
-        do_or_go_on(planned, draft, command)
+        with kept_later(draft):  # what a power cut leaves of it without a state is begun anew
+            do_or_go_on(planned, draft, command)
     finally:
         heart.stop()
+    settle(draft)
     put_run_in_place(planned, draft)
 
 
@@ -50,4 +51,4 @@ def put_run_in_place(planned: PlannedRun, draft: Path) -> None:
     except OSError:
         if not planned.is_finished:
             raise
-    sync_folders(*list(planned.path.parents)[:3])
+    sync_together([], list(planned.path.parents)[:3])

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments.bandit_batches import do_batch
 from experiments.drafts import claim_draft, holds_state
 from experiments.planned_runs import PlannedRun
 from pipeline.broken_runs import is_of_the_machine
@@ -33,6 +32,8 @@ def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
     if not keeping.goes_on:
         _begin_anew(planned, run)
     if planned.is_batch:
+        from experiments.bandit_batches import do_batch
+
         do_batch(planned.spec, planned.n_runs, run, command)
         return
     args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}

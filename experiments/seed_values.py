@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from experiments.study_results import TRAINING_POINTS, StudyResults
+from experiments.run_curves import TRAINING_POINTS
+from experiments.study_results import StudyResults
 from mdp.array_types import Floats
 from verdicts import Band, curve_band, on_grid, shared_grid
 

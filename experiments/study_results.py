@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +15,10 @@ import pandas as pd
 from experiments.bandit_results import batch_rows, read_pulls, run_regret
 from experiments.planned_runs import PlannedRun
 from experiments.pull_statistics import PullStatistics
+from experiments.run_curves import Curve, evaluation_curve, joined, training_curve
 from experiments.run_figures import (
     Episodes,
     read_episodes,
-    read_evaluations,
     read_outcome,
     read_value_maps,
 )
@@ -27,7 +29,6 @@ from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import area_under_curve, steps_to_stay, steps_to_threshold
 
 LAST_EPISODES = 100
-TRAINING_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,11 @@ class RunResults:
 
     Attributes:
         rows: of the summary, see `RUN_COLUMNS`.
-        curves: see `CURVE_COLUMNS`.
+        curves: its learning curves.
     """
 
     rows: list[dict[str, Any]]
-    curves: list[pd.DataFrame] = field(default_factory=list)
+    curves: list[Curve] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ class StudyResults:
     left_out: tuple[LeftOut, ...] = ()
     n_unchecked: int = 0
 
-    @property
+    @cached_property
     def finished(self) -> list[PlannedRun]:
         """The runs that the results are of."""
         damaged = {one.planned.path for one in self.left_out}
@@ -122,32 +123,47 @@ RUN_COLUMNS = (
     "path",
 )
 
-# Columns of `StudyResults.curves`. Each row is an evaluation, or the mean of some episodes of
-# training at the end of the last.
-CURVE_COLUMNS = (
-    "agent",
-    "environment",
-    "seed",
-    "kind",  # "evaluation" or "training"
-    "step",
-    "episode",
-    "seconds",
-    "value",  # return
-)
-
 # Columns that have the same name in ``run.json``.
 _FIGURES = ("success_rate", "exact", "optimum", "baseline", "gap", "score")
 
 
+class EarlyResults:
+    """What runs have to say, read when each has ended, while others are still under way.
+
+    Args:
+        study: whose runs they are.
+    """
+
+    def __init__(self, study: StudySpec) -> None:
+        self.study = study
+        self._found: dict[Path, RunResults] = {}
+
+    def read(self, planned: PlannedRun) -> None:
+        """Read a run that has just ended; one that is damaged is found to be so at the end."""
+        with contextlib.suppress(DamagedFileError):
+            found = read_run(self.study, planned)
+            if found is not None:
+                self._found[planned.path] = found
+
+    def of(self, planned: PlannedRun) -> RunResults | None:
+        """As `read_run`, where that was not done before."""
+        return self._found.get(planned.path) or read_run(self.study, planned)
+
+
 def read_results(
-    study: StudySpec, planned: Sequence[PlannedRun], root: Path, tell: Tell = tell_nobody
+    study: StudySpec,
+    planned: Sequence[PlannedRun],
+    root: Path,
+    tell: Tell = tell_nobody,
+    early: EarlyResults | None = None,
 ) -> StudyResults:
     """Read all runs that have finished; those whose files are damaged are left out."""
     rows, curves, done, left_out = [], [], [], []
+    early = early or EarlyResults(study)
     for place, run in enumerate(planned, start=1):
         tell(f"run {place:,} of {len(planned):,}")
         try:
-            found = read_run(study, run)
+            found = early.of(run)
         except DamagedFileError as error:
             left_out.append(LeftOut(run, str(error)))
             continue
@@ -159,7 +175,7 @@ def read_results(
         study,
         root,
         pd.DataFrame(rows, columns=list(RUN_COLUMNS)),
-        pd.concat(curves, ignore_index=True) if curves else pd.DataFrame(columns=CURVE_COLUMNS),
+        joined(curves),
         tuple(planned),
         read_pulls(done),
         tuple(left_out),
@@ -173,6 +189,7 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
     Raises:
         DamagedFileError: if a file that a comparison reads is missing, changed or no such file.
     """
+    planned = planned.read()
     planned.check_record()
     if not planned.is_finished:
         return None
@@ -180,9 +197,9 @@ def read_run(study: StudySpec, planned: PlannedRun) -> RunResults | None:
         return RunResults(batch_rows(planned))
     _check_for_page(study, planned)
     episodes = read_episodes(planned.run)
-    evaluations = _evaluation_curve(planned, episodes)
+    evaluations = evaluation_curve(planned, episodes)
     row = _summary_row(study, planned, episodes, evaluations)
-    return RunResults([row], [evaluations, _training_curve(planned, episodes)])
+    return RunResults([row], [evaluations, training_curve(planned, episodes)])
 
 
 def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
@@ -196,43 +213,6 @@ def _check_for_page(study: StudySpec, planned: PlannedRun) -> None:
         files.check(run.model_path)
         if not run.model_path.exists():
             raise DamagedFileError(run.model_path, "is missing")
-
-
-def _curve(planned: PlannedRun, kind: str, columns: dict[str, Floats]) -> pd.DataFrame:
-    table = pd.DataFrame(columns)
-    table["agent"], table["environment"] = planned.agent, planned.environment
-    table["seed"], table["kind"] = planned.seed, kind
-    return table[list(CURVE_COLUMNS)]
-
-
-def _evaluation_curve(planned: PlannedRun, episodes: Episodes) -> pd.DataFrame:
-    steps, returns = read_evaluations(planned.run)
-    seconds = np.interp(
-        steps, np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
-    )
-    columns = {
-        "step": steps,
-        "episode": np.searchsorted(episodes.steps, steps, side="right").astype(np.float64),
-        "seconds": seconds,
-        "value": returns,
-    }
-    return _curve(planned, "evaluation", columns)
-
-
-def _training_curve(planned: PlannedRun, episodes: Episodes) -> pd.DataFrame:
-    """Means over blocks of episodes, so that no run has more than `TRAINING_POINTS`."""
-    n = len(episodes.returns)
-    block = max(-(-n // TRAINING_POINTS), 1)
-    ends = np.minimum(np.arange(block, n + block, block), n)
-    starts = np.arange(0, n, block)
-    sums = np.add.reduceat(episodes.returns, starts) if n else np.empty(0)
-    columns = {
-        "step": episodes.steps[ends - 1],
-        "episode": ends.astype(np.float64),
-        "seconds": episodes.seconds[ends - 1],
-        "value": sums / (ends - starts),
-    }
-    return _curve(planned, "training", columns)
 
 
 def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float | None:
@@ -253,14 +233,14 @@ def _mean(values: Floats) -> float:
 
 
 def _summary_row(
-    study: StudySpec, planned: PlannedRun, episodes: Episodes, evaluations: pd.DataFrame
+    study: StudySpec, planned: PlannedRun, episodes: Episodes, evaluations: Curve
 ) -> dict[str, Any]:
     info = read_outcome(
         planned.run, ("final", "best_mean_return", "best_timesteps", "n_timesteps", "seconds")
     )
     final = info["final"]
     threshold = threshold_of(study, planned.spec.env_id, final)
-    steps, values = evaluations["step"].to_numpy(), evaluations["value"].to_numpy()
+    steps, values = evaluations.figures["step"], evaluations.figures["value"]
     reached = stayed = float("nan")
     if threshold is not None and len(steps):
         reached = steps_to_threshold(steps, values, threshold)

@@ -50,7 +50,7 @@ class LimitedEpisodes:
                 without discount.
         """
         states = self._visited()
-        moments = self._along_ways(states, discount, ends_well)
+        moments = self.along_ways(states, discount, ends_well)
         if moments is None and self._is_large(states):
             mean, variance, length, spread, rate = self._forwards(discount, ends_well, floor)
             return PolicyReturn(
@@ -96,8 +96,17 @@ class LimitedEpisodes:
     def _is_large(self, states: Ints) -> bool:
         return self._is_stationary() and len(states) * self.horizon > MOST_BACKWARDS
 
-    def _along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
-        """The moments (n, 5) where each of the states has one outcome; None where one has more."""
+    def along_ways(self, states: Ints, discount: float, ends_well: Bools) -> Floats | None:
+        """The moments where each of the states has one outcome; None where one has more.
+
+        Args:
+            states: those that count, of which none may lead to any other; n of them.
+            discount: from 0 to 1.
+            ends_well: the outcomes that count as success, bool of shape (S, A, K).
+
+        Returns:
+            Shape (n, 5), see `mdp.moments`.
+        """
         if not self._is_stationary():
             return None
         if np.issubdtype(self.policy.dtype, np.integer):

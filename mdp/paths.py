@@ -6,38 +6,15 @@ a time limit of T takes log2(T) rounds over the states, however often a way goes
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from mdp.array_types import AnyInts, Bools, Floats
+from mdp.array_types import AnyInts, Bools, Floats, Ints
+from mdp.machine_code import compiled
 
-
-@dataclass(frozen=True, eq=False)
-class Ways:
-    """What some number of steps from each state comes to; the last entry stands for the end.
-
-    Attributes:
-        earned: the (discounted) sum of rewards, shape (n + 1,).
-        length: the number of steps until then or the end, shape (n + 1,).
-        success: whether the episode has ended well by then, shape (n + 1,).
-        leads_to: the state after them, shape (n + 1,).
-    """
-
-    earned: Floats
-    length: Floats
-    success: Bools
-    leads_to: AnyInts
-
-    def followed_by(self, then: Ways, discount: float) -> Ways:
-        """These steps and then others, whose rewards count ``discount`` times."""
-        place = self.leads_to
-        return Ways(
-            self.earned + discount * then.earned[place],
-            self.length + then.length[place],
-            self.success | then.success[place],
-            then.leads_to[place],
-        )
+# What some number of steps from each state comes to, each of shape (n + 1,); the last entry stands
+# for the end. The (discounted) sum of rewards, the number of steps until then or the end, whether
+# the episode has ended well by then, and the state after them.
+Ways = tuple[Floats, Floats, Bools, Ints]
 
 
 def moments_along_ways(
@@ -61,26 +38,52 @@ def moments_along_ways(
     Returns:
         Shape (n, 5), the variances zero.
     """
+    moments = np.zeros((len(reward), 5))
+    total = _walked(next_state.astype(np.int64), terminated, reward, success, horizon, discount)
+    for place, part in zip((0, 2, 4), total[:3], strict=True):
+        moments[:, place] = part[:-1]
+    return moments
+
+
+@compiled
+def _walked(
+    next_state: Ints,
+    terminated: Bools,
+    reward: Floats,
+    success: Bools,
+    horizon: int,
+    discount: float,
+) -> Ways:
+    """All steps of the limit from each state, out of powers of two of them."""
     n = len(reward)
-    ended = np.append(np.where(terminated, n, next_state), n)
-    step = Ways(
-        np.append(reward, 0.0),
-        np.append(np.ones(n), 0.0),
-        np.append(success & terminated, False),
-        ended,
-    )
-    nothing = np.zeros(n + 1)
-    total = Ways(nothing, nothing, np.zeros(n + 1, np.bool_), np.arange(n + 1))
+    step = np.zeros(n + 1), np.ones(n + 1), np.zeros(n + 1, np.bool_), np.full(n + 1, n)
+    step[1][n] = 0.0
+    for state in range(n):
+        step[0][state] = reward[state]
+        step[2][state] = success[state] and terminated[state]
+        if not terminated[state]:
+            step[3][state] = next_state[state]
+    total = np.zeros(n + 1), np.zeros(n + 1), np.zeros(n + 1, np.bool_), np.arange(n + 1)
     n_done, n_steps = 0, 1
     while True:
         if horizon & n_steps:
-            total = total.followed_by(step, discount**n_done)
+            total = _followed(total, step, discount ** float(n_done))
             n_done += n_steps
         if n_done == horizon:
-            break
-        step = step.followed_by(step, discount**n_steps)
+            return total
+        step = _followed(step, step, discount ** float(n_steps))
         n_steps *= 2
-    moments = np.zeros((n, 5))
-    moments[:, 0], moments[:, 2] = total.earned[:n], total.length[:n]
-    moments[:, 4] = total.success[:n]
-    return moments
+
+
+@compiled
+def _followed(first: Ways, then: Ways, discount: float) -> Ways:
+    """Some steps and then others, whose rewards count ``discount`` times."""
+    n = len(first[0])
+    both = np.empty(n), np.empty(n), np.empty(n, np.bool_), np.empty(n, np.int64)
+    for state in range(n):
+        place = first[3][state]
+        both[0][state] = first[0][state] + discount * then[0][place]
+        both[1][state] = first[1][state] + then[1][place]
+        both[2][state] = first[2][state] or then[2][place]
+        both[3][state] = then[3][place]
+    return both

@@ -6,6 +6,7 @@ import numpy as np
 
 from mdp.array_types import Bools, Floats, Ints
 from mdp.finite_horizon import finite_horizon_optimum
+from mdp.limited_episodes import LimitedEpisodes
 from mdp.machine_code import compiled
 from mdp.policies import Policy, canonical_policy, chances_in
 from mdp.transition_model import TransitionModel
@@ -32,8 +33,12 @@ def state_values(model: TransitionModel, policy: Policy, horizon: int) -> Floats
         raise ValueError(f"horizon is {horizon}, it must be at least 1")
     policy = canonical_policy(model, policy, horizon)
     states = np.flatnonzero(model.reachable)
-    place = np.cumsum(model.reachable) - 1
     values = np.zeros(model.n_states)
+    moments = LimitedEpisodes(model, policy, horizon).along_ways(states, 1.0, model.terminated)
+    if moments is not None:
+        values[states] = moments[:, 0]
+        return values
+    place = np.cumsum(model.reachable) - 1
     values[states] = _returns_under_limit(
         model.prob[states],
         place[model.next_state[states]],

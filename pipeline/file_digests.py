@@ -98,9 +98,13 @@ class RecordedFiles:
     def _recorded(self, path: Path) -> str | None:
         """The digest of a file; None where the run recorded none, or the file is not its own."""
         # Not where a link leads that somebody put in the file's place.
+        if self.digests is None:
+            return None
+        if path.parent == self.folder:
+            return self.digests.get(path.name)
         place = path.parent.resolve() / path.name
         folder = self.folder.resolve()
-        if self.digests is None or not place.is_relative_to(folder):
+        if not place.is_relative_to(folder):
             return None
         return self.digests.get(place.relative_to(folder).as_posix())
 

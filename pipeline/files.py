@@ -10,7 +10,8 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,9 @@ DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "E
 
 # Folders of others above one's own, and file systems that flush no folder.
 _CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
+
+SYNCED_AT_ONCE = 4
+_KEPT_LATER: list[Path] = []
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
 _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
@@ -110,12 +114,42 @@ def replacing(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def lasting(path: Path) -> Iterator[Path]:
-    """As `replacing`, and after it the file is there for good, also after a power cut."""
+    """As `replacing`, and after it the file is there for good, also after a power cut.
+
+    Not so in a folder that is `kept_later`.
+    """
+    later = is_kept_later(path)
     with replacing(path) as draft:
         yield draft
-        with naming(path):
-            sync_file(draft)
-    sync_folders(path.parent)
+        if not later:
+            with naming(path):
+                sync_file(draft)
+    if not later:
+        sync_folders(path.parent)
+
+
+@contextmanager
+def kept_later(folder: Path) -> Iterator[None]:
+    """Within the ``with`` statement nobody waits for what `lasting` writes in a folder.
+
+    Whoever says so waits for all of it at once, before it counts: see `settle`.
+    """
+    _KEPT_LATER.append(folder)
+    try:
+        yield
+    finally:
+        _KEPT_LATER.remove(folder)
+
+
+def is_kept_later(path: Path) -> bool:
+    """Whether somebody else waits until the disk has what is written there."""
+    return any(path.is_relative_to(folder) for folder in _KEPT_LATER)
+
+
+def settle(folder: Path) -> None:
+    """Wait until the disk has a folder and all that is in it."""
+    paths = [folder, *folder.rglob("*")]
+    sync_together(filter(Path.is_file, paths), filter(Path.is_dir, paths))
 
 
 if sys.platform == "win32":
@@ -148,6 +182,18 @@ else:
             os.fsync(number)
         finally:
             os.close(number)
+
+
+def sync_together(files: Iterable[Path], folders: Iterable[Path]) -> None:
+    """Wait until the disk has files and the names in folders, which are asked for at once.
+
+    A disk that is asked for one after the other has to finish each before it hears of the next.
+    """
+    with ThreadPoolExecutor(SYNCED_AT_ONCE) as pool:
+        waits = [pool.submit(sync_file, path) for path in files]
+        waits += [pool.submit(sync_folders, folder) for folder in folders]
+    for wait in waits:
+        wait.result()
 
 
 def drafts_in(folder: Path) -> list[Path]:

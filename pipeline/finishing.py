@@ -5,6 +5,7 @@ from __future__ import annotations
 from pipeline.evaluation.evaluation_budget import SampledEvaluator
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation.value_maps import value_map
+from pipeline.library_loading import loading_libraries
 from pipeline.models.companions import final_replay_buffer_path
 from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
 from pipeline.pictures.learning_curve import draw_learning_curve
@@ -50,17 +51,23 @@ def judge(training: Training, state: str) -> Evaluation | None:
 
 def draw(training: Training, final: Evaluation | None) -> None:
     """Draw the pulls, the learning curve and the map of the final policy, where there are such."""
+    if training.spec.pictures:
+        with loading_libraries():  # Matplotlib
+            _draw(training, final)
+
+
+def _draw(training: Training, final: Evaluation | None) -> None:
     run, spec, recorder = training.run, training.spec, training.pulls
     title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
     has_pulls = recorder is not None and recorder.n_calls > 0
-    if spec.pictures and recorder is not None and has_pulls:
+    if recorder is not None and has_pulls:
         draw_pulls(run.pulls_picture_path, title, recorder.arrays())
-    if spec.pictures and (not has_pulls or training.evaluation.evaluations_timesteps):
+    if not has_pulls or training.evaluation.evaluations_timesteps:
         yardstick = None if final is None else final.yardstick
         first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant
         draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
     maps = training.evaluation.value_maps
-    if spec.pictures and maps is not None and training.evaluation.is_asked_for:
+    if maps is not None and training.evaluation.is_asked_for:
         found = value_map(maps.evaluator, training.model)
         if found is not None:
             draw_value_map(run.value_map_path, title, found)

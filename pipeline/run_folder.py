@@ -11,7 +11,9 @@ import os
 import re
 import secrets
 import shutil
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +29,10 @@ from pipeline.file_digests import (
 )
 from pipeline.files import (
     drafts_in,
+    is_kept_later,
     naming,
     put_in_place,
-    sync_file,
-    sync_folders,
+    sync_together,
     write_json,
 )
 from pipeline.liveness import is_alive, mark
@@ -211,11 +213,14 @@ class Run(RunFiles):
         for draft in drafts_in(self.path):  # of a file that was not to be finished any more
             draft.unlink(missing_ok=True)
         digests = digests_of(self.path)
-        for name in digests:
-            sync_file(self.path / name)
-        inner = {(self.path / name).parent for name in digests}
-        sync_folders(*inner, *[self.path, *self.path.parents][:3])
+        if not is_kept_later(self.path):
+            self.wait_for_disk([self.path / name for name in digests])
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests})
+
+    def wait_for_disk(self, files: Sequence[Path]) -> None:
+        """Wait until the disk has files of the run, and the way to them."""
+        way = [self.path, *self.path.parents][:3]
+        sync_together(files, {*(path.parent for path in files), *way})
 
     @property
     def files(self) -> RecordedFiles:
@@ -234,6 +239,23 @@ class Run(RunFiles):
                 folder.rmdir()
             except OSError:
                 return
+
+
+@dataclass(frozen=True)
+class ReadRun(Run):
+    """A run folder that is only read: all goes by what it said when it was first asked."""
+
+    @cached_property
+    def _info(self) -> dict[str, Any]:
+        return super().read_info()
+
+    def read_info(self) -> dict[str, Any]:
+        return self._info
+
+    @cached_property
+    def files(self) -> RecordedFiles:
+        """The files that the run left, each held against what it was then."""
+        return super().files
 
 
 def _renamed(draft: Path, path: Path) -> bool:

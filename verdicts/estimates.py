@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -17,7 +18,7 @@ from verdicts.bootstrap import (
     percentile_interval,
     resample_counts,
 )
-from verdicts.score_arrays import Floats
+from verdicts.score_arrays import Counts, Floats
 
 Statistic = Literal["mean", "median", "iqm"]
 
@@ -142,17 +143,24 @@ def _resample(scores: ArrayLike, seed: int, confidence: float, n_resamples: int)
     n_missing = columns.size - values.size
     if any(len(stratum) == 0 for stratum in strata):
         return _Resampled(values, np.empty((0, 0)), tail, n_missing)
-    rng = np.random.default_rng(seed)
     n_resamples = enough_resamples(n_resamples, max(map(len, strata)))
     if values.min() == values.max():
         n_resamples = 1  # all are alike
+    sizes = tuple(map(len, strata))
     counts = [
-        np.vstack([np.ones(n, dtype=np.int64), resample_counts(n, n_resamples, rng)])
-        * (len(values) / (len(strata) * n))
-        for n in map(len, strata)
+        np.vstack([np.ones(n, dtype=np.int64), drawn]) * (len(values) / (len(strata) * n))
+        for n, drawn in zip(sizes, _drawn(sizes, n_resamples, seed), strict=True)
     ]
     order = np.argsort(values)
     return _Resampled(values[order], np.hstack(counts)[:, order].cumsum(axis=1), tail, n_missing)
+
+
+# Agents of a study have as many seeds, and several figures each.
+@lru_cache(maxsize=1)
+def _drawn(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[Counts, ...]:
+    """Resamples of each stratum; nobody changes them."""
+    rng = np.random.default_rng(seed)
+    return tuple(resample_counts(n, n_resamples, rng) for n in sizes)
 
 
 def _trimmed_means(values: Floats, weights: Floats, cut: int) -> Floats:

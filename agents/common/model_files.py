@@ -9,14 +9,16 @@ import sys
 import warnings
 import zipfile
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any, ClassVar, Self
 
+import stable_baselines3 as sb3
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.save_util import open_path, save_to_zip_file
+from stable_baselines3.common.save_util import open_path
 from stable_baselines3.common.type_aliases import GymEnv
-from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
 from agents.common.serialization import UnknownTypeError, decode, encode
 from safe_files.archives import read_members
@@ -203,14 +205,30 @@ def _check_tables(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None
 
 
 def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
-    """The zip that the library writes, with the JSON at its end.
+    """The members that the library writes, with the JSON at the end.
 
     A line for each attribute: indented further, as the library does it, writing takes Python twice
     as long as all the rest.
     """
-    buffer = io.BytesIO()
-    save_to_zip_file(buffer, params=params, pytorch_variables={})
+    members = {"pytorch_variables.pth": _saved({})}
+    members |= {f"{name}.pth": _saved(tables) for name, tables in params.items()}
+    members["_stable_baselines3_version"] = sb3.__version__.encode()
+    members["system_info.txt"] = _system_info().encode()
     lines = [f"{json.dumps(name)}: {json.dumps(value)}" for name, value in data.items()]
-    with zipfile.ZipFile(buffer, "a") as archive:
-        archive.writestr("data", "{\n" + ",\n".join(lines) + "\n}")
+    members["data"] = ("{\n" + ",\n".join(lines) + "\n}").encode()
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
     return buffer.getvalue()
+
+
+def _saved(tables: dict[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    th.save(tables, buffer)
+    return buffer.getvalue()
+
+
+@cache
+def _system_info() -> str:
+    return get_system_info(print_info=False)[1]

@@ -28,6 +28,9 @@ _MAX_VALUES = 10_000_000
 # Truth values and numbers of at most 64 bits, which JSON holds without loss.
 _ARRAY_DTYPE = re.compile(r"[<>|][biuf][1248]")
 
+# What most of an agent's attributes are made of.
+_AS_THEY_ARE = frozenset({type(None), bool, int, float, str})
+
 
 class UnknownTypeError(TypeError):
     """An object that the file format has no place for."""
@@ -54,12 +57,16 @@ def encode(value: Any) -> Any:
     Raises:
         UnknownTypeError: if it, or a part of it, is not of a type that the format knows.
     """
+    if type(value) in _AS_THEY_ARE:
+        return value
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list):
-        return [encode(item) for item in value]
+        return [item if type(item) in _AS_THEY_ARE else encode(item) for item in value]
+    if type(value) is dict:  # as its codec has it, for the hundred of them that Monitor has told of
+        return {TYPE: "dict", "pairs": [encode(pair) for pair in _pairs(value)]}
     name = type(value).__name__
     codec = CODECS.get(name)
     if codec is None or type(value) is not codec.cls:

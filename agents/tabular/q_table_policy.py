@@ -88,7 +88,7 @@ class QTablePolicy(MaskBufferPolicy):
 
     def allowed_values(self, obs: Ints) -> Floats:
         """Action values at some observations, minus infinity where masked, shape (n, A)."""
-        values = self.q_tables[:, th.from_numpy(obs)].mean(dim=0).numpy()
+        values: Floats = self.q_tables.numpy()[:, obs].mean(axis=0)
         if not len(self.masks):
             return values
         masks = self.masks[obs]

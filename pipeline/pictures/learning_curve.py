@@ -10,7 +10,7 @@ import numpy as np
 
 from mdp.array_types import Floats
 from pipeline.evaluation.sampled import Yardstick
-from pipeline.files import replacing
+from pipeline.pictures.picture_files import fix_layout, write_png
 from pipeline.run_folder import Run
 
 if TYPE_CHECKING:
@@ -196,5 +196,5 @@ def draw_learning_curve(
         axes.spines[["top", "right"]].set_visible(False)
     if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
         _add_legend(figure)
-    with replacing(run.curve_path) as draft:
-        figure.savefig(draft, format="png")
+    fix_layout(figure)
+    write_png(figure, run.curve_path)

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.array_types import Floats
-from pipeline.files import replacing
 from pipeline.pictures.learning_curve import BLUE, GREEN, MAX_POINTS, ORANGE, moving_average
+from pipeline.pictures.picture_files import fix_layout, write_png
 from pipeline.pull_recording import LAST_PULLS
 
 if TYPE_CHECKING:
@@ -53,8 +53,8 @@ def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> Non
         axes.grid(alpha=0.3)
         axes.spines[["top", "right"]].set_visible(False)
     figure.suptitle(title, x=0.01, ha="left")
-    with replacing(path) as draft:
-        figure.savefig(draft, format="png")
+    fix_layout(figure)
+    write_png(figure, path)
 
 
 def _draw(axes: Axes, values: Floats, colour: str) -> None:

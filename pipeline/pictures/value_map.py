@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from envs.layout import GOAL, PRIZE, TRAP, WALL, GridLayout
 from envs.sprites import INK, Colour
 from pipeline.evaluation.value_maps import ValueMap
-from pipeline.files import replacing
 from pipeline.pictures.learning_curve import ORANGE
 from pipeline.pictures.map_cells import (
     BELOW,
@@ -30,6 +29,7 @@ from pipeline.pictures.map_cells import (
     policies_in,
     shade,
 )
+from pipeline.pictures.picture_files import fix_layout, write_png
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -56,8 +56,6 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
         title: what stands above the picture.
         found: the map.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     layers, cell = shown_layers(found), cell_inches(found.layout)
     scale, colours = _value_scale(found)
     decimals = decimals_for(found)
@@ -67,18 +65,12 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
     figure.suptitle(title, x=0.01, ha="left")
     # What stands inside the panels needs no room around them. Fixed now, the layout is worked
     # out once, and without asking hundreds of numbers for their size.
-    engine = figure.get_layout_engine()
-    assert engine is not None
-    engine.execute(figure)
-    figure.set_layout_engine("none")
+    fix_layout(figure)
     for pair, layer in zip(pairs, layers, strict=True):
         for axes, policy in zip(pair, policies_in(found, layer), strict=True):
             draw_ground(axes, policy, scale, colours)
             _draw_policy(axes, policy, 72 * cell, decimals, thick=axes is pair[0])
-    with replacing(path) as draft:
-        # `savefig` would draw everything twice, the first time for the layout.
-        canvas: Any = FigureCanvasAgg(figure)
-        canvas.print_png(draft)
+    write_png(figure, path)
 
 
 def shown_layers(found: ValueMap) -> list[int]:

@@ -89,6 +89,7 @@ class StateSaver(StopAtSafeMoment):
         )
         self.started = WorkTime.now()
         self.n_synced: dict[str, int] = {}  # bytes, by the names of files
+        self.stamps: dict[Path, tuple[int, int, int]] = {}  # of files that the disk has
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
         self.was_cut_off = was_cut_off
@@ -211,11 +212,28 @@ class StateSaver(StopAtSafeMoment):
         self.n_saved += 1
 
     def _sync(self, positions: Mapping[str, Position]) -> None:
-        """Let the disk have what the state is held against, as far as that takes no time."""
+        """Let the disk have what the state is held against, and what is not written anew after it.
+
+        Of logs that grow fast, only as far as that takes no time.
+        """
         for name, (length, *_) in positions.items():
             if length - self.n_synced.get(name, 0) <= MOST_SYNCED:
                 sync_file(self.run.path / name)
             self.n_synced[name] = length
+        self.run.wait_for_disk(self._files_changed(positions))
+
+    def _files_changed(self, logs: Mapping[str, Position]) -> list[Path]:
+        """The files of the run beside its logs and states that the disk may not have yet."""
+        changed = []
+        for path in self.run.path.rglob("*"):
+            if path.parent == self.run.state_path or path.name in logs or not path.is_file():
+                continue
+            status = path.stat()
+            stamp = status.st_ino, status.st_mtime_ns, status.st_size
+            if self.stamps.get(path) != stamp:
+                self.stamps[path] = stamp
+                changed.append(path)
+        return changed
 
     def _roots(self) -> dict[str, Any]:
         logger = self.model.logger

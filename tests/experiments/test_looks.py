@@ -17,8 +17,9 @@ from experiments.growing import (
 )
 from experiments.looking import take_looks
 from experiments.looks_file import FILE, read_looks
+from experiments.run_curves import CURVE_COLUMNS
 from experiments.study_plan import plan
-from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.study_results import RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from report.conclusions import conclusion

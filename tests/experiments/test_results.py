@@ -13,9 +13,10 @@ from PIL import Image
 from rich.console import Console
 
 from experiments.analysis import analyse
+from experiments.run_curves import CURVE_COLUMNS
 from experiments.seed_values import curves_by_agent, mean_curve, values_over_seeds
 from experiments.study_plan import plan
-from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, read_results
+from experiments.study_results import RUN_COLUMNS, read_results
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
 from report.conclusions import conclusion, places_without_a_run

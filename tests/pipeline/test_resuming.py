@@ -406,6 +406,24 @@ def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeyp
     assert set(order) == {"state"}
 
 
+def test_models_are_on_the_disk_before_a_state_that_comes_after_them(tmp_path, monkeypatch):
+    """They are not written again by a run that goes on from it."""
+    held, save = [], saved_states.save_state
+    monkeypatch.setattr(
+        "pipeline.run_folder.sync_together",
+        lambda files, _: held.extend(path.name for path in files),
+    )
+    seen = []
+    monkeypatch.setattr(
+        "pipeline.resuming.state_saver.save_state",
+        lambda *args: (seen.append(set(held)), held.clear(), save(*args)),
+    )
+    spec = spec_of(tmp_path, GRID, "qlearning", 600, {}, eval_freq=100)
+    train(spec, Console(quiet=True), {}, "", keeping=StateKeeping(SaveInterval(steps=150)))
+    assert {"run.json", "best_model.zip", "evaluations.npz"} <= seen[0]
+    assert "run.json" not in seen[1]  # it has not changed since
+
+
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     """However long a state takes, the next is saved fifty times as long after it."""
     clock = [0.0]

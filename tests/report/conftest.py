@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.run_curves import CURVE_COLUMNS
+from experiments.study_results import RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from verdicts import Estimate, PairComparison, Summary, ThresholdSummary
 
