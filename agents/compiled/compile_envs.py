@@ -132,6 +132,8 @@ def _finite_model(env: Env) -> FiniteModel:
         raise NotCompilable(check.refusal)
     if check is None or model is None or observations is None:
         raise NotCompilable("the environment's transition model is not known")
+    if model.reward_variance is not None:
+        raise NotCompilable("rewards are drawn, and the environment's model holds their means")
     # A wrapper may leave the dynamics alone and yet have to see every step, to film it say.
     watching = {type(layer) for layer in layers(env)[:-1]} - MODEL_WRAPPERS
     if watching:

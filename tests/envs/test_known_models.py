@@ -44,6 +44,13 @@ ENVIRONMENTS: list[tuple[str, dict[str, Any]]] = [
     ("CliffWalking-v1", {"is_slippery": True}),
     ("Taxi-v4", {}),
     ("Taxi-v4", {"is_rainy": True, "rainy_probability": 0.7}),
+    ("DynaMaze-v0", {"maze": "shortcut", "changed": True}),
+    ("RandomWalk-v0", {"n_states": 1000, "max_jump": 100, "left_reward": -1}),
+    ("WindyGridworld-v0", {"moves": "king", "stochastic": True}),
+    ("GamblersProblem-v0", {"heads_probability": 0.55, "goal": 20}),
+    ("RiverSwim-v0", {}),
+    ("DeepSea-v0", {"size": 4}),
+    ("Racetrack-v0", {}),
 ]
 EACH_ENVIRONMENT = pytest.mark.parametrize(("env_id", "kwargs"), ENVIRONMENTS)
 
@@ -144,7 +151,7 @@ def test_unknown_wrappers_hide_the_model(env_id: str, wrap: Any) -> None:
 
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
-    [("CartPole-v1", {}), ("Blackjack-v1", {}), ("Taxi-v4", {"fickle_passenger": True})],
+    [("CartPole-v1", {}), ("Taxi-v4", {"fickle_passenger": True})],
 )
 def test_environments_without_a_model(env_id: str, kwargs: dict[str, Any]) -> None:
     env = gym.make(env_id, **kwargs)
