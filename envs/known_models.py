@@ -18,6 +18,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.toy_text.taxi import TaxiEnv
+from gymnasium.wrappers import ClipReward
 from numpy.typing import NDArray
 
 from envs.checking.claimed_models import Claim, claim_of, is_trusted
@@ -67,8 +68,8 @@ def transition_model(env: Env) -> TransitionModel | None:
     Known are this project's grid worlds, its bandits with click rates, Gymnasium's FrozenLake,
     CliffWalking and Taxi, and environments that hold ``P`` and ``initial_state_distrib`` as these
     do and pass `envs.check_transition_model`, under wrappers that leave the dynamics alone,
-    `ScaleReward`, and `TerminationReward` where it gives its reward at terminations only. A time
-    limit is no part of the model: see `time_limit`.
+    `ScaleReward`, Gymnasium's `ClipReward`, and `TerminationReward` where it gives its reward at
+    terminations only. A time limit is no part of the model: see `time_limit`.
 
     Returns:
         The model, or None where it is not known.
@@ -84,6 +85,8 @@ def transition_model(env: Env) -> TransitionModel | None:
             reward = reward * wrapper.scale
         elif isinstance(wrapper, TerminationReward):
             reward = np.where(model.terminated, wrapper.last_reward, reward)
+        elif isinstance(wrapper, ClipReward):
+            reward = np.asarray(wrapper.func(reward), dtype=np.float64)  # type: ignore[arg-type]
     return model if reward is model.reward else replace(model, reward=reward)
 
 
@@ -189,9 +192,17 @@ def _folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper leaves the states alone and changes rewards, if so, in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
+    if type(wrapper) is ClipReward:
+        return clips_to_numbers(wrapper)
     if type(wrapper) in {ScaleReward, ActionMasks, IdleActionMasks, *OBSERVATION_WRAPPERS}:
         return True
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
+
+
+def clips_to_numbers(wrapper: ClipReward[Any, Any]) -> bool:
+    """Whether the wrapper does what it was made for, with the same bounds for all rewards."""
+    is_own = getattr(wrapper.func, "__qualname__", "").startswith("ClipReward.__init__.")
+    return is_own and all(np.ndim(bound) == 0 for bound in wrapper._saved_kwargs.values())
 
 
 def _believed(base: Env) -> Claim | None:
