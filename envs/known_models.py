@@ -19,6 +19,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
+from gymnasium.wrappers import ClipReward
 from numpy.typing import NDArray
 
 from envs.checking.claimed_models import Claim, claim_of, is_trusted
@@ -69,8 +70,9 @@ def transition_model(env: Env) -> TransitionModel | None:
     Known are this project's grid worlds and textbook environments, its bandits with click rates,
     Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, and environments that hold ``P`` and
     ``initial_state_distrib`` as toy_text's do and pass `envs.check_transition_model`, under
-    wrappers that leave the dynamics alone, `ScaleReward`, and `TerminationReward` where it gives
-    its reward at terminations only. A time limit is no part of the model: see `time_limit`.
+    wrappers that leave the dynamics alone, `ScaleReward`, Gymnasium's `ClipReward`, and
+    `TerminationReward` where it gives its reward at terminations only. What `ClipReward` makes of
+    rewards that are drawn is not known. A time limit is no part of the model: see `time_limit`.
 
     Returns:
         The model, or None where it is not known.
@@ -88,6 +90,10 @@ def transition_model(env: Env) -> TransitionModel | None:
         elif isinstance(wrapper, TerminationReward):
             reward = np.where(model.terminated, wrapper.last_reward, reward)
             variance = None if variance is None else np.where(model.terminated, 0.0, variance)
+        elif isinstance(wrapper, ClipReward):
+            if variance is not None:
+                return None
+            reward = np.asarray(wrapper.func(reward), dtype=np.float64)  # type: ignore[arg-type]
     if reward is model.reward:
         return model
     return replace(model, reward=reward, reward_variance=variance)
@@ -199,9 +205,17 @@ def _folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper leaves the states alone and changes rewards, if so, in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
+    if type(wrapper) is ClipReward:
+        return clips_to_numbers(wrapper)
     if type(wrapper) in {ScaleReward, ActionMasks, IdleActionMasks, *OBSERVATION_WRAPPERS}:
         return True
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
+
+
+def clips_to_numbers(wrapper: ClipReward[Any, Any]) -> bool:
+    """Whether the wrapper does what it was made for, with the same bounds for all rewards."""
+    is_own = getattr(wrapper.func, "__qualname__", "").startswith("ClipReward.__init__.")
+    return is_own and all(np.ndim(bound) == 0 for bound in wrapper._saved_kwargs.values())
 
 
 def _believed(base: Env) -> Claim | None:
