@@ -144,7 +144,7 @@ class PlanningAgent(OnlineAlgorithm):
         """Work out the policy from the transition model of the environment.
 
         Raises:
-            ValueError: if the model is not known, or one observation stands for several states.
+            ValueError: if the model is not known, or states look alike in which the plan differs.
         """
         assert self.env is not None
         name, vec_env = type(self).__name__, self.env.unwrapped
@@ -156,7 +156,7 @@ class PlanningAgent(OnlineAlgorithm):
             check = model_check(env)
             why = "" if check is None or check.refusal is None else f": {check.refusal}"
             raise ValueError(f"{name} needs an environment whose transition model is known{why}")
-        if observations.ndim != 1 or len(np.unique(observations)) < len(observations):
+        if observations.ndim != 1:
             raise ValueError(f"{name} needs observations that are the numbers of the states")
         mask = action_masks_of_states(env) if self.mask_actions else None
         if self.mask_actions and mask is None:
@@ -164,6 +164,9 @@ class PlanningAgent(OnlineAlgorithm):
         by_state, horizon = self._plan(model, time_limit(env), mask)
         actions = np.zeros((len(by_state), int(self.observation_space.n)), dtype=np.int64)  # type: ignore[attr-defined]
         actions[:, observations] = by_state
+        # As with a natural in Blackjack, which looks as any other 21 does.
+        if (actions[:, observations] != by_state)[:, model.reachable].any():
+            raise ValueError(f"{name} needs observations that tell the states apart")
         self.policy.set_actions(actions, horizon)
 
     @abstractmethod

@@ -21,6 +21,18 @@ BANDITS = {
     "SegmentBandit-v0": "envs.bandits.clicks:SegmentBandit",
 }
 DEFAULT_PULLS = 1000
+# Entry points in `envs.textbook`, and time limits.
+TEXTBOOK = {
+    "DeepSea-v0": ("deep_sea:DeepSeaEnv", 1000),
+    "DynaMaze-v0": ("dyna_maze:DynaMazeEnv", 100),
+    "GamblersProblem-v0": ("gamblers_problem:GamblersProblemEnv", 1000),
+    "JacksCarRental-v0": ("jacks_car_rental:JacksCarRentalEnv", 100),
+    "MaximizationBias-v0": ("maximization_bias:MaximizationBiasEnv", 100),
+    "Racetrack-v0": ("racetrack:RacetrackEnv", 1000),
+    "RandomWalk-v0": ("random_walk:RandomWalkEnv", 1000),
+    "RiverSwim-v0": ("river_swim:RiverSwimEnv", 20),
+    "WindyGridworld-v0": ("windy_gridworld:WindyGridworldEnv", 1000),
+}
 
 gym.register(
     id="Warehouse-v0",
@@ -46,6 +58,8 @@ gym.register(
         ),
     ),
 )
+for textbook_id, (place, limit) in TEXTBOOK.items():
+    gym.register(id=textbook_id, entry_point=f"envs.textbook.{place}", max_episode_steps=limit)
 for bandit_id, entry_point in BANDITS.items():
     gym.register(
         id=bandit_id,

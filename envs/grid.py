@@ -6,16 +6,17 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.argument_checks import check_choice, check_flag, check_number
+from envs.argument_checks import check_flag, check_number
+from envs.finite_env import Outcome, as_dictionaries, summing_to_one
 from envs.grid_dynamics import MOVES, POSSIBLE_MOVES, GridDynamics, Tile
 from envs.grid_map import GOAL, Description, GridMap
 from envs.rendering import GridRenderer
 from envs.scene import Scene
+from envs.shown_env import ShownEnv
 from envs.text_rendering import render_text
 from mdp.array_types import AnyInts, Bools, Floats, Ints
 
@@ -23,12 +24,9 @@ if TYPE_CHECKING:
     from mdp.transition_model import TransitionModel
 
 Observation = int | NDArray[np.float32]
-RENDER_MODES = ("ansi", "rgb_array", "human")
-
-Outcome = tuple[float, int, float, bool]
 
 
-class GridWorld(gym.Env[Any, Any]):
+class GridWorld(ShownEnv):
     """A robot on a map of letters, moving up, down, left or right; the base of all grid worlds.
 
     A subclass says in `tiles` what its letters mean; cells that neither block nor terminate can
@@ -52,9 +50,6 @@ class GridWorld(gym.Env[Any, Any]):
         ValueError: if an argument is out of range or the map malformed; see `GridMap.read`.
     """
 
-    # Not annotated as ClassVar, since Gymnasium declares it as an attribute of the instance.
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
-
     def __init__(
         self,
         desc: Description,
@@ -67,8 +62,7 @@ class GridWorld(gym.Env[Any, Any]):
     ) -> None:
         slip = check_number("slip", slip, 0, 1)
         self.random_start = check_flag("random_start", random_start)
-        if render_mode is not None:
-            check_choice("render_mode", render_mode, RENDER_MODES)
+        super().__init__(render_mode)
         passable = [
             letter for letter, tile in tiles.items() if not (tile.blocked or tile.terminated)
         ]
@@ -78,8 +72,6 @@ class GridWorld(gym.Env[Any, Any]):
         self.action_space = spaces.Discrete(len(MOVES))
         self._slip_thresholds = np.cumsum(self.dynamics.outcome_prob).tolist()
         self.s = self.map.start
-        self.render_mode = render_mode
-        self._renderer: GridRenderer | None = None
         self._steps: set[tuple[int, int]] = set()
         self._last_action: int | None = None
 
@@ -126,28 +118,6 @@ class GridWorld(gym.Env[Any, Any]):
         """
         return self.dynamics.action_mask(self.s)
 
-    def render(self) -> str | NDArray[np.uint8] | None:
-        """The map as text (``ansi``), as a picture of shape (height, width, 3), or in a window."""
-        if self.render_mode is None:
-            gym.logger.warn("render() does nothing: the environment was made without render_mode")
-            return None
-        scene = self._scene()
-        if self.render_mode == "ansi":
-            return render_text(scene)
-        if self._renderer is None:
-            title = type(self).__name__ if self.spec is None else self.spec.id
-            self._renderer = GridRenderer(self.map.rows, self.metadata["render_fps"], title)
-        if self.render_mode == "rgb_array":
-            return self._renderer.pixels(scene)
-        self._renderer.show(scene)
-        return None
-
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
-
     def observation_of(self, states: AnyInts) -> NDArray[Any]:
         """What is observed in each of many states: here the states themselves.
 
@@ -168,7 +138,7 @@ class GridWorld(gym.Env[Any, Any]):
         """Probabilities of the starting states, shape (S,)."""
         starts, thresholds = self._starts
         distribution = np.zeros(self.dynamics.n_states)
-        distribution[starts] = _uniform(len(thresholds))
+        distribution[starts] = _equal(len(thresholds))
         return distribution
 
     @cached_property
@@ -178,16 +148,12 @@ class GridWorld(gym.Env[Any, Any]):
         ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built when
         first asked for, from `transition_model`, whose arrays take a tenth of the memory.
         """
-        model = self.transition_model()
-        columns = (model.prob, model.next_state, model.reward, model.terminated)
-        states = zip(*(column.tolist() for column in columns), strict=True)
-        return {
-            state: {
-                action: list(zip(*outcomes, strict=True))
-                for action, outcomes in enumerate(zip(*actions, strict=True))
-            }
-            for state, actions in enumerate(states)
-        }
+        return as_dictionaries(self.transition_model())
+
+    @property
+    def is_stationary(self) -> bool:
+        """Whether the dynamics stay as they are, so that their model holds at any time."""
+        return True
 
     @property
     def desc(self) -> NDArray[np.bytes_]:
@@ -207,7 +173,7 @@ class GridWorld(gym.Env[Any, Any]):
             starts = starts[~np.isin(starts, list(self.dynamics.collectable_bits))]
         else:
             starts = np.array([self.map.start])
-        return starts, np.cumsum(_uniform(len(starts)))
+        return starts, np.cumsum(_equal(len(starts)))
 
     def _observe(self) -> Observation:
         return self.s
@@ -228,7 +194,13 @@ class GridWorld(gym.Env[Any, Any]):
             self._steps.add((origin, target))
         self._last_action = action
 
-    def _scene(self) -> Scene:
+    def _text(self) -> str:
+        return render_text(self._picture())
+
+    def _make_renderer(self, fps: int, title: str) -> GridRenderer:
+        return GridRenderer(self.map.rows, fps, title)
+
+    def _picture(self) -> Scene:
         collected, cell = divmod(self.s, self.map.n_cells)
         return Scene(
             rows=self.map.rows,
@@ -239,11 +211,6 @@ class GridWorld(gym.Env[Any, Any]):
         )
 
 
-def _uniform(n: int) -> Floats:
-    """Equal probabilities whose running sum ends at exactly one.
-
-    Otherwise a uniform number above the sum would choose state 0, as `categorical_sample` does.
-    """
-    probabilities = np.full(n, 1 / n)
-    probabilities[-1] = 1 - probabilities[:-1].cumsum()[-1] if n > 1 else 1
-    return probabilities
+def _equal(n: int) -> Floats:
+    """Equal probabilities."""
+    return summing_to_one(np.full(n, 1 / n))

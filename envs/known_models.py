@@ -17,11 +17,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
+from gymnasium.wrappers import ClipReward
 from numpy.typing import NDArray
 
 from envs.checking.claimed_models import Claim, claim_of, is_trusted
 from envs.checking.model_checks import ModelCheck, checked
+from envs.finite_env import MaskedFiniteEnv
 from envs.grid import GridWorld
 from envs.grid_map import GOAL
 from envs.wrappers import (
@@ -64,11 +67,12 @@ _looked_at: ContextVar[dict[int, Judgement] | None] = ContextVar("looked_at", de
 def transition_model(env: Env) -> TransitionModel | None:
     """The exact dynamics of an environment, with the rewards that its outermost wrapper gives.
 
-    Known are this project's grid worlds, its bandits with click rates, Gymnasium's FrozenLake,
-    CliffWalking and Taxi, and environments that hold ``P`` and ``initial_state_distrib`` as these
-    do and pass `envs.check_transition_model`, under wrappers that leave the dynamics alone,
-    `ScaleReward`, and `TerminationReward` where it gives its reward at terminations only. A time
-    limit is no part of the model: see `time_limit`.
+    Known are this project's grid worlds and textbook environments, its bandits with click rates,
+    Gymnasium's FrozenLake, CliffWalking, Taxi and Blackjack, and environments that hold ``P`` and
+    ``initial_state_distrib`` as toy_text's do and pass `envs.check_transition_model`, under
+    wrappers that leave the dynamics alone, `ScaleReward`, Gymnasium's `ClipReward`, and
+    `TerminationReward` where it gives its reward at terminations only. What `ClipReward` makes of
+    rewards that are drawn is not known. A time limit is no part of the model: see `time_limit`.
 
     Returns:
         The model, or None where it is not known.
@@ -78,13 +82,21 @@ def transition_model(env: Env) -> TransitionModel | None:
     if claim is None:
         return None
     model = claim.model
-    reward = model.reward
+    reward, variance = model.reward, model.reward_variance
     for wrapper in wrappers:
         if isinstance(wrapper, ScaleReward):
             reward = reward * wrapper.scale
+            variance = None if variance is None else variance * wrapper.scale**2
         elif isinstance(wrapper, TerminationReward):
             reward = np.where(model.terminated, wrapper.last_reward, reward)
-    return model if reward is model.reward else replace(model, reward=reward)
+            variance = None if variance is None else np.where(model.terminated, 0.0, variance)
+        elif isinstance(wrapper, ClipReward):
+            if variance is not None:
+                return None
+            reward = np.asarray(wrapper.func(reward), dtype=np.float64)  # type: ignore[arg-type]
+    if reward is model.reward:
+        return model
+    return replace(model, reward=reward, reward_variance=variance)
 
 
 def model_check(env: Env) -> ModelCheck | None:
@@ -111,7 +123,7 @@ def success_outcomes(env: Env) -> Bools | None:
 
     In a grid world those are the ones that reach a goal. Elsewhere they are the ones that
     terminate with the highest reward that any termination has before wrappers change it: the goal
-    of FrozenLake and CliffWalking, the passenger delivered in Taxi.
+    of FrozenLake and CliffWalking, the passenger delivered in Taxi. In Blackjack it is any win.
 
     Returns:
         The mask, or None where the model is not known or no episode terminates.
@@ -127,6 +139,8 @@ def success_outcomes(env: Env) -> Bools | None:
     if isinstance(base, GridWorld):
         codes = np.frombuffer(base.map.codes, np.uint8)
         good = codes[model.next_state % base.map.n_cells] == ord(GOAL)
+    elif isinstance(base, BlackjackEnv):
+        good = model.reward > 0
     else:
         good = model.reward == model.reward[ends].max()
     success: Bools = ends & good
@@ -155,7 +169,7 @@ def observations_of_states(env: Env) -> NDArray[Any] | None:
 def action_masks_of_states(env: Env) -> Bools | None:
     """What may be done in each state of `transition_model`, bool of shape (S, A).
 
-    Known are the masks of this project's grid worlds, of Gymnasium's Taxi, and of
+    Known are the masks of this project's environments, of Gymnasium's Taxi, and of
     `IdleActionMasks`, under the wrappers that `transition_model` knows.
 
     Returns:
@@ -170,7 +184,9 @@ def action_masks_of_states(env: Env) -> Bools | None:
     # A class of one's own may have masks of its own.
     kind: Any = type(base)
     if isinstance(base, GridWorld) and kind.action_masks is GridWorld.action_masks:
-        return base.dynamics.action_masks()
+        return base.dynamics.action_masks() if base.is_stationary else None
+    if isinstance(base, MaskedFiniteEnv) and kind.action_masks is MaskedFiniteEnv.action_masks:
+        return base.masks_of_states()
     if isinstance(base, TaxiEnv) and kind.action_mask is TaxiEnv.action_mask:
         return np.array([base.action_mask(state) for state in sorted(base.P)], dtype=np.bool_)
     return None
@@ -189,9 +205,17 @@ def _folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper leaves the states alone and changes rewards, if so, in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
+    if type(wrapper) is ClipReward:
+        return clips_to_numbers(wrapper)
     if type(wrapper) in {ScaleReward, ActionMasks, IdleActionMasks, *OBSERVATION_WRAPPERS}:
         return True
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
+
+
+def clips_to_numbers(wrapper: ClipReward[Any, Any]) -> bool:
+    """Whether the wrapper does what it was made for, with the same bounds for all rewards."""
+    is_own = getattr(wrapper.func, "__qualname__", "").startswith("ClipReward.__init__.")
+    return is_own and all(np.ndim(bound) == 0 for bound in wrapper._saved_kwargs.values())
 
 
 def _believed(base: Env) -> Claim | None:
@@ -226,5 +250,6 @@ def _judged_now(base: Env) -> Judgement:
     if claim is None:
         return None, None
     if is_trusted(base):
-        return claim, ModelCheck(None, bit_for_bit=True, state_can_be_set=True)
+        plays = claim.plays_from_model
+        return claim, ModelCheck(None, bit_for_bit=plays, state_can_be_set=plays)
     return claim, checked(base, claim)

@@ -17,6 +17,7 @@ from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
 from envs.grid import GridWorld
 from envs.grid_dynamics import MOVES, Tile
+from envs.textbook.windy_gridworld import WindyGridworldEnv
 from mdp.array_types import Ints
 
 FREE, START, WALL, GOAL, TRAP, PRIZE = ".S#GXP"
@@ -100,11 +101,14 @@ def grid_layout(env: gym.Env[Any, Any]) -> GridLayout | None:
     """The layout of an environment, for the states of its ``envs.known_models.transition_model``.
 
     Returns:
-        The layout of this project's grid worlds, FrozenLake and CliffWalking; None for all others.
+        The layout of this project's grid worlds, WindyGridworld, FrozenLake and CliffWalking; None
+        for all others.
     """
     base = env.unwrapped
     if isinstance(base, GridWorld):
         return _of_grid_world(base)
+    if isinstance(base, WindyGridworldEnv):
+        return GridLayout(base.rows, base.steps, {})
     if isinstance(base, FrozenLakeEnv):
         letters = str.maketrans("FH", FREE + TRAP)
         rows = tuple("".join(row).translate(letters) for row in np.array(base.desc).astype(str))

@@ -17,7 +17,8 @@ class Scene:
         robot: where the robot is.
         steps: pairs of neighbouring cells that it has gone from and to, in no order.
         collected: cells that it has emptied.
-        last_action: its latest action, None before the first.
+        last_action: its latest move, 0 up, 1 down, 2 left, 3 right; None before the first.
+        title: what to write above the map as text; None for the latest move.
     """
 
     rows: tuple[str, ...]
@@ -25,6 +26,7 @@ class Scene:
     steps: Collection[tuple[int, int]]
     collected: Collection[int]
     last_action: int | None
+    title: str | None = None
 
     def place(self, cell: int) -> tuple[int, int]:
         """Row and column of a cell."""

@@ -28,7 +28,7 @@ STYLES = {
 
 
 def render_text(scene: Scene) -> str:
-    """The last action on a line, then the map: ``R`` the robot, ``*`` where it has been."""
+    """The latest action on a line, then the map: ``R`` the robot, ``*`` where it has been."""
     robot_row, robot_column = scene.place(scene.robot)
     rows = _window(robot_row, len(scene.rows), MAX_ROWS)
     columns = _window(robot_column, len(scene.rows[0]), MAX_COLUMNS)
@@ -50,7 +50,8 @@ def terminal_has_colour() -> bool:
 
 
 def _title(scene: Scene, rows: range, columns: range) -> str:
-    title = "(start)" if scene.last_action is None else f"({MOVE_NAMES[scene.last_action]})"
+    move = "start" if scene.last_action is None else MOVE_NAMES[scene.last_action]
+    title = f"({move if scene.title is None else scene.title})"
     if len(rows) < len(scene.rows) or len(columns) < len(scene.rows[0]):
         title += f" rows {rows[0]}-{rows[-1]}, columns {columns[0]}-{columns[-1]}"
     return title

@@ -61,10 +61,14 @@ class LimitedEpisodes:
                 float(rate) if with_success else None,
             )
         if moments is None:
-            rows = self._rows(states)
-            rest = (self.model.reward[states], ends_well[states])
+            rows = (*self._rows(states), self.model.reward[states], ends_well[states])
             chances = chances_in(self.model, self.policy, states)
-            moments = moments_under_limit(*rows, *rest, chances, self.horizon, discount)
+            if len(chances) == 1 and ((chances == 0) | (chances == 1)).all():
+                # The rows of all other actions would only be passed over, again and again.
+                taken = np.arange(len(states)), chances[0].argmax(axis=1)
+                rows = tuple(array[taken][:, None] for array in rows)
+                chances = np.ones((1, len(states), 1))
+            moments = moments_under_limit(*rows, chances, self.horizon, discount)
         return over_starts(self.model.initial[states], moments, with_success=with_success)
 
     def visits(self) -> Floats:

@@ -6,6 +6,8 @@ policy visits are used.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mdp.array_types import Bools, Floats
@@ -38,6 +40,8 @@ def policy_return(
             discount, for a policy under which episodes may never end.
     """
     _check(model, horizon, discount, success)
+    if model.reward_variance is not None:
+        return _with_drawn_rewards(model, policy, horizon, discount, success)
     policy = canonical_policy(model, policy, horizon)
     ends_well = model.terminated if success is None else model.terminated & success
     if horizon is not None:
@@ -98,6 +102,25 @@ def baseline_return(model: TransitionModel, horizon: int, discount: float = 1.0)
         found = episodes.result(discount, model.terminated, with_success=False, floor=floor)
         best = max(best, found.expected_return)
     return best
+
+
+def _with_drawn_rewards(
+    model: TransitionModel,
+    policy: Policy,
+    horizon: int | None,
+    discount: float,
+    success: Bools | None,
+) -> PolicyReturn:
+    """As `policy_return`, where rewards vary around their means independently of all else.
+
+    That adds the expected sum of their own variances, each discounted twice, to the variance.
+    """
+    assert model.reward_variance is not None
+    settled = replace(model, reward_variance=None)
+    result = policy_return(settled, policy, horizon, discount, success)
+    drawn = replace(settled, reward=model.reward_variance)
+    added = policy_return(drawn, policy, horizon, discount**2).expected_return
+    return replace(result, return_variance=result.return_variance + added)
 
 
 def _check(

@@ -43,11 +43,14 @@ class TransitionModel:
         reward: rewards, float64 of shape (S, A, K).
         terminated: whether the episode ends with the outcome, bool of shape (S, A, K).
         initial: probabilities of the starting states, float64 of shape (S,), summing to one.
+        reward_variance: where rewards are drawn, their variance, float64 of shape (S, A, K);
+            ``reward`` holds their means, and they are independent of each other. None where the
+            outcome says what the reward is.
 
     Raises:
         ValueError: where the shapes disagree, a probability lies outside [0, 1], a row of
-            probabilities does not sum to one within 1e-9, an index is out of range, or a
-            reward is not finite. The message names state and action.
+            probabilities does not sum to one within 1e-9, an index is out of range, a reward or
+            variance is not finite, or a variance negative. The message names state and action.
     """
 
     prob: Floats
@@ -55,6 +58,7 @@ class TransitionModel:
     reward: Floats
     terminated: Bools
     initial: Floats
+    reward_variance: Floats | None = None
 
     def __post_init__(self) -> None:
         index_type = np.int32 if np.asarray(self.next_state).dtype == np.int32 else np.int64
@@ -63,6 +67,8 @@ class TransitionModel:
         self._freeze("reward", np.float64)
         self._freeze("terminated", np.bool_)
         self._freeze("initial", np.float64)
+        if self.reward_variance is not None:
+            self._freeze("reward_variance", np.float64)
         self._check_shapes()
         self._check_outcomes()
         self._check_initial()
@@ -166,6 +172,10 @@ class TransitionModel:
         for name in ("next_state", "reward", "terminated"):
             if getattr(self, name).shape != shape:
                 raise ValueError(f"{name} has shape {getattr(self, name).shape}, prob has {shape}")
+        if self.reward_variance is not None and self.reward_variance.shape != shape:
+            raise ValueError(
+                f"reward_variance has shape {self.reward_variance.shape}, prob has {shape}"
+            )
         if self.initial.shape != shape[:1]:
             raise ValueError(f"initial has shape {self.initial.shape}, it must be {shape[:1]}")
 
@@ -179,6 +189,9 @@ class TransitionModel:
         in_range = (self.next_state >= 0) & (self.next_state < self.n_states)
         self._require(in_range, f"a next state outside 0..{self.n_states - 1}")
         self._require(np.isfinite(self.reward), "a reward that is not finite")
+        if self.reward_variance is not None:
+            valid = np.isfinite(self.reward_variance) & (self.reward_variance >= 0)
+            self._require(valid, "a variance of the reward that is negative or not finite")
 
     def _check_initial(self) -> None:
         bad = np.flatnonzero(~((self.initial >= 0) & (self.initial <= 1)))

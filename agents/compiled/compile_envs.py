@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.classic_control import CartPoleEnv
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import ClipReward, OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
@@ -42,7 +42,13 @@ Env = gym.Env[Any, Any]
 COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
 CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
 MASK_WRAPPERS = {ActionMasks, IdleActionMasks}
-CHANGE_WRAPPERS = {FlattenToDiscrete, OneHotObservation, ScaleReward, TerminationReward}
+CHANGE_WRAPPERS = {
+    ClipReward,
+    FlattenToDiscrete,
+    OneHotObservation,
+    ScaleReward,
+    TerminationReward,
+}
 MODEL_WRAPPERS = {*CHANGE_WRAPPERS, *MASK_WRAPPERS, *COMMON_WRAPPERS}
 
 
@@ -132,6 +138,8 @@ def _finite_model(env: Env) -> FiniteModel:
         raise NotCompilable(check.refusal)
     if check is None or model is None or observations is None:
         raise NotCompilable("the environment's transition model is not known")
+    if model.reward_variance is not None:
+        raise NotCompilable("rewards are drawn, and the environment's model holds their means")
     # A wrapper may leave the dynamics alone and yet have to see every step, to film it say.
     watching = {type(layer) for layer in layers(env)[:-1]} - MODEL_WRAPPERS
     if watching:

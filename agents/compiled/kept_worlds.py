@@ -13,13 +13,14 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 import gymnasium as gym
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
+from gymnasium.wrappers import ClipReward, OrderEnforcing, PassiveEnvChecker, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.compiled.cart_pole import CartPole
 from agents.compiled.finite_model import FiniteModel
 from envs.checking.model_sources import Sources, pickled, sources_of
+from envs.known_models import clips_to_numbers
 
 World = FiniteModel | CartPole
 
@@ -32,6 +33,8 @@ _COUNTS: dict[type, tuple[str, ...]] = {
     OrderEnforcing: (),
     PassiveEnvChecker: (),
     TimeLimit: ("_max_episode_steps",),
+    # Its function cannot be compared, but follows from the bounds.
+    ClipReward: ("_saved_kwargs",),
 }
 _BELOW = "env"
 
@@ -72,6 +75,8 @@ def recipe_of(layers: Sequence[gym.Env[Any, Any]]) -> Recipe | None:
 
 
 def _content(wrapper: gym.Env[Any, Any]) -> bytes | None:
+    if isinstance(wrapper, ClipReward) and not clips_to_numbers(wrapper):
+        return None
     held = {name: value for name, value in vars(wrapper).items() if name != _BELOW}
     names = _COUNTS.get(type(wrapper), held.keys())
     return pickled({name: held[name] for name in names})

@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from numpy.typing import NDArray
 
-from envs.argument_checks import check_choice, check_whole_number
+from envs.argument_checks import check_whole_number
 from envs.bandit_rendering import Tally, render_chart, render_text
 from envs.rendering import ChartRenderer
+from envs.scene import Chart
+from envs.shown_env import ShownEnv
 from mdp.array_types import Floats
 
-RENDER_MODES = ("ansi", "rgb_array", "human")
 MAX_PULLS = 10**9
 MAX_ARMS = 10_000
 
 
-class Bandit(gym.Env[Any, Any], ABC):
+class Bandit(ShownEnv):
     """Arms to pull, one a step, in the present context.
 
     A subclass says with `_begin` how an episode begins, with `step` what a pull gives, and with
@@ -42,8 +41,6 @@ class Bandit(gym.Env[Any, Any], ABC):
         ValueError: if an argument is out of range.
     """
 
-    # Not annotated as ClassVar, since Gymnasium declares it as an attribute of the instance.
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 8}  # noqa: RUF012
     kind: str
     context: Any
 
@@ -56,16 +53,13 @@ class Bandit(gym.Env[Any, Any], ABC):
         batch_size: int = 1,
         render_mode: str | None,
     ) -> None:
-        if render_mode is not None:
-            check_choice("render_mode", render_mode, RENDER_MODES)
+        super().__init__(render_mode)
         self.n_arms = n_arms
         self.pulls = check_whole_number("pulls", pulls, 1, MAX_PULLS)
         self.batch_size = check_whole_number("batch_size", batch_size, 1, MAX_PULLS)
         self.observation_space = observation_space
         self.action_space = spaces.Discrete(n_arms)
-        self.render_mode = render_mode
         self.pulls_done = 0
-        self._renderer: ChartRenderer | None = None
         self._tally = Tally.empty(max(self.n_contexts, 1), n_arms)
 
     @property
@@ -87,27 +81,14 @@ class Bandit(gym.Env[Any, Any], ABC):
             self.render()
         return self.context, {}
 
-    def render(self) -> str | NDArray[np.uint8] | None:
-        """The arms as text (``ansi``), as a picture of shape (height, width, 3), or in a window."""
-        if self.render_mode is None:
-            gym.logger.warn("render() does nothing: the environment was made without render_mode")
-            return None
-        if self.render_mode == "ansi":
-            return render_text(self._tally, self._true_means(), self._row(self.context))
-        if self._renderer is None:
-            title = type(self).__name__ if self.spec is None else self.spec.id
-            self._renderer = ChartRenderer(self.metadata["render_fps"], title)
-        chart = render_chart(self._tally, self._true_means(), self._row(self.context))
-        if self.render_mode == "rgb_array":
-            return self._renderer.pixels(chart)
-        self._renderer.show(chart)
-        return None
+    def _text(self) -> str:
+        return render_text(self._tally, self._true_means(), self._row(self.context))
 
-    def close(self) -> None:
-        """Close the window, if there is one."""
-        if self._renderer is not None:
-            self._renderer.close()
-            self._renderer = None
+    def _picture(self) -> Chart:
+        return render_chart(self._tally, self._true_means(), self._row(self.context))
+
+    def _make_renderer(self, fps: int, title: str) -> ChartRenderer:
+        return ChartRenderer(fps, title)
 
     def _checked(self, action: int) -> int:
         """The arm that an action names."""

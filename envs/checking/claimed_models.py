@@ -1,7 +1,8 @@
 """What environments, without their wrappers, say of their own dynamics, and whose word is enough.
 
 Gymnasium's FrozenLake, CliffWalking and Taxi and this project's own classes step as they say, which
-tests hold. Whatever else brings a model, a subclass of one of these too, only claims to.
+tests hold. Gymnasium's Blackjack says nothing, but `envs.blackjack_model` knows its rules. Whatever
+else brings a model, a subclass of one of these too, only claims to.
 """
 
 from __future__ import annotations
@@ -13,18 +14,22 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium.envs.toy_text.blackjack import BlackjackEnv
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 from gymnasium.envs.toy_text.taxi import TaxiEnv
 from numpy.typing import NDArray
 
 from envs.bandits.clicks import ClickBandit
+from envs.blackjack_model import blackjack_model, blackjack_observations
+from envs.finite_env import FiniteEnv
 from envs.grid import GridWorld
 from mdp.transition_model import TransitionModel
 
 Env = gym.Env[Any, Any]
 
 TRUSTED_CLASSES = (FrozenLakeEnv, CliffWalkingEnv, TaxiEnv)
+OWN_CLASSES = (GridWorld, ClickBandit, FiniteEnv)
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,8 +46,10 @@ class Claim:
     def model(self) -> TransitionModel:
         """The dynamics."""
         base = self.base
-        if isinstance(base, GridWorld | ClickBandit):
+        if isinstance(base, OWN_CLASSES):
             return base.transition_model()
+        if isinstance(base, BlackjackEnv):
+            return blackjack_model(base)
         P = base.get_wrapper_attr("P")  # noqa: N806 (Gymnasium's own name)
         return TransitionModel.from_gymnasium(P, base.get_wrapper_attr("initial_state_distrib"))
 
@@ -51,8 +58,20 @@ class Claim:
         """What is observed in each state, states along the first axis; None if it does not say."""
         if isinstance(self.base, GridWorld):
             return self.base.observation_of(np.arange(self.base.dynamics.n_states))
+        if isinstance(self.base, BlackjackEnv):
+            return blackjack_observations()
         space = self.base.observation_space
         return np.arange(space.n) if isinstance(space, gym.spaces.Discrete) else None
+
+    @property
+    def plays_from_model(self) -> bool:
+        """Whether a trusted environment draws just what its model says, and goes on from any state.
+
+        Blackjack draws cards, and others draw rewards of which the model holds the means.
+        """
+        if isinstance(self.base, FiniteEnv):
+            return self.model.reward_variance is None
+        return not isinstance(self.base, BlackjackEnv)
 
     @property
     def observes_states(self) -> bool:
@@ -89,7 +108,7 @@ def claim_of(base: Env) -> Claim | None:
         if not brings_model(base):
             return None
         claim = Claim(base)
-        if not is_ours(base):
+        if not (is_ours(base) or isinstance(base, BlackjackEnv)):
             claim.check_spaces()
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -99,8 +118,10 @@ def claim_of(base: Env) -> Claim | None:
 
 def brings_model(base: Env) -> bool:
     """Whether an environment says anything of its dynamics."""
-    if isinstance(base, GridWorld | ClickBandit):
-        return True
+    if isinstance(base, OWN_CLASSES):
+        return not isinstance(base, GridWorld) or base.is_stationary
+    if isinstance(base, BlackjackEnv):
+        return _is_known_blackjack(base)
     # A fickle passenger of Taxi changes his mind outside of P.
     fickle = getattr(base, "fickle_passenger", False)
     brings = isinstance(getattr(base, "P", None), Mapping)
@@ -109,13 +130,19 @@ def brings_model(base: Env) -> bool:
 
 def is_trusted(base: Env) -> bool:
     """Whether an environment's own word on its dynamics is enough."""
-    return is_ours(base) or (type(base) in TRUSTED_CLASSES and not _is_changed(base))
+    trusted = type(base) in TRUSTED_CLASSES and not _is_changed(base)
+    return is_ours(base) or trusted or _is_known_blackjack(base)
 
 
 def is_ours(base: Env) -> bool:
     """Whether it is one of this project's, as it was made."""
-    ours = isinstance(base, GridWorld | ClickBandit)
+    ours = isinstance(base, OWN_CLASSES)
     return ours and type(base).__module__.startswith("envs.") and not _is_changed(base)
+
+
+def _is_known_blackjack(base: Env) -> bool:
+    """Whether it is Gymnasium's Blackjack; what a subclass does could not even be looked at."""
+    return type(base) is BlackjackEnv and not _is_changed(base)
 
 
 def _is_changed(base: Env) -> bool:

@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 
 from envs.checking.claimed_models import TRUSTED_CLASSES, is_trusted
+from envs.finite_env import FiniteEnv
 from envs.grid import GridWorld
 
 Env = gym.Env[Any, Any]
@@ -21,7 +22,7 @@ Env = gym.Env[Any, Any]
 # What changes while an environment is played or shown, and what is worked out from the rest.
 PLAYED = frozenset(
     {"s", "spec", "render_mode", "_np_random", "_np_random_seed", "_renderer", "_steps"}
-    | {"_last_action", "P"}
+    | {"_last_action", "last_action", "P"}
 )
 
 
@@ -49,13 +50,13 @@ class Sources:
 def sources_of(base: Env) -> Sources | None:
     """What the model of an environment without wrappers is made from; None if not all is known.
 
-    It is known of Gymnasium's toy_text and of this project's grid worlds, see
+    It is known of Gymnasium's toy_text and of this project's environments, see
     `envs.checking.claimed_models.is_trusted`.
     """
     if not is_trusted(base):
         return None
     parts = [type(base)]
-    if isinstance(base, GridWorld):
+    if isinstance(base, GridWorld | FiniteEnv):
         base.initial_state_distrib  # noqa: B018  # worked out now, so that it is always there
         held = {name: _lasting(value) for name, value in vars(base).items() if name not in PLAYED}
         for cls in type(base).__mro__[: type(base).__mro__.index(gym.Env)]:

@@ -19,6 +19,10 @@ from pipeline.finite_numbers import FinitePlayer, check_numbers
 KNOWN_LIBRARIES = ("agents", "stable_baselines3")
 
 
+# Where nothing that an agent does makes a difference, sums may differ by this much.
+ROUNDING = 1e-12
+
+
 @dataclass(frozen=True)
 class Yardstick:
     """What returns on an environment are measured against.
@@ -37,8 +41,9 @@ class Yardstick:
 
     def score(self, expected_return: float) -> float:
         """The return on a scale where 1 is the optimum and 0 the best random or constant policy."""
-        if self.optimum == self.baseline:
-            return 1.0 if expected_return >= self.optimum else 0.0
+        rounding = ROUNDING * max(1.0, abs(self.optimum))
+        if self.optimum - self.baseline <= rounding:
+            return 1.0 if expected_return >= self.optimum - rounding else 0.0
         return (expected_return - self.baseline) / (self.optimum - self.baseline)
 
 

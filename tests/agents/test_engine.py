@@ -8,7 +8,7 @@ from functools import partial
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.wrappers import PassiveEnvChecker
+from gymnasium.wrappers import ClipReward, PassiveEnvChecker
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -217,7 +217,7 @@ def test_same_bits(case, tmp_path):
 
 
 def both_shaped(env):
-    return TerminationReward(ScaleReward(env, 0.1), -3.3)
+    return TerminationReward(ClipReward(ScaleReward(env, 0.1), -0.5, 0.9), -3.3)
 
 
 @pytest.mark.parametrize(

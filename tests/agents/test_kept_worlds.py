@@ -7,7 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import ClipReward, TimeLimit
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -171,6 +171,23 @@ def test_a_wrapper_in_between_counts():
         compile_envs(wrapped(lambda env: env)),
         compile_envs(wrapped(lambda env: ScaleReward(env, 2.0))),
     )
+
+
+def test_bounds_of_rewards_count(built):
+    worlds = [
+        compile_envs(wrapped(lambda env, top=top: ClipReward(env, -1, top))) for top in (0.5, 1, 1)
+    ]
+    assert not equal(worlds[0], worlds[1])
+    assert equal(worlds[1], worlds[2])
+    assert len(built) == 2
+
+
+def test_rewards_that_are_no_longer_clipped_are_not_overlooked():
+    vec_env = wrapped(lambda env: ClipReward(env, -1, 0.5))
+    compile_envs(vec_env)
+    layer(vec_env, ClipReward).func = lambda reward: reward
+    with pytest.raises(NotCompilable):
+        compile_envs(vec_env)
 
 
 def test_a_method_that_was_replaced_counts(monkeypatch, built):

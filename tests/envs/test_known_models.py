@@ -7,6 +7,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.wrappers import (
+    ClipReward,
     RecordEpisodeStatistics,
     TimeAwareObservation,
     TimeLimit,
@@ -44,6 +45,13 @@ ENVIRONMENTS: list[tuple[str, dict[str, Any]]] = [
     ("CliffWalking-v1", {"is_slippery": True}),
     ("Taxi-v4", {}),
     ("Taxi-v4", {"is_rainy": True, "rainy_probability": 0.7}),
+    ("DynaMaze-v0", {"maze": "shortcut", "changed": True}),
+    ("RandomWalk-v0", {"n_states": 1000, "max_jump": 100, "left_reward": -1}),
+    ("WindyGridworld-v0", {"moves": "king", "stochastic": True}),
+    ("GamblersProblem-v0", {"heads_probability": 0.55, "goal": 20}),
+    ("RiverSwim-v0", {}),
+    ("DeepSea-v0", {"size": 4}),
+    ("Racetrack-v0", {}),
 ]
 EACH_ENVIRONMENT = pytest.mark.parametrize(("env_id", "kwargs"), ENVIRONMENTS)
 
@@ -98,6 +106,13 @@ def test_rewards_are_folded_in(env_id: str, kwargs: dict[str, Any]) -> None:
     )
 
 
+@pytest.mark.parametrize("bounds", [(-0.5, 0.3), (None, -0.2), (0.1, None)])
+@EACH_ENVIRONMENT
+def test_so_are_bounds_of_rewards(env_id: str, kwargs: dict[str, Any], bounds: Any) -> None:
+    env = ClipReward(ScaleReward(gym.make(env_id, **kwargs), 0.1), *bounds)
+    assert_replays(ScaleReward(env, 0.7), steps=200)
+
+
 @pytest.mark.parametrize("observation", ["discrete", "position", "one_hot"])
 def test_observations_of_the_warehouse(observation: str) -> None:
     assert_replays(gym.make("Warehouse-v0", observation=observation, slip=0.1))
@@ -118,6 +133,12 @@ class Anything(gym.Wrapper[Any, Any, Any, Any]):
     """A wrapper of somebody else's."""
 
 
+def clip_otherwise(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+    clipping: Any = ClipReward(env, -1, 1)
+    clipping.func = lambda reward: 2 * reward
+    return clipping
+
+
 class OurOwnTimeLimit(TimeLimit):
     """Not the one that is known."""
 
@@ -129,9 +150,11 @@ class OurOwnTimeLimit(TimeLimit):
         lambda env: OurOwnTimeLimit(env, 10),
         lambda env: TransformReward(env, lambda reward: reward),
         lambda env: TerminationReward(env, -10, on_truncation=True),
+        lambda env: ClipReward(env, np.array([-1.0, 0.0])),
+        clip_otherwise,
         lambda env: Monitor(Anything(env)),
     ],
-    ids=["unknown", "subclass", "function", "on_truncation", "inside"],
+    ids=["unknown", "subclass", "function", "on_truncation", "bounds", "otherwise", "inside"],
 )
 @pytest.mark.parametrize("env_id", ["FrozenLake-v1", "Warehouse-v0"])
 def test_unknown_wrappers_hide_the_model(env_id: str, wrap: Any) -> None:
@@ -144,7 +167,7 @@ def test_unknown_wrappers_hide_the_model(env_id: str, wrap: Any) -> None:
 
 @pytest.mark.parametrize(
     ("env_id", "kwargs"),
-    [("CartPole-v1", {}), ("Blackjack-v1", {}), ("Taxi-v4", {"fickle_passenger": True})],
+    [("CartPole-v1", {}), ("Taxi-v4", {"fickle_passenger": True})],
 )
 def test_environments_without_a_model(env_id: str, kwargs: dict[str, Any]) -> None:
     env = gym.make(env_id, **kwargs)

@@ -1,0 +1,156 @@
+"""Environments that are played from the arrays of their own model, as Gymnasium's toy_text are."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from gymnasium import spaces
+
+from envs.shown_env import ShownEnv
+from mdp.array_types import Bools, Floats
+
+if TYPE_CHECKING:
+    from mdp.transition_model import TransitionModel
+
+Outcome = tuple[float, int, float, bool]
+
+
+class FiniteEnv(ShownEnv):
+    """Numbered states and actions; a step draws from what the model says.
+
+    A subclass says with `transition_model` what may happen, and how a state looks. `reset` and
+    `step` draw one uniform number each, even where nothing is random, and choose by cumulative sum
+    in the order of the arrays. Where the model's rewards have a variance, a step then draws a
+    standard normal number. A subclass may draw otherwise, see `_draw`, as long as it comes to the
+    same probabilities, means and variances.
+
+    Args:
+        n_states: observations are the states, `Discrete(n_states)`.
+        n_actions: actions are `Discrete(n_actions)`.
+        render_mode: see `ShownEnv`.
+
+    Attributes:
+        s: the state; may be set to continue from another one.
+        last_action: the latest action, None before the first.
+    """
+
+    def __init__(self, n_states: int, n_actions: int, render_mode: str | None) -> None:
+        super().__init__(render_mode)
+        self.observation_space = spaces.Discrete(n_states)
+        self.action_space = spaces.Discrete(n_actions)
+        self.n_actions = n_actions
+        self.s = 0
+        self.last_action: int | None = None
+
+    @abstractmethod
+    def transition_model(self) -> TransitionModel:
+        """The exact dynamics as arrays.
+
+        Asked for at each step: a subclass hands out one that is kept outside of the environment,
+        so that copies and saved states do not carry it along.
+        """
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        """Begin an episode; ``options`` are not used."""
+        super().reset(seed=seed)
+        self.s = choose(self.transition_model().initial, self.np_random.random())
+        self.last_action = None
+        if self.render_mode == "human":
+            self.render()
+        return self.s, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        """Do one thing; see the class for the meaning of what is returned.
+
+        Raises:
+            ValueError: if there is no such action.
+        """
+        action = int(action)
+        if not 0 <= action < self.n_actions:
+            raise ValueError(
+                f"action {action} does not exist: they are numbered 0 to {self.n_actions - 1}"
+            )
+        state, reward, terminated = self._draw(action)
+        self.s, self.last_action = state, action
+        if self.render_mode == "human":
+            self.render()
+        return state, reward, terminated, False, {}
+
+    def _draw(self, action: int) -> tuple[int, float, bool]:
+        """What comes of an action: next state, reward, and whether the episode terminates."""
+        model = self.transition_model()
+        outcome = self.s, action, choose(model.prob[self.s, action], self.np_random.random())
+        reward = float(model.reward[outcome])
+        if model.reward_variance is not None and model.reward_variance[outcome] > 0:
+            std = float(np.sqrt(model.reward_variance[outcome]))
+            reward += std * float(self.np_random.standard_normal())
+        return int(model.next_state[outcome]), reward, bool(model.terminated[outcome])
+
+    @property
+    def initial_state_distrib(self) -> Floats:
+        """Probabilities of the starting states, shape (S,)."""
+        return self.transition_model().initial
+
+    @cached_property
+    def P(self) -> dict[int, dict[int, list[Outcome]]]:  # noqa: N802 (the name toy_text gave it)
+        """The dynamics as Gymnasium's toy_text environments hold them.
+
+        ``P[state][action]`` is a list of (probability, next state, reward, terminated). Built when
+        first asked for. Where rewards are drawn, these are their means.
+        """
+        return as_dictionaries(self.transition_model())
+
+
+class MaskedFiniteEnv(FiniteEnv):
+    """One where what may be done depends on the state.
+
+    What may not be done does something all the same, which the class says: agents that know
+    nothing of masks may choose it.
+    """
+
+    @abstractmethod
+    def masks_of_states(self) -> Bools:
+        """What may be done in each state, bool of shape (S, A), never nothing."""
+
+    def action_masks(self) -> Bools:
+        """What may be done now, bool of shape (A,): sb3-contrib's convention."""
+        mask: Bools = self.masks_of_states()[self.s]
+        return mask.copy()
+
+
+def choose(probabilities: Floats, uniform: float) -> int:
+    """The first whose running sum exceeds the number; 0 where rounding leaves none, as toy_text."""
+    place = int(probabilities.cumsum().searchsorted(uniform, side="right"))
+    return place if place < len(probabilities) else 0
+
+
+def as_dictionaries(model: TransitionModel) -> dict[int, dict[int, list[Outcome]]]:
+    """A model as Gymnasium's toy_text environments hold it, outcomes of no probability included."""
+    columns = (model.prob, model.next_state, model.reward, model.terminated)
+    states = zip(*(column.tolist() for column in columns), strict=True)
+    return {
+        state: {
+            action: list(zip(*outcomes, strict=True))
+            for action, outcomes in enumerate(zip(*actions, strict=True))
+        }
+        for state, actions in enumerate(states)
+    }
+
+
+def summing_to_one(probabilities: Floats) -> Floats:
+    """Probabilities whose running sum, over the last axis, ends at exactly one.
+
+    Otherwise a uniform number above the sum would choose the first, as `categorical_sample` does.
+    What rounding leaves goes to the last one that is not zero.
+    """
+    before = np.zeros_like(probabilities)
+    before[..., 1:] = probabilities.cumsum(axis=-1)[..., :-1]
+    n = probabilities.shape[-1]
+    last = n - 1 - (probabilities[..., ::-1] > 0).argmax(axis=-1)
+    is_last = np.arange(n) == last[..., None]
+    return np.where(is_last, 1 - before, probabilities)

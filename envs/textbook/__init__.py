@@ -1,0 +1,1 @@
+"""Environments of textbooks and papers, with exact models."""
