@@ -1,6 +1,7 @@
 """What holds for every test: no window, one thread, unhurried property tests; and a small study."""
 
 import dataclasses
+import multiprocessing
 import os
 import signal
 import sys
@@ -10,6 +11,7 @@ from types import SimpleNamespace
 import hypothesis
 import pytest
 
+from experiments.child_processes import PRELOADED
 from pipeline.stopping import SIGNALS
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
@@ -21,6 +23,10 @@ for library in ("OMP", "MKL", "OPENBLAS", "NUMBA"):
 # The key to saved states is the user's own, which tests leave alone.
 CONFIGURATION = tempfile.TemporaryDirectory(prefix="yardstick-tests-")
 os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
+
+# One server for all tests, whichever needs it first: from one that has imported nothing, as the
+# library starts it, each child would import everything anew.
+multiprocessing.set_forkserver_preload(PRELOADED)
 
 # No deadline: the first example of a compiled function pays for its compilation. In CI the examples
 # are the same every time, so that a failure there can be repeated.

@@ -1,6 +1,5 @@
 """Ctrl-C at any moment leaves a training that can go on."""
 
-import os
 import signal
 import threading
 from contextlib import closing, contextmanager, nullcontext
@@ -105,7 +104,9 @@ def test_other_threads_hold_nothing():
 
 
 class Interrupter(BlockCallback):
-    """Lets an interrupt come some time after a block of steps has begun, from another thread.
+    """Lets an interrupt come some time after a block of steps has begun.
+
+    The clock is that of the process's own work: however busy the machine is, it comes no later.
 
     Args:
         n_calls: calls to wait for before that, so that some training has been done by then.
@@ -115,26 +116,34 @@ class Interrupter(BlockCallback):
     def __init__(self, n_calls, seconds):
         super().__init__()
         self.after = n_calls
-        self.timer = threading.Timer(seconds, os.kill, (os.getpid(), signal.SIGINT))
+        self.seconds = seconds
 
     def horizon(self):
         return Horizon(calls=max(self.after - self.n_calls, 1))
 
     def _on_step(self):
-        if self.n_calls >= self.after and self.timer.ident is None:
-            self.timer.start()
+        if self.n_calls == self.after:
+            signal.setitimer(signal.ITIMER_VIRTUAL, self.seconds)
         return True
+
+
+@pytest.fixture
+def alarms_interrupt():
+    """Let the end of a timer be an interrupt."""
+    previous = signal.signal(signal.SIGVTALRM, lambda *_: signal.raise_signal(signal.SIGINT))
+    yield
+    signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+    signal.signal(signal.SIGVTALRM, previous)
 
 
 def train_until_interrupted(model, n_calls, seconds):
     """Train without end until an interrupt comes; whether it was one that ended the training."""
-    interrupter = Interrupter(n_calls, seconds)
     try:
-        model.learn(10**9, interrupter, reset_num_timesteps=False, log_interval=20)
+        model.learn(
+            10**9, Interrupter(n_calls, seconds), reset_num_timesteps=False, log_interval=20
+        )
     except KeyboardInterrupt:
         return True
-    finally:
-        interrupter.timer.join()
     return False
 
 
@@ -178,6 +187,7 @@ def made(folder=None, n_envs=N_ENVS):
         yield load_algorithm("sarsa")(env=env, seed=0, engine="compiled")
 
 
+@pytest.mark.usefixtures("alarms_interrupt")
 def test_interrupts_at_any_moment(tmp_path):
     rng = np.random.default_rng(0)
     with made(tmp_path) as model:

@@ -30,6 +30,8 @@ from pathlib import Path
 
 import gymnasium as gym
 
+MARK = Path(__file__).with_name("mark")
+
 
 class Walk(gym.Env):
     """Five places in a row; the goal is the last."""
@@ -63,7 +65,7 @@ class Killed(Walk):
     """Kills its process on the 30th step, the first time that it comes so far."""
 
     def act(self):
-        mark = Path(os.environ["FRAGILE_MARK"])
+        mark = MARK
         if self.steps == 30 and not mark.exists():
             mark.touch()
             os.kill(os.getpid(), signal.SIGKILL)
@@ -73,7 +75,7 @@ class KilledLater(Walk):
     """Kills its process once, when there is a state; says what its first step is after that."""
 
     def act(self):
-        mark = Path(os.environ["FRAGILE_MARK"])
+        mark = MARK
         if mark.exists():
             if not mark.read_text():
                 mark.write_text(str(self.steps))
@@ -88,7 +90,7 @@ class Slow(Walk):
     """Takes its time while there is no file that says it may hurry."""
 
     def act(self):
-        if not Path(os.environ["FRAGILE_MARK"]).exists():
+        if not MARK.exists():
             time.sleep(0.05)
 
 
@@ -121,12 +123,10 @@ for kind in (Fragile, Killed, KilledLater, Slow, Leaves, Refuses, Late):
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    (tmp_path / "fragile_walks.py").write_text(FRAGILE)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("FRAGILE_MARK", str(tmp_path / "mark"))
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{ROOT}")
-    return tmp_path
+def folder(own_folder, monkeypatch):
+    (own_folder / "fragile_walks.py").write_text(FRAGILE)
+    monkeypatch.setenv("PYTHONPATH", f"{own_folder}{os.pathsep}{ROOT}")
+    return own_folder
 
 
 @pytest.fixture
@@ -267,10 +267,10 @@ def test_a_study_file(type_command, folder):
     assert set(rows(folder / "studies" / "steps-quick")["n_episodes"]) == {4}
 
 
-def test_a_run_that_fails_does_not_stop_the_others(folder):
+def test_a_run_that_fails_does_not_stop_the_others(type_command, folder):
     words = ["--env", "Fragile-v0", "--gym-packages", "fragile_walks", "--no-report"]
     words += ["--algos", "qlearning", "random", "--seeds", 3, "-n", 2000, "-j", 2, "-f", "studies"]
-    code, out, err = finish(*words)
+    code, out, err = type_command(*words)
     assert (code, err) == (1, "")
     assert "qlearning on Fragile-v0, seed 1: thin ice" in out
     assert "1 of 3 runs of qlearning is missing" in " ".join(out.split())
@@ -284,9 +284,9 @@ def test_a_run_that_fails_does_not_stop_the_others(folder):
     assert not (study / ".drafts").exists()
 
 
-def test_a_killed_worker_costs_nothing(folder):
+def test_a_killed_worker_costs_nothing(type_command, folder):
     words = ["--env", "Killed-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
-    code, out, err = finish(*words, "--seeds", 3, "-n", 500, "--no-report", "-f", "studies")
+    code, out, err = type_command(*words, "--seeds", 3, "-n", 500, "--no-report", "-f", "studies")
     assert (code, err) == (0, "")
     assert (folder / "mark").exists()
     assert "failed" not in out
@@ -296,9 +296,9 @@ def test_a_killed_worker_costs_nothing(folder):
     assert not (study / "failures").exists()
 
 
-def test_what_a_killed_worker_has_saved_is_gone_on_with(folder):
+def test_what_a_killed_worker_has_saved_is_gone_on_with(type_command, folder):
     words = ["--env", "KilledLater-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
-    code, _, err = finish(*words, "--seeds", 1, "-n", 500, "--no-report", "-f", "studies")
+    code, _, err = type_command(*words, "--seeds", 1, "-n", 500, "--no-report", "-f", "studies")
     assert (code, err) == (0, "")
     assert int((folder / "mark").read_text()) > 1
 
@@ -326,15 +326,15 @@ SLOW = ["--env", "Slow-v0", "--gym-packages", "fragile_walks", "--algos", "qlear
 SLOW += ["--no-report", "-n", "2000", "--seeds", "2", "-j", "2", "-f", "studies"]
 
 
-def begin_slowly(folder):
+def begin_slowly(folder, n_seeds=2):
     """A study in the middle of its runs."""
-    process = start(*SLOW)
+    process = start(*SLOW, "--seeds", n_seeds)
     study = folder / "studies" / "Slow-v0_qlearning"
-    wait_for(lambda: len(list(study.glob(".drafts/*/0.monitor.csv"))) == 2)
+    wait_for(lambda: len(list(study.glob(".drafts/*/0.monitor.csv"))) == n_seeds)
     return process, study
 
 
-def test_a_killed_driver_leaves_no_orphans_and_no_drafts(folder):
+def test_a_killed_driver_leaves_no_orphans_and_no_drafts(type_command, folder):
     process, study = begin_slowly(folder)
     started = session_of(process.pid)
     assert len(started) >= 4
@@ -344,11 +344,11 @@ def test_a_killed_driver_leaves_no_orphans_and_no_drafts(folder):
     # Of the driver itself its lock is left, which nobody heeds.
     wait_for(lambda: [path.name for path in study.iterdir()] == [".lock"])
     (folder / "mark").touch()
-    assert finish(*SLOW)[0] == 0
+    assert type_command(*SLOW)[0] == 0
     assert sorted(path.name for path in study.iterdir()) == FILES
 
 
-def test_ctrl_c_ends_with_130_and_goes_on_afterwards(folder):
+def test_ctrl_c_ends_with_130_and_goes_on_afterwards(type_command, folder):
     process, study = begin_slowly(folder)
     started = session_of(process.pid)
     os.killpg(process.pid, signal.SIGINT)
@@ -360,7 +360,7 @@ def test_ctrl_c_ends_with_130_and_goes_on_afterwards(folder):
     wait_for(lambda: not any(map(is_alive, started)))
     assert not study.exists()
     (folder / "mark").touch()
-    code, out, _ = finish(*SLOW)
+    code, out, _ = type_command(*SLOW)
     assert (code, "2 runs, 0 of them there already" in out) == (0, True)
     assert len(records(study)) == 2
 
@@ -380,10 +380,10 @@ def test_other_signals_do_what_ctrl_c_does(folder, number, to_all):
     assert not study.exists()
 
 
-def test_a_second_driver_says_who_is_at_work_and_touches_nothing(folder):
+def test_a_second_driver_says_who_is_at_work_and_touches_nothing(type_command, folder):
     process, study = begin_slowly(folder)
     before = [*sorted(study.iterdir()), *sorted(study.glob(".drafts/*"))]
-    code, _, err = finish(*SLOW, "-params", "gamma:0.5", "--replace", "--repair")
+    code, _, err = type_command(*SLOW, "-params", "gamma:0.5", "--replace", "--repair")
     assert (code, err.count("\n")) == (2, 1)
     assert f"process {process.pid} on " in err
     assert [*sorted(study.iterdir()), *sorted(study.glob(".drafts/*"))] == before
@@ -393,7 +393,7 @@ def test_a_second_driver_says_who_is_at_work_and_touches_nothing(folder):
     assert len(records(study)) == 2
 
 
-def test_what_a_dead_driver_began_is_gone_on_with(folder):
+def test_what_a_dead_driver_began_is_gone_on_with(type_command, folder):
     """What it left is taken over, and begun anew where it is no state; nothing is left."""
     process, study = begin_slowly(folder)
     drafts = list(study.glob(".drafts/*"))
@@ -405,13 +405,13 @@ def test_what_a_dead_driver_began_is_gone_on_with(folder):
     wait_for(lambda: not session_of(process.pid) or not any(map(is_alive, session_of(process.pid))))
     assert sorted(study.glob(".drafts/*")) == sorted(drafts)
     (folder / "mark").touch()
-    assert finish(*SLOW)[0] == 0
+    assert type_command(*SLOW)[0] == 0
     assert sorted(path.name for path in study.iterdir()) == FILES
 
 
-def test_an_environment_ends_its_run_and_nothing_else(folder):
+def test_an_environment_ends_its_run_and_nothing_else(type_command, folder):
     words = ["--env", "Leaves-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
-    code, out, err = finish(*words, "--seeds", 3, "-n", 300, "--no-report", "-f", "studies")
+    code, out, err = type_command(*words, "--seeds", 3, "-n", 300, "--no-report", "-f", "studies")
     assert (code, err) == (1, "")
     assert "SystemExit: bye" in out
     assert "KeyboardInterrupt: bye" in out
@@ -427,13 +427,13 @@ def test_an_environment_cannot_end_the_command_as_if_all_were_done(type_command,
     assert "SystemExit: 0, which ends no command" in err
 
 
-def test_a_run_that_hangs_is_ended_and_says_where_it_was(folder):
+def test_a_run_that_hangs_is_ended_and_says_where_it_was(type_command, folder):
     (folder / "late.yml").write_text(
         "agents: [qlearning]\nenvironments: [Late-v0]\nn_timesteps: 300\nseeds: 2\n"
         "run_timeout: 4s\n"
     )
     words = ["late.yml", "--gym-packages", "fragile_walks", "--no-report", "-f", "studies"]
-    code, out, err = finish(*words)
+    code, out, err = type_command(*words)
     assert (code, err) == (1, "")
     assert "seed 1: took longer than --run-timeout allows, 4 s" in out
     log = folder / "studies" / "late" / "failures" / "qlearning@Late-v0_2.txt"
@@ -481,12 +481,10 @@ def test_where_nothing_can_be_forked_a_killed_worker_costs_nothing(spawning, fol
     study = folder / "studies" / "Killed-v0_qlearning"
     assert list(rows(study)["seed"]) == [0]
     assert not (study / ".drafts").exists()
-    code, out, err = finish(*words)
-    assert "1 runs, 1 of them there already" in out
 
 
 def test_where_nothing_can_be_forked_ctrl_c_leaves_nothing(spawning, folder):
-    process, study = begin_slowly(folder)
+    process, study = begin_slowly(folder, n_seeds=1)
     started = session_of(process.pid)
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)

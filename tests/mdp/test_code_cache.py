@@ -15,8 +15,8 @@ from mdp import code_cache
 
 ROOT = Path(code_cache.__file__).resolve().parent.parent
 
-# Q-learning on the cliff: what the greedy policy is worth, and what was compiled for that.
-TRAIN = """
+# What is compiled in this process, and what is said of it besides.
+NOTE = """
 import logging, sys
 names = []
 class Note(logging.Handler):
@@ -24,17 +24,43 @@ class Note(logging.Handler):
         names.append(record.getMessage())
 log = logging.getLogger("mdp.machine_code")
 log.addHandler(Note()); log.setLevel(logging.INFO); log.propagate = False
+"""
+
+# Q-learning on the cliff: what the greedy policy is worth.
+TRAIN = f"""{NOTE}
 from stable_baselines3.common.env_util import make_vec_env
 from agents.tabular.q_learning import QLearning
 model = QLearning(env=make_vec_env("CliffWalking-v1", seed=0), seed=0, learning_rate=0.5)
 model.learn(20_000)
-from envs.known_models import transition_model
-from mdp import policy_return
 import gymnasium as gym
-greedy = model.policy.q_table.argmax(axis=1)
-value = policy_return(transition_model(gym.make("CliffWalking-v1")), greedy, 200).expected_return
-print(round(float(value)), model.engine_in_use, int("compiling run_block" in names), len(names))
-print([name for name in names if not name.startswith("compiling")], file=sys.stderr)
+env = gym.make("CliffWalking-v1", max_episode_steps=200)
+obs, _ = env.reset()
+value, is_over = 0, False
+while not is_over:
+    obs, reward, terminated, truncated, _ = env.step(int(model.policy.q_table[obs].argmax()))
+    value, is_over = value + reward, terminated or truncated
+print(int(value), model.engine_in_use, int("compiling run_block" in names))
+"""
+
+# The same in small: a function, and another of another package that it is compiled into.
+RULE = """
+from mdp.machine_code import inlined
+
+@inlined
+def rule(x):
+    return 3.0 * x
+"""
+LOOP = """
+from agents.common.small_rule import rule
+from mdp.machine_code import kernel
+
+@kernel
+def run_small(x):
+    return rule(x) + 1.0
+"""
+SMALL = f"""{NOTE}
+from mdp.small_loop import run_small
+print(int(run_small(4.0)), "compiled", int("compiling run_small" in names))
 """
 
 
@@ -45,10 +71,12 @@ def checkout(tmp_path_factory):
     for package in ("safe_files", "mdp", "agents", "envs"):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / package, root / package, ignore=ignored)
+    (root / "agents" / "common" / "small_rule.py").write_text(RULE)
+    (root / "mdp" / "small_loop.py").write_text(LOOP)
     return root
 
 
-def run(root, code=TRAIN, **environment):
+def run(root, code=SMALL, **environment):
     variables = {**os.environ, "PYTHONPATH": str(root), **environment}
     variables.pop("NUMBA_CACHE_DIR", None)
     done = subprocess.run(
@@ -63,9 +91,9 @@ def run(root, code=TRAIN, **environment):
     return done
 
 
-def outcome(root, **environment):
-    """Value of the policy, engine, and whether the loop was compiled."""
-    value, engine, compiled, _ = run(root, **environment).stdout.split()
+def outcome(root, code=SMALL, **environment):
+    """What it comes to, by which engine, and whether the loop was compiled."""
+    value, engine, compiled = run(root, code, **environment).stdout.split()
     return int(value), engine, compiled == "1"
 
 
@@ -73,17 +101,29 @@ def test_a_changed_rule_is_what_runs(checkout):
     """The rule stands in another file than the loop, and the constant in yet another."""
     rule = checkout / "agents" / "common" / "exploration.py"
     before = rule.read_text()
-    assert outcome(checkout) == (-13, "compiled", True)
-    assert outcome(checkout) == (-13, "compiled", False)
+    assert outcome(checkout, TRAIN) == (-13, "compiled", True)
     wrong = before.replace("        highest = max(highest, values[action])\n", "        pass\n")
     assert wrong != before
     rule.write_text(wrong)
-    value, engine, compiled = outcome(checkout)
+    value, engine, compiled = outcome(checkout, TRAIN)
     rule.write_text(before)
     assert (engine, compiled) == ("compiled", True)
     assert value < -13
     # Back again, what was compiled at first is still there and right.
-    assert outcome(checkout) == (-13, "compiled", False)
+    assert outcome(checkout, TRAIN) == (-13, "compiled", False)
+
+
+def test_so_it_is_in_small(checkout):
+    rule = checkout / "agents" / "common" / "small_rule.py"
+    first, second = RULE.replace("3.0", "7.0"), RULE.replace("3.0", "5.0")
+    rule.write_text(first)
+    assert outcome(checkout) == (29, "compiled", True)
+    assert outcome(checkout) == (29, "compiled", False)
+    rule.write_text(second)
+    assert outcome(checkout) == (21, "compiled", True)
+    rule.write_text(first)
+    assert outcome(checkout) == (29, "compiled", False)
+    rule.write_text(RULE)
 
 
 def test_damaged_machine_code_is_compiled_anew(checkout):
@@ -95,8 +135,8 @@ def test_damaged_machine_code_is_compiled_anew(checkout):
         assert len(name) < code_cache.LONGEST_NAME + 8
         size = path.stat().st_size
         path.write_bytes(b"" if place % 2 else path.read_bytes()[: size // 2])
-    assert outcome(checkout) == (-13, "compiled", True)
-    assert outcome(checkout) == (-13, "compiled", False)
+    assert outcome(checkout) == (13, "compiled", True)
+    assert outcome(checkout) == (13, "compiled", False)
 
 
 def test_where_nothing_can_be_written_it_is_compiled_in_memory(checkout, tmp_path):
@@ -106,7 +146,7 @@ def test_where_nothing_can_be_written_it_is_compiled_in_memory(checkout, tmp_pat
     (root / "mdp" / "__pycache__").write_text("")
     (tmp_path / "home").write_text("")
     done = run(root, HOME=str(tmp_path / "home"), XDG_CACHE_HOME="")
-    assert done.stdout.split()[:2] == ["-13", "compiled"]
+    assert done.stdout.split() == ["13", "compiled", "1"]
     assert "Traceback" not in done.stderr
     warnings = run(
         root,
@@ -181,7 +221,7 @@ class Own(QLearning):
     next_value = own_value
 """
 USE = """
-from {module} import Own
+from own_rules import Own
 from stable_baselines3.common.env_util import make_vec_env
 def q(cls):
     env = make_vec_env("FrozenLake-v1", seed=0)
@@ -192,22 +232,24 @@ print(*q(Own))
 """
 
 
-def test_a_rule_of_the_users_own_compiles_and_follows_its_source(checkout):
+AGAIN = """
+import importlib, own_rules
+from pathlib import Path
+source = Path(own_rules.__file__)
+source.write_text(source.read_text().replace("9.0", "5.25"))
+print(*q(importlib.reload(own_rules).Own))
+"""
+
+
+def test_a_rule_of_the_users_own_follows_its_source(checkout):
+    """From process to process, and in one where its class is defined anew, as in a notebook."""
     module = checkout / "own_rules.py"
-    for worth in (7.0, 9.0):
-        module.write_text(OWN_RULE.format(worth=worth))
-        printed = run(checkout, USE.format(module="own_rules")).stdout.split()
-        assert printed == [str(worth), "compiled"]
+    module.write_text(OWN_RULE.format(worth=7.0))
+    assert run(checkout, USE).stdout.split() == ["7.0", "compiled"]
+    module.write_text(OWN_RULE.format(worth=9.0))
+    printed = run(checkout, USE + AGAIN).stdout.split()
     module.unlink()
-
-
-def test_a_class_that_is_defined_anew_is_compiled_anew(checkout):
-    """As in a notebook, where a cell is run once more."""
-    again = OWN_RULE.format(worth=7.0) + USE.format(module="__main__").replace(
-        "from __main__ import Own", ""
-    )
-    again += again.replace("7.0", "9.0")
-    assert run(checkout, again).stdout.split() == ["7.0", "compiled", "9.0", "compiled"]
+    assert printed == ["9.0", "compiled", "5.25", "compiled"]
 
 
 def test_old_machine_code_goes_away(tmp_path, monkeypatch):

@@ -126,12 +126,13 @@ def test_what_is_asked_for_is_done(tmp_path):
     assert evaluations["results"].shape == (20, 3)
     assert "n_episodes" not in evaluations, "all have as many as there are columns"
     assert json.loads(run.info_path.read_text())["final"]["n_episodes"] == 3
-    often = run_of(spec_of(tmp_path, eval_freq=20, n_timesteps=2000)).run
-    assert len(np.load(often.evaluations_path)["timesteps"]) == 100
+    often = run_of(spec_of(tmp_path, eval_freq=10, n_timesteps=500)).run
+    assert len(np.load(often.evaluations_path)["timesteps"]) == 50
 
 
-def test_a_run_says_what_its_evaluations_took(tmp_path):
-    outcome = run_of(spec_of(tmp_path, "ppo", n_timesteps=2000))
+def test_a_run_says_what_its_evaluations_took(tmp_path, monkeypatch):
+    monkeypatch.setattr(budget, "STEPS_IN_ANY_CASE", 4000)
+    outcome = run_of(spec_of(tmp_path, "ppo", n_timesteps=500))
     assert 0 < outcome.evaluation_steps <= budget.STEPS_IN_ANY_CASE
     info = json.loads(outcome.run.info_path.read_text())
     assert info["evaluation_steps"] == outcome.evaluation_steps
@@ -144,7 +145,7 @@ def test_a_run_says_what_its_evaluations_took(tmp_path):
     assert outcome.evaluating.cpu_seconds > 0
     # Rows of fewer episodes are repeated, so that all tools read them.
     assert set(n_columns % counts) == {0}
-    again = run_of(spec_of(tmp_path, "ppo", n_timesteps=2000))
+    again = run_of(spec_of(tmp_path, "ppo", n_timesteps=500))
     for name, array in np.load(again.run.evaluations_path).items():
         np.testing.assert_array_equal(array, evaluations[name])
 

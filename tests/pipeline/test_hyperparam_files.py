@@ -25,10 +25,13 @@ from pipeline.train_spec import TrainSpec
 
 FOLDER = Path(hyperparams.__file__).parents[2] / "hyperparams"
 FILES = sorted(FOLDER.glob("*.yml"))
-ENTRIES = [(path.stem, key) for path in FILES for key in read_yaml(path) if key != tuned_seeds.KEY]
+READ = {path.stem: read_yaml(path) for path in FILES}
+ENTRIES = [(algo, key) for algo, read in READ.items() for key in read if key != tuned_seeds.KEY]
 
 # Agents of one environment alone have no entry that stands in for others.
 SPECIALISTS = {"angle"}
+
+pytestmark = pytest.mark.usefixtures("files_parsed_once")
 
 
 class Valid(gym.Env):
@@ -85,7 +88,7 @@ def test_every_file_is_an_agents_and_every_agent_has_one():
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_file_names_known_environments(path):
-    names = [name for name in read_yaml(path) if name != tuned_seeds.KEY]
+    names = [name for name in READ[path.stem] if name != tuned_seeds.KEY]
     assert set(names) - {"default"} <= set(gym.registry)
     assert entry_names(path.stem) == [name for name in names if name != "default"]
     assert ("default" in names) == (path.stem not in SPECIALISTS)
@@ -93,7 +96,7 @@ def test_every_file_names_known_environments(path):
 
 @pytest.mark.parametrize(("algo", "key"), ENTRIES)
 def test_every_entry_says_how_long_to_train_and_builds_its_agents_arguments(algo, key):
-    entry = read_yaml(FOLDER / f"{algo}.yml")[key]
+    entry = READ[algo][key]
     spec = split(entry)
     assert [spec.n_timesteps, spec.n_episodes].count(None) == 1
     algorithm = load_algorithm(algo)
@@ -122,7 +125,7 @@ def test_every_entry_fits_its_environment(algo, env_id):
 
 @pytest.mark.parametrize(("algo", "key"), ENTRIES)
 def test_every_entry_names_components_that_there_are(algo, key, tmp_path):
-    spec = split(read_yaml(FOLDER / f"{algo}.yml")[key])
+    spec = split(READ[algo][key])
     vec_wrapper_factory(spec.vec_env_wrapper)
     assert len(callbacks(spec.callback, save_path=tmp_path)) == len(spec.callback)
 

@@ -49,10 +49,11 @@ ZOO = peer_folder("rl_zoo3") / "hyperparams"
 ZOO_ALGORITHMS: Mapping[str, type[BaseAlgorithm]] = {
     path.stem: load_algorithm(path.stem) for path in sorted(ZOO.glob("*.yml")) if path.stem != "her"
 }
+ZOO_READ = {algo: yaml.safe_load((ZOO / f"{algo}.yml").read_text()) for algo in ZOO_ALGORITHMS}
 ZOO_ENTRIES = [
     (algo, env_id)
     for algo in ZOO_ALGORITHMS
-    for env_id in yaml.safe_load((ZOO / f"{algo}.yml").read_text())
+    for env_id in ZOO_READ[algo]
     # A slip that rl_zoo3 stumbles over itself; see below.
     if (algo, env_id) != ("ppo_lstm", "default")
 ]
@@ -82,10 +83,11 @@ def write(folder: Path, text: str | bytes) -> Path:
 # --- rl_zoo3's own files -------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("files_parsed_once")
 @pytest.mark.parametrize(("algo", "env_id"), ZOO_ENTRIES)
 def test_rl_zoo3_entries_load_unchanged(algo: str, env_id: str) -> None:
     raw = read_hyperparams(algo, env_id, ZOO / f"{algo}.yml")
-    assert raw == yaml.safe_load((ZOO / f"{algo}.yml").read_text())[env_id]
+    assert raw == ZOO_READ[algo][env_id]
     hyperparams = split(raw)
     assert hyperparams.n_timesteps == int(float(raw["n_timesteps"]))
     built = build_algorithm_kwargs(ZOO_ALGORITHMS[algo], hyperparams.algorithm, algo)

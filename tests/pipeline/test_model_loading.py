@@ -39,7 +39,11 @@ CASES = {
     "crossq": OFF,
     "trpo": {**ROLLOUT, "batch_size": 8},
     "ars": {"n_delta": 1},
-    "ppo_lstm": {**ROLLOUT, "batch_size": 8},
+    "ppo_lstm": {
+        **ROLLOUT,
+        "batch_size": 8,
+        "policy_kwargs": {**TINY, "lstm_hidden_size": 4},
+    },
     "ppo_mask": {**ROLLOUT, "batch_size": 8},
 }
 

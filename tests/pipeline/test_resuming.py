@@ -15,6 +15,7 @@ from rich.console import Console
 
 from agents import ALGORITHMS
 from pipeline.errors import UserError
+from pipeline.evaluation import evaluation_budget
 from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
 from pipeline.resuming.log_positions import cut_back, log_positions
@@ -40,6 +41,7 @@ GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
 ARMS, LINEAR = "BernoulliBandit-v0", "LinearBandit-v0"
 SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
 EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
+EAGER["policy_kwargs"] = {"net_arch": [16]}
 
 # Every agent, and the settings whose state is kept in a place of its own.
 TRAININGS = [
@@ -67,8 +69,8 @@ TRAININGS = [
     (SWING, "tqc", 150, EAGER),
     (SWING, "crossq", 150, EAGER),
     (LEFT_RIGHT, "trpo", 400, {"n_steps": 64, "batch_size": 32, "n_envs": 1}),
-    (SWING, "ars", 8000, {"n_delta": 2, "n_top": 1, "n_envs": 1, "normalize": True}),
-    (LEFT_RIGHT, "ppo_lstm", 400, SMALL),
+    (SWING, "ars", 4000, {"n_delta": 2, "n_top": 1, "n_envs": 1, "normalize": True}),
+    (LEFT_RIGHT, "ppo_lstm", 400, {**SMALL, "policy_kwargs": {"lstm_hidden_size": 16}}),
     ("Warehouse-v0", "ppo_mask", 400, SMALL),
     *((ARMS, name, 300, {}) for name in ("epsilon_greedy", "boltzmann", "ucb", "kl_ucb")),
     *((ARMS, name, 300, {}) for name in ("gradient_bandit", "exp3", "thompson")),
@@ -76,6 +78,12 @@ TRAININGS = [
     *((ARMS, f"mabwiser_{name}", 200, {}) for name in ("epsilon_greedy", "ucb1", "thompson")),
     (LINEAR, "mabwiser_linucb", 200, {}),
 ]
+
+
+@pytest.fixture(autouse=True)
+def short_evaluations(monkeypatch):
+    """As many steps as a test can wait for, shared out as ever."""
+    monkeypatch.setattr(evaluation_budget, "STEPS_IN_ANY_CASE", 600)
 
 
 class CutOffError(BaseException):

@@ -4,6 +4,7 @@ In processes of their own, of the Python that has it: importing it changes Gymna
 """
 
 import csv
+import json
 import os
 import subprocess
 import sys
@@ -24,24 +25,26 @@ ROOT = Path(train.__file__).parent
 # rl_zoo3.enjoy needs `requests` for downloading models, which is not done here, and does not
 # itself ask for it to be installed.
 ENJOY = """
-import importlib.util, sys, types
+import importlib.util, json, types
 if importlib.util.find_spec("requests") is None:
     stand_in = types.ModuleType("requests.exceptions")
     stand_in.HTTPError = type("HTTPError", (OSError,), {})
     sys.modules["requests"] = types.ModuleType("requests")
     sys.modules["requests.exceptions"] = stand_in
 from rl_zoo3.enjoy import enjoy
-enjoy()
+for words in json.loads(sys.argv[3]):
+    print("=====")
+    sys.argv = ["enjoy.py", *words]
+    enjoy()
 """
 
 READ = """
 import sys
-import numpy as np
 from rl_zoo3.utils import create_test_env, get_latest_run_id, get_model_path, get_saved_hyperparams
 from stable_baselines3 import PPO
 import envs
 
-folder, env_id = sys.argv[1:]
+folder, env_id = sys.argv[1:3]
 print(get_latest_run_id(f"{folder}/ppo", env_id))
 for kwargs in ({}, {"load_best": True}, {"load_checkpoint": 128}, {"load_last_checkpoint": True}):
     _, model_path, log_path = get_model_path(0, folder, "ppo", env_id, **kwargs)
@@ -109,8 +112,19 @@ def run(tmp_path_factory):
     return Run.find(folder / "logs", "ppo", "Warehouse-v0")
 
 
-def test_rl_zoo3_reads_a_run_folder(run):
-    out = python(READ, run.path.parent.parent, "Warehouse-v0").splitlines()
+@pytest.fixture(scope="module")
+def printed(run):
+    """What is printed when it reads the run, plays it, and plays the last checkpoint."""
+    folder = run.path.parent.parent
+    words = ["--algo", "ppo", "--env", "Warehouse-v0", "-f", str(folder)]
+    words += ["--no-render", "-n", "45", "--device", "cpu", "--gym-packages", "envs"]
+    plays = json.dumps([words, [*words, "--load-last-checkpoint"]])
+    parts = python(READ + ENJOY, folder, "Warehouse-v0", plays).split("=====\n")
+    return [part.splitlines() for part in parts]
+
+
+def test_rl_zoo3_reads_a_run_folder(run, printed):
+    out, *_ = printed
     assert out[0] == "2"
     paths = [Path(line) for line in out if line.endswith(".zip")]
     assert paths == [
@@ -124,14 +138,13 @@ def test_rl_zoo3_reads_a_run_folder(run):
     assert out.count("Loading running average") == 4
 
 
-@pytest.mark.parametrize("which", [[], ["--load-last-checkpoint"]])
-def test_rl_zoo3_plays_a_run(run, which):
+def test_rl_zoo3_plays_a_run(run, printed):
     """Its own command, with the environment as our hyperparameters make it."""
-    arguments = ["--algo", "ppo", "--env", "Warehouse-v0", "-f", run.path.parent.parent]
-    options = ["--no-render", "-n", "45", "--device", "cpu", "--gym-packages", "envs"]
-    out = python(ENJOY, *arguments, *options, *which).splitlines()
-    lengths = [line for line in out if line.startswith("Episode Length")]
-    assert lengths == ["Episode Length 15"] * 3
+    _, *played = printed
+    for out, path in zip(played, (run.model_path, run.checkpoint_path(256)), strict=True):
+        assert any(str(path) in line for line in out)
+        lengths = [line for line in out if line.startswith("Episode Length")]
+        assert lengths == ["Episode Length 15"] * 3
 
 
 def test_the_librarys_plots_read_our_monitors(run):

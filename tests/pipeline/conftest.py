@@ -1,0 +1,19 @@
+"""What several tests of runs and their settings need."""
+
+import copy
+from functools import cache
+
+import pytest
+
+from pipeline.settings import hyperparam_entries
+from pipeline.settings.strict_yaml import read_yaml
+
+_parsed = cache(read_yaml)
+
+
+@pytest.fixture
+def files_parsed_once(monkeypatch):
+    """For tests of every entry of a file: to parse it takes longer than all that is tested."""
+    monkeypatch.setattr(
+        hyperparam_entries, "read_yaml", lambda path: copy.deepcopy(_parsed(path))
+    )
