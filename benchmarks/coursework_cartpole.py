@@ -48,7 +48,7 @@ def pushed(cart: Any, to_the_right: bool) -> Any:
 @numba.njit(cache=False)
 def has_fallen(cart: Any) -> bool:
     """Whether the cart has left the track or the pole leans by more than 12 degrees."""
-    return abs(cart[0]) > 2.4 or abs(cart[2]) > math.radians(12)
+    return bool(abs(cart[0]) > 2.4 or abs(cart[2]) > math.radians(12))
 
 
 @numba.njit(cache=False)
@@ -84,7 +84,7 @@ def seen(cart: Any, binning: int) -> Any:
 def chosen(values: Any, epsilon: float) -> int:
     """An action, epsilon-greedily; the first of two that are alike."""
     if np.random.random() < epsilon:  # noqa: NPY002
-        return np.random.randint(2)  # type: ignore[no-any-return]  # noqa: NPY002
+        return np.random.randint(2)  # noqa: NPY002
     return int(values[1] > values[0])
 
 

@@ -260,33 +260,15 @@ def _prepare(
         from commands.study_output import repair
 
         repair(console, study, planned)
-<<<<<<< HEAD
-    with doing(console, "looking for runs that are there") as activity:
-=======
     with doing(console, "looking for runs that are there") as activity, loading_libraries():
-        from experiments.child_processes import start_server
->>>>>>> wt-c
         from experiments.replaced_runs import check_settings_kept
         from experiments.study_plan import check_settings
 
         if not args.replace:
             check_settings_kept(planned, root)
         if any(run.is_to_do for run in planned):
-<<<<<<< HEAD
             place.get_ready(planned)
-=======
-            start_server(_warm_ups(planned))  # it imports the libraries while this process does
->>>>>>> wt-c
         activity.now("loading the libraries")
         import commands.study_output  # noqa: F401  # what it imports takes long
 
         check_settings(study, planned)
-
-
-def _warm_ups(planned: Sequence[PlannedRun]) -> str:
-    """What the server is to compile once for all runs: only of users' own modules."""
-    if not any(run.spec.user_modules for run in planned):
-        return "[]"
-    from experiments.warm_ups import warm_ups
-
-    return warm_ups(planned)

@@ -47,14 +47,9 @@ def grow_study(
         now = grown(study, counts)
         planned = plan(now, root, counts)
         given_up = {failure.planned.path for failure in failures}
-<<<<<<< HEAD
-        failures += do_missing(console, planned, root, place, given_up)
-        results = read(console, now, planned, root)
-=======
         early = EarlyResults(now)
-        failures += do_missing(console, planned, root, launchers, where, early, given_up)
+        failures += do_missing(console, planned, root, place, early, given_up)
         results = read(console, now, planned, root, early)
->>>>>>> wt-c
         steps = take_planned_looks(results)
         for step in steps:
             if (step.environment, step.growth.n_looks) not in said:

@@ -87,9 +87,17 @@ def place_of(
 
 def _start_server(planned: Sequence[PlannedRun]) -> None:
     from experiments.child_processes import start_server
+
+    start_server(_warm_ups(planned))  # it imports the libraries while this process does
+
+
+def _warm_ups(planned: Sequence[PlannedRun]) -> str:
+    """What the server is to compile once for all runs: only of users' own modules."""
+    if not any(run.spec.user_modules for run in planned):
+        return "[]"
     from experiments.warm_ups import warm_ups
 
-    start_server(warm_ups(planned))  # it imports the libraries while this process does
+    return warm_ups(planned)
 
 
 def _cluster(
@@ -123,9 +131,7 @@ def _cluster(
         )
 
     def get_ready(planned: Sequence[PlannedRun]) -> None:
-        from experiments.warm_ups import warm_ups
-
-        compiled[0] = warm_ups(planned)
+        compiled[0] = _warm_ups(planned)
 
     return Place(launchers, f"on the cluster {args.cluster}", get_ready)
 

@@ -50,14 +50,9 @@ def run_study(
     Returns:
         The exit code: 0 if all runs are there and sound, else 1.
     """
-<<<<<<< HEAD
-    failures = do_missing(console, planned, root, place)
-    results = read(console, study, planned, root)
-=======
     early = EarlyResults(study)
-    failures = do_missing(console, planned, root, launchers, where, early)
+    failures = do_missing(console, planned, root, place, early)
     results = read(console, study, planned, root, early)
->>>>>>> wt-c
     return conclude(console, results, failures, command, with_page=with_page)
 
 
@@ -171,13 +166,8 @@ def do_missing(
     console: Console,
     planned: Sequence[PlannedRun],
     root: Path,
-<<<<<<< HEAD
     place: Place,
-=======
-    launchers: Launchers,
-    where: str,
     early: EarlyResults,
->>>>>>> wt-c
     given_up: Collection[Path] = (),
 ) -> list[RunFailure]:
     """Do the runs that are missing, but for those whose folders are given up; which failed.
@@ -195,17 +185,13 @@ def do_missing(
     with StudyProgress(console, planned, done) as progress:
         for run in done:
             progress.note_refusal(run)
-<<<<<<< HEAD
-        return execute(missing, root, progress.watching(place.launchers), progress.note)
-=======
 
         def note(planned: PlannedRun, failure: RunFailure | None) -> None:
             progress.note(planned, failure)
             if failure is None:
                 early.read(planned)
 
-        return execute(missing, root, launchers, note)
->>>>>>> wt-c
+        return execute(missing, root, progress.watching(place.launchers), note)
 
 
 def _judge(
