@@ -119,10 +119,10 @@ def cluster(folder: Path) -> Iterator[tuple[str, dict[str, int]]]:
             stack.callback(process.terminate)
             return process.pid
 
-        pid = started("distributed.cli.dask_scheduler --host 127.0.0.1 --port 0 --no-dashboard")
+        pid = started("distributed.cli.dask_scheduler --host 127.0.0.1 --port 0 --dashboard-address 127.0.0.1:0")
         while not file.exists():
             time.sleep(0.1)
-        started(f"distributed.cli.dask_worker --nworkers {N_WORKERS} --nthreads 1 --no-dashboard")
+        started(f"distributed.cli.dask_worker --nworkers {N_WORKERS} --nthreads 1 --dashboard-address 127.0.0.1:0")
         yield str(file), {"scheduler": pid, "driver": os.getpid()}
 
 

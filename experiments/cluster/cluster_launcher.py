@@ -18,7 +18,7 @@ from distributed import Future as DaskFuture
 from distributed.scheduler import KilledWorker
 
 from experiments.child_processes import NO_LIMITS
-from experiments.cluster.addresses import Cluster, JobQueue
+from experiments.cluster.addresses import Cluster, JobQueue, LocalWorkers
 from experiments.cluster.answers import FAILED, STOPPED, RefusedAnswerError, unpacked
 from experiments.cluster.clusters import opened
 from experiments.cluster.connections import Connection
@@ -69,6 +69,7 @@ def cluster_launcher(
         UserError: if there is no such cluster.
     """
     plugin, wanted = Supervisors(warm_ups), n_runs if isinstance(cluster, JobQueue) else 0
+    wanted = cluster.n_workers if isinstance(cluster, LocalWorkers) else wanted
     with probing(root) as probe, opened(cluster, n_runs, is_told) as (connect, replace_jobs):
         launcher = ClusterLauncher(probe, command, limits, wanted)
         prepare = partial(launcher.prepare, plugin)
