@@ -21,19 +21,9 @@ from report.page import (
     settings_section,
     verdict_section,
 )
-from report.page.markup import (
-    as_json,
-    inline_script,
-    package_file,
-    packed,
-    script_hash,
-    template_file,
-    templates,
-)
+from report.page.markup import SHARED, as_json, frame, packed, template_file, templates
 from report.page.sections import Report, Section
 from report.series.study_series import StudySeries
-
-STYLES = ("templates/parts.css", "templates/page.css", "templates/paper.css")
 
 # A new kind of section is a module with such a function, named here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
@@ -88,29 +78,20 @@ def render(report: Report, sections: list[Section]) -> str:
         )
         for section in sections
     }
-    from plotly.offline import get_plotlyjs
-
-    early, start = package_file("templates/theme.js"), package_file("templates/start.js")
-    plotly, own = get_plotlyjs(), _own_script(sections)
     return environment.get_template("page.html").render(
+        title=study.title,
         study=study,
         environments=report.analysis.environments,
         sections=sections,
         bodies=bodies,
         data=_data(report, sections),
-        style=Markup("\n".join(package_file(name) for name in STYLES)),  # noqa: S704  # our own
-        early=inline_script(early),
-        plotly=packed(plotly),
-        own=inline_script(own),
-        start=inline_script(start),
-        policy=" ".join(map(script_hash, [early, plotly, own, start])),
+        **frame(_own_script(sections)),
     )
 
 
 def _own_script(sections: list[Section]) -> str:
     """The scripts of the page and of its sections, as one."""
-    shared = ["core.js", "exports.js", "figures.js", "tables.js"]
-    names = [*shared, *(f"{section.name}.js" for section in sections), "paper.js"]
+    names = [*SHARED, *(f"{section.name}.js" for section in sections), "paper.js"]
     return "\n".join(text for name in names if (text := template_file(name)) is not None)
 
 

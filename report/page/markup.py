@@ -20,6 +20,10 @@ from report.wording import interval_alone, number
 
 _WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
 
+STYLES = ("templates/parts.css", "templates/page.css", "templates/paper.css")
+# Scripts that sections build on, before their own.
+SHARED = ("core.js", "exports.js", "figures.js", "tables.js")
+
 SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
 
 
@@ -97,6 +101,26 @@ def script_hash(text: str) -> str:
     """How a content security policy names an inline script."""
     digest = hashlib.sha256(text.encode("utf-8")).digest()
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def frame(own: str) -> dict[str, str]:
+    """What every page has: its styles, its scripts, and the policy that admits these alone.
+
+    Args:
+        own: the page's own script.
+    """
+    from plotly.offline import get_plotlyjs
+
+    early, start = package_file("templates/theme.js"), package_file("templates/start.js")
+    plotly = get_plotlyjs()
+    return {
+        "style": Markup("\n".join(package_file(name) for name in STYLES)),  # noqa: S704  # our own
+        "early": inline_script(early),
+        "plotly": packed(plotly),
+        "own": inline_script(own),
+        "start": inline_script(start),
+        "policy": " ".join(map(script_hash, [early, plotly, own, start])),
+    }
 
 
 def p_value(value: float) -> str:

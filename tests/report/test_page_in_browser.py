@@ -19,8 +19,7 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from report.latex import LATEX
 from report.markdown import MARKDOWN
 from report.page import write_report
-from report.page.assembly import STYLES
-from report.page.markup import package_file, templates
+from report.page.markup import STYLES, package_file, templates
 from report.page.settings_section import SettingsTable
 from report.series.agent_marks import agent_marks
 from report.series.study_series import study_series
