@@ -26,6 +26,7 @@ from experiments.study_plan import plan
 from pipeline.folder_lock import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning
+from tuning.record import FILE as RECORD
 from tuning.record import write_record
 from tuning.retesting import (
     FOLDER,
@@ -84,7 +85,7 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
     if not candidates:
         if tuning.retest:
             say(console, "no settings but the shipped ones were judged to the end: no re-test")
-        write_record(place, None, how.command, None)
+        _write_down(console, place, how, None)
         return 0
     root = place.root / FOLDER
     lost = partial(_give_way, console, root)
@@ -97,12 +98,27 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
         else:
             n_trials = place.queue.n_trials
             path = write_winner(tuning, place.root, outcome, winner.entry, n_trials)
-        write_record(place, outcome, how.command, None if path is None else WINNER)
-    print_outcome(console, place, outcome)
+        print_outcome(console, place, outcome)
+        _write_down(console, place, how, outcome)
     if winner is not None and path is not None:
         print_winner(console, outcome, path, _use(place, path))
         print_entry(console, winner.entry, place.suggestions.shipped)
     return code
+
+
+def _write_down(console: Console, place: OpenTuning, how: How, outcome: Outcome | None) -> None:
+    """Write the record, and the page of it."""
+    is_won = outcome is not None and outcome.winner is not None
+    record = write_record(place, outcome, how.command, WINNER if is_won else None)
+    files = [place.root / RECORD]
+    if how.with_page:
+        with doing(console, "writing the page"):
+            from report.tuning_page import write_tuning_page
+
+            page, retest = place.root / "report.html", f"{FOLDER}/report.html"
+            write_tuning_page(record, page, retest if (place.root / retest).exists() else "")
+            files.append(page)
+    say(console, f"files: {', '.join(map(str, files))}")
 
 
 def _use(place: OpenTuning, path: Path) -> str:
