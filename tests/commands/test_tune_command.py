@@ -137,4 +137,4 @@ def test_flags_of_the_library_for_a_search_point_here(monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["train.py", "-optimize", "--n-trials", "100"])
     with pytest.raises(SystemExit):
         run_command(train.main)
-    assert "the command tune searches for hyperparameters" in capsys.readouterr().err
+    assert "by the command tune: see tune --help" in capsys.readouterr().err
