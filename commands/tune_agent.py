@@ -5,19 +5,22 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from commands.parsing import command_line
+from commands.places import Place, place_of
 from commands.streams import go_on_unread
 from commands.tune_flags import build_parser
+from commands.tune_how import How
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.signs_of_life import doing
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
-    from experiments.launching import Launchers
+    from rich.console import Console
+
     from tuning.tuning_spec import TuningSpec
 
 
@@ -33,50 +36,45 @@ def _tune(args: argparse.Namespace) -> int:
 
     tuning = tuning_spec(args)
     from commands.terminal import table_console
-    from experiments.child_processes import end_server, start_server
+    from experiments.child_processes import end_server
 
     go_on_unread()
     console = table_console()
     console.print(tuning.study.title, style="bold", markup=False, highlight=False)
     root = Path(args.log_folder) / tuning.study.name
     try:
+        how = _how(args, tuning, root, console)
         with doing(console, "loading the libraries"):
-            start_server()
-            import commands.tune_driving as driving
+            from tuning.trial_runs import shipped_run
+
+            how.place(root).get_ready([shipped_run(tuning, root)])
+            from commands.tune_driving import drive
             from tuning.opening import open_tuning
 
-            place = open_tuning(tuning, root, args.storage)
-        deadline = math.inf if args.timeout is None else time.monotonic() + args.timeout
-        how = driving.How(
-            launchers=partial(_launchers, args, tuning),
-            where=f"{_n_workers(args)} at once",
-            command=_command(),
-            deadline=deadline,
-            with_page=not args.no_report,
-        )
-        return driving.drive(console, place, how)
+            opened = open_tuning(tuning, root, args.storage)
+        return drive(console, opened, how)
     except KeyboardInterrupt:
         end_server()
         raise
 
 
-def _launchers(args: argparse.Namespace, tuning: TuningSpec, root: Path) -> Launchers:
-    """Where the runs in a folder are done."""
-    from experiments.launching import local_launcher
+def _how(args: argparse.Namespace, tuning: TuningSpec, root: Path, console: Console) -> How:
     from experiments.run_limits import RunLimits
-
-    limits = RunLimits(tuning.study.run_timeout, tuning.study.run_memory)
-    return partial(local_launcher, root, _command(), _n_workers(args), limits)
-
-
-def _command() -> str:
-    """The command as every run folder notes it, which is no place for a password."""
     from tuning.trial_storage import without_secret
 
-    return without_secret(command_line())
+    # Every run folder notes the command, which is no place for a password.
+    command = without_secret(command_line())
+    limits = RunLimits(tuning.study.run_timeout, tuning.study.run_memory)
+    say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
 
+    @cache
+    def place(folder: Path) -> Place:
+        return place_of(args, folder, command, limits, say)
 
-def _n_workers(args: argparse.Namespace) -> int:
-    from experiments.launching import available_cores
-
-    return max(args.jobs, 0) or available_cores()
+    place(root)  # so that a mistake in its flags is found at once
+    return How(
+        place=place,
+        command=command,
+        deadline=math.inf if args.timeout is None else time.monotonic() + args.timeout,
+        with_page=not args.no_report,
+    )

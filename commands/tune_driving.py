@@ -5,8 +5,6 @@ from __future__ import annotations
 import _thread
 import shlex
 import signal
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +12,7 @@ from rich.console import Console
 
 from commands.parsing import called_as
 from commands.study_output import conclude, do_missing, read, say
+from commands.tune_how import How
 from commands.tune_output import (
     print_entry,
     print_opened,
@@ -23,11 +22,11 @@ from commands.tune_output import (
 )
 from commands.tune_progress import TuningProgress
 from experiments.child_processes import stop_all
-from experiments.launching import Launchers
 from experiments.study_plan import plan
 from pipeline.folder_lock import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning
+from tuning.record import FILE as RECORD
 from tuning.record import write_record
 from tuning.retesting import (
     FOLDER,
@@ -43,29 +42,10 @@ from tuning.winner_files import FILE as WINNER
 from tuning.winner_files import remove_winner, write_winner
 
 
-@dataclass(frozen=True)
-class How:
-    """How a tuning is done.
-
-    Attributes:
-        launchers: of a folder, where its runs are done.
-        where: the same, in words.
-        command: the command that asked for it.
-        deadline: when the search begins no further run, by `time.monotonic`.
-        with_page: draw figures and write pages.
-    """
-
-    launchers: Callable[[Path], Launchers]
-    where: str
-    command: str
-    deadline: float
-    with_page: bool
-
-
 def drive(console: Console, place: OpenTuning, how: How) -> int:
     """Search, run the best again, and say what came of it; the exit code."""
     with place.queue:
-        print_opened(console, place, how.where)
+        print_opened(console, place, how.place(place.root).words)
         _search(console, place, how)
     print_search(console, place)
     try:
@@ -84,7 +64,7 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
     if queue.is_done:
         return
     progress = TuningProgress(console, queue.n_trials, ended, is_cost=tuning.is_cost)
-    with progress, how.launchers(place.root)() as launcher:
+    with progress, how.place(place.root).launchers() as launcher:
         Search(
             tuning,
             place.root,
@@ -105,7 +85,7 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
     if not candidates:
         if tuning.retest:
             say(console, "no settings but the shipped ones were judged to the end: no re-test")
-        write_record(place, None, how.command, None)
+        _write_down(console, place, how, None)
         return 0
     root = place.root / FOLDER
     lost = partial(_give_way, console, root)
@@ -118,12 +98,27 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
         else:
             n_trials = place.queue.n_trials
             path = write_winner(tuning, place.root, outcome, winner.entry, n_trials)
-        write_record(place, outcome, how.command, None if path is None else WINNER)
-    print_outcome(console, place, outcome)
+        print_outcome(console, place, outcome)
+        _write_down(console, place, how, outcome)
     if winner is not None and path is not None:
         print_winner(console, outcome, path, _use(place, path))
         print_entry(console, winner.entry, place.suggestions.shipped)
     return code
+
+
+def _write_down(console: Console, place: OpenTuning, how: How, outcome: Outcome | None) -> None:
+    """Write the record, and the page of it."""
+    is_won = outcome is not None and outcome.winner is not None
+    record = write_record(place, outcome, how.command, WINNER if is_won else None)
+    files = [place.root / RECORD]
+    if how.with_page:
+        with doing(console, "writing the page"):
+            from report.tuning_page import write_tuning_page
+
+            page, retest = place.root / "report.html", f"{FOLDER}/report.html"
+            write_tuning_page(record, page, retest if (place.root / retest).exists() else "")
+            files.append(page)
+    say(console, f"files: {', '.join(map(str, files))}")
 
 
 def _use(place: OpenTuning, path: Path) -> str:
@@ -151,7 +146,8 @@ def _retested(
     root = place.root / FOLDER
     study = retest_study(place.tuning, place.root, candidates)
     planned = plan(study, root)
-    failures = do_missing(console, planned, root, how.launchers(root), how.where)
+    how.place(root).get_ready(planned)
+    failures = do_missing(console, planned, root, how.place(root))
     results = read(console, study, planned, root)
     code = conclude(console, results, failures, how.command, with_page=how.with_page)
     with doing(console, "judging the winner") as activity:

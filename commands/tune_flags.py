@@ -6,7 +6,6 @@ import argparse
 
 from commands.flag_values import (
     COUNT,
-    JOBS,
     RUN_MEMORY,
     RUN_TIMEOUT,
     filled,
@@ -14,6 +13,7 @@ from commands.flag_values import (
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, program_name
+from commands.places import add_place_flags
 from tuning.pruning import PRUNERS
 from tuning.tuning_spec import FIGURES, OBJECTIVES, SAMPLERS
 
@@ -129,7 +129,8 @@ def _add_retest_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_run_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("runs").add_argument
+    group = parser.add_argument_group("runs")
+    add = group.add_argument
     add("-n", "--n-timesteps", type=COUNT, metavar="N", help="environment steps of each run")
     add("--n-episodes", type=COUNT, metavar="N", help="episodes instead of steps")
     add(
@@ -144,14 +145,7 @@ def _add_run_flags(parser: argparse.ArgumentParser) -> None:
     add("--gym-packages", nargs="+", type=filled, default=[], metavar="MODULE", help=MODULES_HELP)
     add("--eval-freq", type=COUNT, metavar="N", help="steps between two evaluations")
     add("--eval-episodes", type=COUNT, metavar="N", help="episodes of each that is sampled (20)")
-    add(
-        *("-j", "--jobs", "--n-jobs"),
-        dest="jobs",
-        type=JOBS,
-        default=0,
-        metavar="N",
-        help="runs at once (default: all cores)",
-    )
+    add_place_flags(group)
     add("--run-timeout", type=RUN_TIMEOUT, metavar="TIME", help="end a run after, say, 10m")
     add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes, say, 4GB")
 

@@ -71,7 +71,7 @@ def print_outcome(console: Console, place: OpenTuning, outcome: Outcome) -> None
         say(
             console,
             "optimism of the search, its best there less the same on other seeds: "
-            f"{outcome.optimism:+.4g}",
+            f"{round(outcome.optimism, 9):+.4g}",
         )
     if outcome.winner is None:
         say(console, f"no winner: {outcome.reason}; they stay as they are")

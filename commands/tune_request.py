@@ -15,6 +15,7 @@ from pipeline.errors import UserError, unknown
 from pipeline.run_files import environment_name
 from pipeline.settings.literals import parse_assignments
 from pipeline.user_modules import import_typed
+from tuning.trial_storage import kind_of
 from tuning.tuning_spec import AUTO, SHIPPED, TuningSpec
 
 NEEDED = {"optuna": "tune", "cmaes": "tune"}
@@ -65,6 +66,8 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
         first_retest_seed=args.first_retest_seed,
     )
     tuning.check()
+    if args.storage is not None:
+        kind_of(args.storage)
     return tuning
 
 

@@ -8,7 +8,6 @@ from typing import Any
 import yaml
 
 from pipeline.json_text import plain
-from pipeline.run_files import environment_name
 from pipeline.settings.hyperparam_entries import seeds_tuned_on
 from pipeline.settings.tuned_seeds import KEY as TUNED_ON
 from tuning.tuning_spec import TuningSpec
@@ -47,10 +46,24 @@ def _joined(ranges: Sequence[range]) -> list[range]:
     return joined
 
 
+class _Dumper(yaml.SafeDumper):
+    """Writes a setting a line; lists of plain values, and seeds, in one."""
+
+
+def _list(dumper: yaml.SafeDumper, items: list[Any]) -> yaml.Node:
+    are_plain = not any(isinstance(item, list | dict) for item in items)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=are_plain)
+
+
+def _mapping(dumper: yaml.SafeDumper, items: dict[str, Any]) -> yaml.Node:
+    return dumper.represent_mapping(
+        "tag:yaml.org,2002:map", items, flow_style=items.keys() == {"first", "count"}
+    )
+
+
+_Dumper.add_representer(list, _list)
+_Dumper.add_representer(dict, _mapping)
+
+
 def _yaml(data: Mapping[str, Any]) -> str:
-    return str(yaml.safe_dump(data, sort_keys=False, allow_unicode=True, default_flow_style=None))
-
-
-def file_stem(tuning: TuningSpec) -> str:
-    """What a tuning is called, where nobody says."""
-    return f"{environment_name(tuning.environment.env_id)}_{tuning.agent.algo}"
+    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True))

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents import ALGORITHMS
-from experiments.planned_runs import PlannedRun
-from experiments.study_plan import check_settings, plan
+from experiments.study_plan import check_settings
 from pipeline.errors import UserError
 from tuning.judging import judged
 from tuning.pruning import is_hopeless
@@ -19,6 +18,7 @@ from tuning.search_spaces import read_search_space
 from tuning.study_opening import open_study
 from tuning.suggesting import Suggestions
 from tuning.trial_queue import FIGURES, TrialQueue, turn
+from tuning.trial_runs import shipped_run
 from tuning.trial_storage import open_storage
 from tuning.tuning_spec import AUTO, TuningSpec
 
@@ -58,18 +58,6 @@ class OpenTuning:
         return is_hopeless(scores, list(others.values()), self.tuning.pruner, value)
 
 
-def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
-    """A run of the agent as it is without the search.
-
-    Raises:
-        UserError: if it cannot be trained so.
-    """
-    study = replace(tuning.study, n_seeds=1)
-    planned = plan(study, root)
-    check_settings(study, planned)
-    return planned[0]
-
-
 def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:
     """Check what is asked for, and open what keeps its trials.
 
@@ -82,6 +70,7 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
         UserError: if it cannot be done so, or is not what was begun under this name.
     """
     run = shipped_run(tuning, root)
+    check_settings(tuning.study, [run])
     if tuning.figure == AUTO:
         is_bandit = ALGORITHMS[tuning.agent.algo].for_bandits
         tuning = replace(tuning, figure="regret" if is_bandit else "score")

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.files import write_json
+from pipeline.json_text import plain
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome
 from tuning.trial_queue import FAILURE, FIGURES, SECONDS, SETTINGS
@@ -20,8 +19,8 @@ FILE = "tuning.json"
 
 def write_record(
     place: OpenTuning, outcome: Outcome | None, command: str, winner_file: str | None
-) -> Path:
-    """Write what there is; its file.
+) -> dict[str, Any]:
+    """Write what there is; and return it.
 
     Args:
         place: the tuning.
@@ -29,8 +28,8 @@ def write_record(
         command: the command that asked for it.
         winner_file: the file with the winner's settings, None without one.
     """
-    tuning, path = place.tuning, place.root / FILE
-    data = {
+    tuning = place.tuning
+    data: dict[str, Any] = {
         "name": tuning.study.name,
         "command": command,
         "asked": place.study.user_attrs.get("asked"),
@@ -44,8 +43,9 @@ def write_record(
         "trials": [_trial(trial) for trial in place.queue.trials()],
         "retest": None if outcome is None else _outcome(outcome, winner_file),
     }
-    write_json(path, data)
-    return path
+    data = plain(data)
+    write_json(place.root / FILE, data)
+    return data
 
 
 def _trial(trial: FrozenTrial) -> dict[str, Any]:
@@ -73,8 +73,3 @@ def _outcome(outcome: Outcome, winner_file: str | None) -> dict[str, Any]:
         "reason": outcome.reason,
         "optimism": outcome.optimism,
     }
-
-
-def n_runs(trials: Sequence[Mapping[str, Any]]) -> int:
-    """How many runs trials of a record have judged."""
-    return sum(len(trial["figures"]) for trial in trials)

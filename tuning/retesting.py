@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
 FOLDER = "retest"
+ROUNDING = 1e-9  # two that are the same but for this are the same
 
 
 @dataclass(frozen=True)
@@ -244,6 +245,7 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     best = max(there, key=lambda each: sign * (each.held_out or 0.0))
     if shipped.held_out is None:
         return None, "the shipped settings did not run"
-    if best.verdict == "worse" or sign * ((best.held_out or 0.0) - shipped.held_out) <= 0:
+    apart = sign * ((best.held_out or 0.0) - shipped.held_out)
+    if best.verdict == "worse" or apart <= ROUNDING * abs(shipped.held_out):
         return None, "none is better than the shipped settings on other seeds"
     return best, ""

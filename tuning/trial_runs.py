@@ -21,6 +21,15 @@ def name_of(entry: Mapping[str, Any]) -> str:
     return f"settings-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 
+def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
+    """A run of the agent as it is without the search.
+
+    Raises:
+        UserError: if it cannot be trained so.
+    """
+    return plan(replace(tuning.study, n_seeds=1), root)[0]
+
+
 def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
     """One run of a trial.
 

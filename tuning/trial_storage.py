@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
 from pipeline.errors import UserError, one_line, shown
@@ -34,23 +34,48 @@ def open_storage(root: Path, given: str | None) -> BaseStorage:
         UserError: if it cannot be opened.
     """
     if given is None:
-        return _database(f"sqlite:///{root / OWN_FILE}")
-    scheme = _SCHEME.match(given)
+        return _own_file(root / OWN_FILE)
     try:
-        if scheme is None:
-            return _journal(Path(given.removeprefix(_JOURNAL)))
-        if scheme[0].lower() == _GRPC:
-            return _proxy(given)
-        if scheme[0].partition("+")[0].lower() not in _DATABASES:
-            raise UserError(f"--storage: {shown(without_secret(given))} is none: {KNOWN}")
-        return _database(given)
+        match kind_of(given):
+            case "journal":
+                return _journal(Path(given.removeprefix(_JOURNAL)))
+            case "proxy":
+                return _proxy(given)
+            case "database":
+                return _database(given)
     except ImportError as error:
-        raise UserError(f"--storage: {one_line(error)}: it has to be installed") from error
+        lacking = one_line(error).partition(".")[0]
+        raise UserError(f"--storage {without_secret(given)}: {lacking}: install one") from error
+
+
+def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
+    """What a storage is by its name.
+
+    Raises:
+        UserError: if it is none.
+    """
+    scheme = _SCHEME.match(given)
+    if scheme is None:
+        return "journal"
+    name = scheme[0].partition("+")[0].lower()
+    if name not in (*_DATABASES, _GRPC):
+        raise UserError(f"--storage: {shown(without_secret(given))} is none: {KNOWN}")
+    return "proxy" if name == _GRPC else "database"
 
 
 def without_secret(text: str) -> str:
     """The text with the password of each address in it left out."""
     return _SECRET.sub(r"\1:***@", text)
+
+
+def _own_file(path: Path) -> BaseStorage:
+    """A SQLite file. In an address, some signs of its path would mean something else."""
+    import sqlite3
+
+    def connect() -> sqlite3.Connection:
+        return sqlite3.connect(path, timeout=SECONDS_TO_WAIT, check_same_thread=False)
+
+    return _opened(f"sqlite:///{OWN_FILE}", {"creator": connect}, str(path))
 
 
 def _journal(path: Path) -> BaseStorage:
@@ -72,16 +97,20 @@ def _proxy(url: str) -> BaseStorage:
 
 
 def _database(url: str) -> BaseStorage:
-    from optuna.exceptions import StorageInternalError
-    from optuna.storages import RDBStorage
-    from sqlalchemy.exc import ArgumentError, SQLAlchemyError
-
     options = {}
     if url.startswith("sqlite"):
         options = {"connect_args": {"timeout": SECONDS_TO_WAIT}}
+    # Optuna fills braces in.
+    return _opened(url.replace("{", "{{").replace("}", "}}"), options, without_secret(url))
+
+
+def _opened(url: str, options: dict[str, Any], name: str) -> BaseStorage:
+    from optuna.exceptions import StorageInternalError
+    from optuna.storages import RDBStorage
+    from sqlalchemy.exc import SQLAlchemyError
+
     try:
-        # Optuna fills braces in.
-        return RDBStorage(url.replace("{", "{{").replace("}", "}}"), engine_kwargs=options)
-    except (SQLAlchemyError, StorageInternalError, ArgumentError, RuntimeError) as error:
+        return RDBStorage(url, engine_kwargs=options)
+    except (SQLAlchemyError, StorageInternalError, RuntimeError) as error:
         reason = without_secret(one_line(error).partition("(Background on")[0].strip())
-        raise UserError(f"--storage {without_secret(url)}: cannot be opened: {reason}") from error
+        raise UserError(f"--storage {name}: cannot be opened: {reason}") from error

@@ -1,0 +1,126 @@
+"""Searches over a toy: what is tried and ended, and what becomes of it after a kill."""
+
+import math
+
+import numpy as np
+import pytest
+
+from pipeline.errors import UserError
+from tuning.trial_queue import FAILURE, FIGURES, SETTINGS
+
+
+def test_each_trial_is_the_mean_of_its_seeds_and_the_first_has_the_shipped_settings(
+    toy, tmp_path, monkeypatch
+):
+    place = toy.opened(toy.tuning(), tmp_path)
+    launcher = toy.search(place, toy.Launcher())
+    assert len(launcher.done) == 30
+    for trial in place.queue.trials():
+        entry = trial.user_attrs[SETTINGS]
+        assert trial.value == pytest.approx(np.mean([toy.score(entry, seed) for seed in range(3)]))
+        assert set(trial.user_attrs[FIGURES]) == {"0", "1", "2"}
+    assert place.queue.trials()[0].user_attrs[SETTINGS] == toy.shipped
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "random", "cmaes"])
+@pytest.mark.parametrize("stops_after", [1, 14, 29])
+def test_what_was_broken_off_goes_on_to_the_same_trials(toy, tmp_path, sampler, stops_after):
+    tuning = toy.tuning(sampler=sampler)
+    whole = toy.opened(tuning, tmp_path / "whole")
+    toy.search(whole, toy.Launcher())
+    first = toy.opened(tuning, tmp_path / "broken")
+    toy.search(first, toy.Launcher(stops_after=stops_after))
+    assert "RUNNING" not in toy.states(first)
+    again = toy.opened(tuning, tmp_path / "broken")
+    rest = toy.search(again, toy.Launcher())
+    assert toy.states(again) == ["COMPLETE"] * 10
+    assert toy.params(again) == toy.params(whole)
+    assert len(rest.done) == 30 - stops_after
+
+
+def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path):
+    place = toy.opened(toy.tuning(pruner="median", n_trials=20, n_seeds=5), tmp_path)
+    launcher = toy.search(place, toy.Launcher())
+    ended = [trial for trial in place.queue.trials() if trial.state.name == "PRUNED"]
+    assert ended
+    assert all(len(trial.user_attrs[FIGURES]) < 5 for trial in ended)
+    assert len(launcher.done) == sum(len(t.user_attrs[FIGURES]) for t in place.queue.trials())
+
+
+def test_a_cost_is_made_small(toy, tmp_path):
+    place = toy.opened(toy.tuning(figure="steps"), tmp_path)
+    toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
+    assert place.study.best_value == min(trial.value for trial in place.queue.trials())
+
+
+def test_seeds_go_side_by_side_where_trials_are_few(toy, tmp_path):
+    place = toy.opened(toy.tuning(n_trials=1), tmp_path)
+    waiting = []
+
+    class Slow(toy.Launcher):
+        def submit(self, planned):
+            waiting.append(planned.seed)
+            return super().submit(planned)
+
+    toy.search(place, Slow(n_workers=3))
+    assert sorted(waiting) == [0, 1, 2]
+    assert toy.states(place) == ["COMPLETE"]
+
+
+def test_a_setting_that_fails_is_one_of_the_worst_and_the_search_goes_on(toy, tmp_path):
+    place = toy.opened(toy.tuning(), tmp_path)
+
+    class Fragile(toy.Launcher):
+        def submit(self, planned):
+            self.failing = {0, 1, 2} if planned.entry["gamma"] > 0.9 else ()
+            return super().submit(planned)
+
+    toy.search(place, Fragile())
+    for trial in place.queue.trials():
+        fails = trial.user_attrs[SETTINGS]["gamma"] > 0.9
+        assert trial.state.name == ("PRUNED" if fails else "COMPLETE")
+        assert (FAILURE in trial.user_attrs) == fails
+
+
+def test_where_nothing_but_failures_comes_of_it_the_search_ends_and_says_why(
+    toy, tmp_path, monkeypatch
+):
+    place = toy.opened(toy.tuning(), tmp_path)
+    with pytest.raises(UserError, match=r"all of the first 5 trials failed; seed \d: it broke"):
+        toy.search(place, toy.Launcher(failing={0, 1, 2}))
+
+
+def test_after_the_time_no_run_is_begun(toy, tmp_path):
+    place = toy.opened(toy.tuning(), tmp_path)
+    launcher = toy.search(place, toy.Launcher(), deadline=-math.inf)
+    assert not launcher.done
+    assert toy.states(place) == ["WAITING"] * 10
+
+
+def test_a_grid_goes_through_every_point_once(toy, tmp_path):
+    place = toy.opened(toy.tuning(sampler="grid", n_trials=12), tmp_path)
+    toy.search(place, toy.Launcher())
+    tried = {(p["learning_rate"], p["gamma"]) for p in toy.params(place)[1:]}
+    assert len(toy.params(place)) == 10  # three values of each, and what was shipped
+    assert len(tried) == 9
+    assert {gamma for _, gamma in tried} == {0.5, 0.75, 1.0}
+
+
+def test_a_grid_that_does_not_fit_is_refused(toy, tmp_path):
+    with pytest.raises(UserError, match="4 settings with two values of each number"):
+        toy.opened(toy.tuning(sampler="grid", n_trials=4), tmp_path)
+
+
+def test_what_the_user_fixes_is_not_searched(toy, tmp_path):
+    place = toy.opened(toy.tuning(settings={"gamma": 0.9}), tmp_path)
+    toy.search(place, toy.Launcher())
+    assert place.suggestions.n_free == 1
+    assert {p["gamma"] for p in toy.params(place)} == {0.9}
+    assert len({p["learning_rate"] for p in toy.params(place)}) == 10
+
+
+def test_another_search_under_the_same_name_is_refused(toy, tmp_path):
+    toy.opened(toy.tuning(), tmp_path)
+    toy.opened(toy.tuning(n_trials=20, retest=0), tmp_path)
+    with pytest.raises(UserError, match=r"toy: the tuning there is another .*objective: 'mean'"):
+        toy.opened(toy.tuning(objective="lower"), tmp_path)
