@@ -26,7 +26,8 @@ import numpy as np
 import pandas as pd
 
 from experiments.analysis import analyse
-from experiments.study_results import CURVE_COLUMNS, RUN_COLUMNS, StudyResults
+from experiments.run_curves import CURVE_COLUMNS
+from experiments.study_results import RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from report.figures.figure_files import write_figures
 from report.page import write_report

@@ -138,8 +138,9 @@ def best_actions(
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
 
-    if _is_table_alone(agent):  # sooner looked up than asked for: this is most of an evaluation
-        return agent.policy.allowed_values(observations).argmax(axis=1)
+    table = _table_alone(agent)
+    if table is not None:  # sooner looked up than asked for, which is most of an evaluation
+        return np.asarray(table.allowed_values(observations).argmax(axis=1))
 
     def predicted(observations: NDArray[Any], **told: Any) -> NDArray[Any]:
         return np.asarray(agent.predict(observations, deterministic=True, **told)[0])
@@ -147,14 +148,11 @@ def best_actions(
     return _in_parts(agent, observations, masks, predicted).astype(np.int64)
 
 
-def _is_table_alone(agent: BaseAlgorithm) -> bool:
-    """Whether the agent does what its table says is best, as `predict` would tell."""
-    return (
-        isinstance(agent, TabularAlgorithm)
-        and type(agent.policy) is QTablePolicy
-        and type(agent).predict is TabularAlgorithm.predict
-        and not takes_masks(agent)
-    )
+def _table_alone(agent: BaseAlgorithm) -> QTablePolicy | None:
+    """The agent's table, where what it says is best is what `predict` would tell."""
+    is_ours = isinstance(agent, TabularAlgorithm) and type(agent.policy) is QTablePolicy
+    is_as_it_was = type(agent).predict is TabularAlgorithm.predict
+    return agent.policy if is_ours and is_as_it_was and not takes_masks(agent) else None
 
 
 def _in_parts(

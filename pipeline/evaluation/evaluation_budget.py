@@ -15,12 +15,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.train_spec import TrainSpec
 
-# Steps of evaluation for one of training: by a network, which learns for longer than it plays; by
-# one that learns on compiled code, which evaluation has not; and by a table, likewise.
-SHARE_OF_NETWORKS = 1 / 4
-SHARE_OF_COMPILED_NETWORKS = 1 / 16
-SHARE_OF_TABLES = 1 / 100
-# Of short trainings; tenths of a second in most environments.
+# Steps of evaluation for one of training, so that they take a fifth of its time or less: by a
+# network, which learns for longer than it plays, and by a table; and the same where training runs
+# on compiled code, which evaluation does not. Figures: `benchmarks/evaluation_share.py`.
+SHARES = {"network": 1 / 4, "table": 1 / 100}
+SHARES_COMPILED = {"network": 1 / 32, "table": 1 / 2500}
+# Of short trainings; half a second in most environments.
 STEPS_IN_ANY_CASE = 10_000
 # The final evaluation has the rest.
 PART_DURING_TRAINING = 1 / 2
@@ -110,10 +110,9 @@ class SampledEvaluator:
 
 def share_of(model: BaseAlgorithm) -> float:
     """Steps of evaluation for one of the model's training."""
-    if not is_network(model):
-        return SHARE_OF_TABLES
     is_compiled = getattr(model, "engine_in_use", "").startswith("compiled")
-    return SHARE_OF_COMPILED_NETWORKS if is_compiled else SHARE_OF_NETWORKS
+    shares = SHARES_COMPILED if is_compiled else SHARES
+    return shares["network" if is_network(model) else "table"]
 
 
 def allowed_steps(n_trained: float, share: float) -> float:
