@@ -181,7 +181,8 @@ def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) ->
             zorder=3,
         )
         still = (moves[actions] == 0).all(axis=1)
-        _draw_rings(axes, columns[still], rows[still] - lift, weight * width, strength)
+        if still.any():
+            _draw_rings(axes, columns[still], rows[still] - lift, weight * width, strength)
 
 
 def _draw_rings(axes: Axes, columns: Ints, rows: Ints, width: float, strength: float) -> None:
