@@ -150,8 +150,9 @@ def draw_marks(axes: Axes, policy: Policy, cell: float) -> None:
 def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) -> None:
     """An arrow for each action, dark where the policy comes to from the start.
 
-    A single action has its arrow in the middle of the cell, several set out from there; both are
-    shorter, and higher up, where a number stands below. ``width`` is a share of the cell.
+    One that stays has a ring. A single action has its arrow in the middle of the cell, several set
+    out from there; both are shorter, and higher up, where a number stands below. ``width`` is a
+    share of the cell.
     """
     moves = np.array(policy.layout.moves)
     lift, reach = (0.1, 0.25) if with_numbers else (0.0, 0.33)
@@ -179,6 +180,20 @@ def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) ->
             alpha=strength,
             zorder=3,
         )
+        still = (moves[actions] == 0).all(axis=1)
+        if still.any():
+            _draw_rings(axes, columns[still], rows[still] - lift, weight * width, strength)
+
+
+def _draw_rings(axes: Axes, columns: Ints, rows: Ints, width: float, strength: float) -> None:
+    """A ring for each action that stays where it is; ``width`` is a share of the cell."""
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Annulus
+
+    rings = [Annulus((x, y), 0.12, width) for x, y in zip(columns, rows, strict=True)]
+    axes.add_collection(
+        PatchCollection(rings, facecolor=shade(INK), linewidth=0, alpha=strength, zorder=3)
+    )
 
 
 def draw_numbers(axes: Axes, policy: Policy, font: float, decimals: int) -> None:

@@ -17,6 +17,8 @@ from gymnasium.utils import env_checker
 from gymnasium.utils.seeding import np_random
 
 import envs  # noqa: F401
+from envs import TEXTBOOK as TEXTBOOK_IDS
+from envs.finite_env import FiniteEnv
 from envs.grid import GridWorld
 from mdp.transition_model import TransitionModel
 
@@ -44,13 +46,19 @@ BANDITS: list[tuple[str, dict[str, Any]]] = [
     ("SegmentBandit-v0", {"batch_size": 7, "pulls": 25}),
     ("ReplayBandit-v0", {"log": LOG}),
 ]
+TEXTBOOK: list[tuple[str, dict[str, Any]]] = [
+    ("WindyGridworld-v0", {"moves": "king_and_stay", "stochastic": True}),
+    ("DynaMaze-v0", {"maze": "shortcut", "changed": True, "change_after_steps": 50}),
+    ("DeepSea-v0", {"deterministic": False}),
+]
 # An environment that has no variants here yet is held to its contract as it is.
 for spec in list(gym.registry.values()):
     is_new = spec.id not in {env_id for env_id, _ in GRID_WORLDS + BANDITS}
     if is_new and str(spec.entry_point).startswith("envs."):
         kind = GRID_WORLDS if isinstance(gym.make(spec.id).unwrapped, GridWorld) else BANDITS
         kind.append((spec.id, {}))
-VARIANTS = GRID_WORLDS + BANDITS
+VARIANTS = GRID_WORLDS + BANDITS + TEXTBOOK
+FINITE = [env_id for env_id in TEXTBOOK_IDS if env_id not in {"DynaMaze-v0", "Racetrack-v0"}]
 # The first variant of each id.
 SIMPLEST = dict(reversed(VARIANTS))
 HEADINGS = [
@@ -216,6 +224,34 @@ def test_p_and_the_arrays_say_the_same(env_id: str, kwargs: dict[str, Any]) -> N
     assert type(env.P[0][0][0][1]) is int
     assert type(env.P[0][0][0][3]) is bool
     assert arrays.n_outcomes == (3 if len(env.dynamics.outcome_prob) > 1 else 1)
+
+
+@pytest.mark.parametrize("env_id", FINITE)
+def test_p_of_a_finite_environment_is_its_model(env_id: str) -> None:
+    env = gym.make(env_id).unwrapped
+    assert isinstance(env, FiniteEnv)
+    model = env.transition_model()
+    assert len(env.P) == model.n_states
+    for state in range(0, model.n_states, 1 + model.n_states // 20):
+        listed = (list(zip(*outcomes, strict=True)) for outcomes in env.P[state].values())
+        for action, (prob, next_state, reward, terminated) in enumerate(listed):
+            assert np.array_equal(prob, model.prob[state, action])
+            assert np.array_equal(next_state, model.next_state[state, action])
+            assert np.array_equal(reward, model.reward[state, action])
+            assert np.array_equal(terminated, model.terminated[state, action])
+    assert np.array_equal(env.initial_state_distrib, model.initial)
+    kinds = [type(value) for value in env.P[0][0][0]]
+    assert kinds == [float, int, float, bool]
+
+
+@pytest.mark.parametrize("env_id", FINITE)
+def test_a_finite_environment_refuses_actions_that_do_not_exist(env_id: str) -> None:
+    env = gym.make(env_id).unwrapped
+    env.reset(seed=0)
+    n = env.action_space.n  # type: ignore[attr-defined]
+    for action in (-1, n):
+        with pytest.raises(ValueError, match=f"action {action} does not exist"):
+            env.step(action)
 
 
 @every_grid_world

@@ -129,6 +129,19 @@ def test_observation_wrappers() -> None:
     np.testing.assert_array_equal(one_hot, np.eye(16))
 
 
+def test_what_wrappers_make_of_drawn_rewards() -> None:
+    env: Any = gym.make("MaximizationBias-v0", reward_std=2)
+    scaled = transition_model(ScaleReward(env, 3))
+    assert scaled is not None
+    assert scaled.reward_variance is not None
+    assert scaled.reward_variance[1, 0, 0] == 36
+    replaced = transition_model(TerminationReward(env, -5))
+    assert replaced is not None
+    assert replaced.reward_variance is not None
+    assert not replaced.reward_variance.any()
+    assert transition_model(ClipReward(env, -1, 1)) is None
+
+
 class Anything(gym.Wrapper[Any, Any, Any, Any]):
     """A wrapper of somebody else's."""
 

@@ -17,6 +17,7 @@ WORLDS = {
     "FrozenLake 8x8": ("FrozenLake-v1", {"is_slippery": False, "map_name": "8x8"}),
     "FrozenLake 2x3": ("FrozenLake-v1", {"is_slippery": False, "desc": ["SFH", "FFG"]}),
     "CliffWalking": ("CliffWalking-v1", {}),
+    "DynaMaze": ("envs:DynaMaze-v0", {"maze": "blocking"}),
 }
 
 
@@ -52,6 +53,13 @@ def test_the_cliff():
     assert layout.rows == ("............",) * 3 + ("SXXXXXXXXXXG",)
     assert layout.names == {"X": "cliff"}
     assert layout.moves == (UP, RIGHT, DOWN, LEFT)
+
+
+def test_a_field_with_wind():
+    layout = grid_layout(gym.make("envs:WindyGridworld-v0", moves="king_and_stay"))
+    assert layout.rows[3] == "S......G.."
+    assert layout.n_states == 70
+    assert layout.moves == (UP, DOWN, LEFT, RIGHT, (-1, -1), (-1, 1), (1, -1), (1, 1), (0, 0))
 
 
 def test_the_mine_maze_has_a_layer_for_each_set_of_powers():

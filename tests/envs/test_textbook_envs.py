@@ -298,6 +298,17 @@ def test_corners_of_the_sea_have_noise_where_it_is_rough() -> None:
 # --- what they share -----------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("env_id", LIMITS)
+def test_an_agent_that_plans_reaches_the_optimum(env_id) -> None:
+    env = gym.make(env_id, max_episode_steps=30)
+    model, states = transition_model(env), np.arange(env.observation_space.n)
+    agent = load_algorithm("optimal")(env=env, seed=0)
+    agent.plan()
+    plan = agent.policy.actions_after(states[None], np.arange(30)[:, None])
+    found = policy_return(model, plan, 30).expected_return
+    assert found == pytest.approx(finite_horizon_optimum(model, 30).start_value, abs=1e-9)
+
+
 def sampled_steps(env, state, action, n):
     found = []
     for _ in range(n):
@@ -345,6 +356,25 @@ def test_the_engine_says_whether_it_compiles(env_id, reason) -> None:
     agent._setup_learn(10, None)
     choose_engine(agent, agent._init_callback(None), None)
     assert agent.engine_in_use.removeprefix("interpreted: ") == reason
+
+
+@pytest.mark.parametrize(
+    ("env_id", "kwargs"),
+    [
+        ("GamblersProblem-v0", {"goal": 20}),
+        ("RandomWalk-v0", {"n_states": 300, "max_jump": 30}),
+        ("WindyGridworld-v0", {"moves": "king", "stochastic": True}),
+    ],
+)
+def test_both_engines_end_in_the_same_bits(env_id, kwargs) -> None:
+    tables, states = [], []
+    for engine in ("compiled", "interpreted"):
+        env = gym.make(env_id, **kwargs)
+        agent = load_algorithm("qlearning")(env=env, engine=engine, seed=3).learn(3000)
+        tables.append(agent.policy.q_tables.numpy())
+        states.append(env.unwrapped.s)
+    np.testing.assert_array_equal(tables[0], tables[1])
+    assert states[0] == states[1]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Exact evaluation against closed forms and known figures."""
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -45,6 +46,19 @@ def test_the_geometric_distribution() -> None:
     assert found.return_variance == pytest.approx(9 * 0.8 / 0.04)
     assert found.success_rate is None
     assert found.success_variance is None
+
+
+@pytest.mark.parametrize("horizon", [None, 400])
+def test_drawn_rewards_add_their_own_variance(horizon: int | None) -> None:
+    still = coin(0.2, reward=3)
+    drawn = replace(still, reward_variance=np.full((1, 2, 2), 4.0))
+    for discount in (1.0, 0.9):
+        known = policy_return(still, np.array([0]), horizon, discount)
+        found = policy_return(drawn, np.array([0]), horizon, discount)
+        # Each step is reached with probability 0.8 ** t, and weighs discount ** (2 t).
+        added = 4 / (1 - 0.8 * discount**2)
+        assert found.return_variance == pytest.approx(known.return_variance + added)
+        assert replace(found, return_variance=0.0) == replace(known, return_variance=0.0)
 
 
 def test_the_geometric_distribution_cut_off() -> None:

@@ -96,6 +96,20 @@ def test_wrong_shapes_are_refused(name: str, shape: tuple[int, ...], message: st
         TransitionModel(**{**given, name: given[name].reshape(shape)})
 
 
+def test_variances_of_rewards_are_checked() -> None:
+    given, variance = arrays(), np.ones((2, 2, 2))
+    assert TransitionModel(**given).reward_variance is None
+    kept = TransitionModel(**given, reward_variance=variance).reward_variance
+    assert kept is not None
+    assert not kept.flags.writeable
+    with pytest.raises(ValueError, match=r"reward_variance has shape \(2, 4\), prob has"):
+        TransitionModel(**given, reward_variance=variance.reshape(2, 4))
+    for wrong in (-1.0, np.inf):
+        variance[1, 0, 1] = wrong
+        with pytest.raises(ValueError, match="state 1, action 0 has a variance of the reward"):
+            TransitionModel(**given, reward_variance=variance)
+
+
 def test_rounding_of_probabilities_is_accepted() -> None:
     given = arrays()
     given["prob"][1, 1] = [0.5, 0.5 + 5e-10]

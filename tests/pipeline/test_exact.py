@@ -108,6 +108,13 @@ def test_the_exact_return_is_that_of_the_agents_own_actions(name, deterministic)
     assert played.lengths.mean() == pytest.approx(exact.lengths[0], rel=0.15)
 
 
+def test_a_hidden_natural_is_judged_by_what_the_agent_sees():
+    spec = spec_of("Blackjack-v1", env_wrapper="envs.wrappers.FlattenToDiscrete")
+    exact = exact_evaluator(spec)(agent := briefly_trained("qlearning", spec))
+    played = evaluate(agent, make_evaluation_env(spec, 50), 3000, 5)
+    assert_mean_is(exact.mean_return, exact.std_return, played.returns)
+
+
 @pytest.mark.parametrize("env", ["still Warehouse", "still FrozenLake", "still MineMaze"])
 @pytest.mark.parametrize("name", ["qlearning", "ppo", "a2c", "dqn"])
 def test_where_nothing_is_random_one_episode_says_it_all(name, env):
@@ -185,7 +192,6 @@ def test_networks_on_other_observations(name):
             "FrozenLake-v1",
             {"vec_env_wrapper": "stable_baselines3.common.vec_env.VecMonitor"},
         ),
-        ("Blackjack-v1", {"env_wrapper": "envs.wrappers.FlattenToDiscrete"}),
         # Twenty-two thousand states of as many numbers each are two gigabytes.
         (
             "envs:RandomWarehouse-v0",
@@ -274,3 +280,6 @@ def test_figures_of_the_yardstick():
     assert yardstick.score(-2079.0) == -1.0
     flat = Yardstick(optimum=5.0, baseline=5.0)
     assert (flat.score(5.0), flat.score(4.0)) == (1.0, 0.0)
+    # Sums in another order.
+    nearly = Yardstick(optimum=0.3, baseline=np.nextafter(0.3, 0))
+    assert (nearly.score(np.nextafter(0.3, 0)), nearly.score(0.29)) == (1.0, 0.0)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.collections import PatchCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from PIL import Image
@@ -95,6 +96,17 @@ def test_arrows_show_what_is_done_and_where_the_agent_comes_to(corner, axes):
         (1, 0, -1, 0, 1.0),
         (2, 0, 0, 1, 0.45),
     ]
+
+
+def test_an_action_that_stays_is_a_ring(axes):
+    found = map_of("WindyGridworld-v0", [8] * 70, moves="king_and_stay")
+    draw_arrows(axes, policies_in(found, 0)[0], 0.04, with_numbers=False)
+    rings = [rings for rings in axes.collections if isinstance(rings, PatchCollection)]
+    boxes = [path.get_extents() for drawn in rings for path in drawn.get_paths()]
+    centres = {(round((box.x0 + box.x1) / 2), round((box.y0 + box.y1) / 2)) for box in boxes}
+    # The start and the cells around it, and not the goal.
+    assert {(0, 3), (0, 4), (1, 3)} <= centres
+    assert (7, 3) not in centres
 
 
 def test_several_best_actions_set_out_from_the_middle(axes):

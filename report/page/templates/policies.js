@@ -29,7 +29,8 @@ report.section("policies", (root, _, chosen) => {
     const width = chosen().rows[0].length;
     return `row ${Math.floor(cell / width) + 1}, column ${(cell % width) + 1}`;
   };
-  const word = ([down, right]) => (down ? (down > 0 ? "down" : "up") : right > 0 ? "right" : "left");
+  const word = ([down, right]) =>
+    [["up", "", "down"][down + 1], ["left", "", "right"][right + 1]].filter(Boolean).join(" and ") || "stay";
 
   // The last map of a run that is not later than the slider.
   const current = (run) => {
@@ -69,7 +70,8 @@ report.section("policies", (root, _, chosen) => {
   const arrow = ([down, right], isBest) =>
     element("path", {
       class: isBest ? "arrow" : "arrow wrong",
-      d: "M-.26,0H.24M.08,-.15L.25,0L.08,.15",
+      // To stay is a ring.
+      d: down || right ? "M-.26,0H.24M.08,-.15L.25,0L.08,.15" : "M-.12,0a.12,.12 0 1 0 .24,0a.12,.12 0 1 0 -.24,0",
       transform: `rotate(${(Math.atan2(down, right) * 180) / Math.PI})`,
     });
   const GLYPHS = { G: "★", X: "✕", P: "◆", S: "" };
