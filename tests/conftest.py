@@ -25,7 +25,8 @@ CONFIGURATION = tempfile.TemporaryDirectory(prefix="yardstick-tests-")
 os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
 
 # One server for all tests, whichever needs it first: from one that has imported nothing, as the
-# library starts it, each child would import everything anew.
+# library starts it, each child would import everything anew, and what PyTorch's optimizers import.
+PRELOADED.append("torch._dynamo")
 multiprocessing.set_forkserver_preload(PRELOADED)
 
 # No deadline: the first example of a compiled function pays for its compilation. In CI the examples
