@@ -14,6 +14,4 @@ _parsed = cache(read_yaml)
 @pytest.fixture
 def files_parsed_once(monkeypatch):
     """For tests of every entry of a file: to parse it takes longer than all that is tested."""
-    monkeypatch.setattr(
-        hyperparam_entries, "read_yaml", lambda path: copy.deepcopy(_parsed(path))
-    )
+    monkeypatch.setattr(hyperparam_entries, "read_yaml", lambda path: copy.deepcopy(_parsed(path)))
