@@ -25,7 +25,8 @@ CONFIGURATION = tempfile.TemporaryDirectory(prefix="yardstick-tests-")
 os.environ["XDG_CONFIG_HOME"] = CONFIGURATION.name
 
 # One server for all tests, whichever needs it first: from one that has imported nothing, as the
-# library starts it, each child would import everything anew.
+# library starts it, each child would import everything anew, and what PyTorch's optimizers import.
+PRELOADED.append("torch._dynamo")
 multiprocessing.set_forkserver_preload(PRELOADED)
 
 # No deadline: the first example of a compiled function pays for its compilation. In CI the examples
@@ -143,7 +144,7 @@ def report_study(tmp_path_factory):
     from experiments.study_plan import plan
     from experiments.study_results import read_results
     from pipeline.files import write_text
-    from report.page import write_report
+    from report.page import film_section, write_report
     from report.series.study_series import study_series
 
     study, root = small_study(), tmp_path_factory.mktemp("study")
@@ -156,7 +157,9 @@ def report_study(tmp_path_factory):
     write_text(log, "Traceback:\nValueError: <the> disk & all is full\n")
     analysis = analyse(read_results(study, planned, root))
     page = root / "report.html"
-    write_report(study_series(analysis), page, "python compare.py 'a & b.yml'")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(film_section, "MAX_STEPS", 20)  # longer films take ten seconds to draw
+        write_report(study_series(analysis), page, "python compare.py 'a & b.yml'")
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page
     )

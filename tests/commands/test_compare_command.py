@@ -475,7 +475,7 @@ def spawning(folder, monkeypatch):
 def test_where_nothing_can_be_forked_a_killed_worker_costs_nothing(spawning, folder):
     words = ["--env", "Killed-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
     words += ["--seeds", 1, "-n", 500, "--no-report", "-f", "studies"]
-    code, out, err = finish(*words)
+    code, _, err = finish(*words)
     assert (code, err) == (0, "")
     assert (folder / "mark").exists()
     study = folder / "studies" / "Killed-v0_qlearning"

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+import enjoy
 import train
 from commands import streams
 from commands.parsing import run_command
@@ -53,9 +54,9 @@ def printing(n_lines, ends=0, goes_on=False):
 def run(monkeypatch):
     """Run a command whose output stops being taken; exit code, output, errors."""
 
-    def do(main, number, n_texts=2):
+    def do(main, number, n_texts=2, argv=("/there/train.py",)):
         out, err = Refusing(number, n_texts), io.StringIO()
-        monkeypatch.setattr(sys, "argv", ["/there/train.py"])
+        monkeypatch.setattr(sys, "argv", list(argv))
         monkeypatch.setattr(sys, "stdout", out)
         monkeypatch.setattr(sys, "stderr", err)
         with pytest.raises(SystemExit) as stop:
@@ -164,21 +165,22 @@ def test_streams_that_were_closed_are_opened_on_nothing(monkeypatch):
 
 
 def test_a_training_goes_on_after_its_reader_has_gone_and_playing_ends(
-    tmp_path, left_by_its_reader
+    tmp_path, left_by_its_reader, monkeypatch, run
 ):
     words = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
     line = "qlearning on FrozenLake-v1, seed 0, 500 steps\n"
     assert left_by_its_reader(tmp_path, "train.py", *words) == (line, "", 0)
-    run = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
-    assert json.loads((run / "run.json").read_text())["state"] == "finished"
-    model = run / "FrozenLake-v1.zip"
+    folder = tmp_path / "logs" / "qlearning" / "FrozenLake-v1_1"
+    assert json.loads((folder / "run.json").read_text())["state"] == "finished"
+    model = folder / "FrozenLake-v1.zip"
     for_ever = ["--n-episodes", 10**9, "--render", "none"]
     line, err, code = left_by_its_reader(tmp_path, "enjoy.py", model, *for_ever)
     assert line.startswith("qlearning on FrozenLake-v1")
     assert (err, code) == ("", 0)
     # Where a film is wanted, that is what the work is for.
-    film = ["--n-episodes", 1, "--record", "film.gif", "--reward-log", "returns"]
-    assert left_by_its_reader(tmp_path, "enjoy.py", model, *film)[1:] == ("", 0)
+    monkeypatch.chdir(tmp_path)
+    film = ["--n-episodes", "1", "--record", "film.gif", "--reward-log", "returns"]
+    assert run(enjoy.main, errno.EPIPE, argv=["enjoy.py", str(model), *film])[::2] == (0, "")
     assert (tmp_path / "film.gif").stat().st_size > 0
 
 

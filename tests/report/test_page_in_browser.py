@@ -65,14 +65,21 @@ def browser(tmp_path_factory):
 
 
 @pytest.fixture
-def page(browser, report_study):
-    """The page, freshly loaded in a wide window."""
+def loaded(browser, report_study):
+    """The page, freshly loaded in a wide window; figures are drawn as they come near."""
     resize(browser, 1280)
     browser.get(report_study.page.as_uri())
     with contextlib.suppress(Exception):
         browser.execute_script("localStorage.clear()")
-    wait(browser, lambda: plots(browser) >= 5)
+    wait(browser, lambda: has_scripts(browser))
     return browser
+
+
+@pytest.fixture
+def page(loaded):
+    """The same with all figures drawn."""
+    wait(loaded, lambda: plots(loaded) >= 5)
+    return loaded
 
 
 @pytest.fixture(scope="module")
@@ -109,10 +116,15 @@ def wait(browser, condition):
     WebDriverWait(browser, PATIENCE, 0.1).until(lambda _: condition())
 
 
+def has_scripts(browser):
+    """Whether the page can be used: its scripts are unpacked after it is there."""
+    return browser.execute_script("return typeof report !== 'undefined'")
+
+
 def plots(browser):
     """How many figures are there, those drawn too that nobody has come near yet."""
-    if browser.execute_script("return typeof report === 'undefined'"):
-        return 0  # the scripts are unpacked after the page is there
+    if not has_scripts(browser):
+        return 0
     browser.execute_script("report.drawAll()")
     return browser.execute_script("return document.querySelectorAll('.plot .main-svg').length")
 
@@ -277,31 +289,31 @@ def test_hiding_an_agent_in_the_legend(page):
 
 
 @pytest.mark.parametrize("way", ["click", "keyboard"])
-def test_a_heading_sorts_the_ranking(page, way):
-    ranked = first_column(page)
-    heading = find(page, "#ranking figure:not([hidden]) thead th:nth-child(2)")
+def test_a_heading_sorts_the_ranking(loaded, way):
+    ranked = first_column(loaded)
+    heading = find(loaded, "#ranking figure:not([hidden]) thead th:nth-child(2)")
     button = heading.find_element(By.CSS_SELECTOR, "button")
 
     def press():
         if way == "click":
-            script_click(page, button)
+            script_click(loaded, button)
         else:
             button.send_keys(Keys.ENTER)
 
     assert heading.get_attribute("aria-sort") == "descending"
     press()
     assert heading.get_attribute("aria-sort") == "ascending"
-    assert first_column(page) == ranked[::-1]
+    assert first_column(loaded) == ranked[::-1]
     press()
     assert heading.get_attribute("aria-sort") == "descending"
-    assert first_column(page) == ranked
+    assert first_column(loaded) == ranked
 
 
-def test_names_sort_as_text(page):
-    heading = find(page, "#ranking figure:not([hidden]) thead th")
-    script_click(page, heading.find_element(By.CSS_SELECTOR, "button"))
-    assert [name[0] for name in first_column(page)] == ["<", "Q", "s"]
-    assert len(find_all(page, "#ranking figure:not([hidden]) th[aria-sort]")) == 1
+def test_names_sort_as_text(loaded):
+    heading = find(loaded, "#ranking figure:not([hidden]) thead th")
+    script_click(loaded, heading.find_element(By.CSS_SELECTOR, "button"))
+    assert [name[0] for name in first_column(loaded)] == ["<", "Q", "s"]
+    assert len(find_all(loaded, "#ranking figure:not([hidden]) th[aria-sort]")) == 1
 
 
 def test_the_environment_changes_everywhere(page):
@@ -313,50 +325,50 @@ def test_the_environment_changes_everywhere(page):
     assert len(names) == 3
 
 
-def test_the_slider_moves_the_map_by_keyboard_and_says_where_it_is(page):
-    slider = find(page, "#progress")
-    board = find_all(page, ".board")[1]
+def test_the_slider_moves_the_map_by_keyboard_and_says_where_it_is(loaded):
+    slider = find(loaded, "#progress")
+    board = find_all(loaded, ".board")[1]
     assert slider.get_attribute("aria-valuetext") == "after 2,000 steps"
     last = board.get_attribute("innerHTML")
     slider.send_keys(Keys.HOME)
-    label = find(page, "#policies output").text
+    label = find(loaded, "#policies output").text
     assert label.startswith("after ")
     assert label != "after 2,000 steps"
     assert slider.get_attribute("aria-valuetext") == label
-    first = find_all(page, ".board")[1].get_attribute("innerHTML")
+    first = find_all(loaded, ".board")[1].get_attribute("innerHTML")
     assert first != last
     slider.send_keys(Keys.ARROW_RIGHT)
-    assert find(page, "#policies output").text != label
+    assert find(loaded, "#policies output").text != label
     slider.send_keys(Keys.END)
-    assert find_all(page, ".board")[1].get_attribute("innerHTML") == last
+    assert find_all(loaded, ".board")[1].get_attribute("innerHTML") == last
 
 
-def test_the_map_marks_what_is_not_optimal_and_tells_a_cell(page):
-    boards = find_all(page, ".board")
+def test_the_map_marks_what_is_not_optimal_and_tells_a_cell(loaded):
+    boards = find_all(loaded, ".board")
     assert boards[0].find_elements(By.CSS_SELECTOR, ".differs") == []
     assert boards[0].text.startswith("optimum")
     for board in boards[1:]:
         marked = len(board.find_elements(By.CSS_SELECTOR, ".differs"))
         assert f"{11 - marked} of 11 cells" in board.text
-    page.execute_script(
+    loaded.execute_script(
         "document.querySelector('.board [data-cell=\"14\"]')"
         ".dispatchEvent(new PointerEvent('pointerover', {bubbles: true}))"
     )
-    told = find(page, "#policies .cell").text
+    told = find(loaded, "#policies .cell").text
     assert told.startswith("row 4, column 3: optimum 0.924 (down)")
 
 
-def test_another_seed_has_another_map(page):
-    before = find_all(page, ".board")[1].get_attribute("innerHTML")
-    Select(find(page, "#policies .seed select")).select_by_index(1)
-    assert find_all(page, ".board")[1].get_attribute("innerHTML") != before
+def test_another_seed_has_another_map(loaded):
+    before = find_all(loaded, ".board")[1].get_attribute("innerHTML")
+    Select(find(loaded, "#policies .seed select")).select_by_index(1)
+    assert find_all(loaded, ".board")[1].get_attribute("innerHTML") != before
 
 
-def test_films_play_and_stop(page):
-    screen = find(page, ".films:not([hidden]) .screen")
+def test_films_play_and_stop(loaded):
+    screen = find(loaded, ".films:not([hidden]) .screen")
     picture = screen.find_element(By.CSS_SELECTOR, "img")
     assert picture.get_attribute("src").startswith("data:image/gif")
-    script_click(page, screen)
+    script_click(loaded, screen)
     assert screen.get_attribute("aria-pressed") == "false"
     assert picture.get_attribute("src").startswith("data:image/png")
     screen.send_keys(Keys.ENTER)
@@ -537,24 +549,26 @@ def test_figures_are_drawn_when_they_come_near(browser, report_study):
 # --- for every eye and hand ----------------------------------------------------------------------
 
 
-def test_a_small_figure_chooses_its_environment(page):
-    small = find_all(page, "#overview [data-choose]")
+def test_a_small_figure_chooses_its_environment(loaded):
+    small = find_all(loaded, "#overview [data-choose]")
     assert [one.get_attribute("aria-pressed") for one in small] == ["true", "false"]
-    script_click(page, small[1])
+    script_click(loaded, small[1])
     assert [one.get_attribute("aria-pressed") for one in small] == ["false", "true"]
-    assert Select(find(page, "#environment")).first_selected_option.text == "Warehouse-v0"
-    assert find(page, "#ranking .where:not([hidden])").text == "Warehouse-v0"
+    assert Select(find(loaded, "#environment")).first_selected_option.text == "Warehouse-v0"
+    assert find(loaded, "#ranking .where:not([hidden])").text == "Warehouse-v0"
 
 
-def test_the_arrows_go_from_cell_to_cell(page):
-    board = find_all(page, ".board svg")[1]
+def test_the_arrows_go_from_cell_to_cell(loaded):
+    board = find_all(loaded, ".board svg")[1]
     board.send_keys(Keys.ARROW_RIGHT)
-    assert find(page, "#policies .cell").text.startswith("row 1, column 1: optimum 0.7442 (left)")
+    assert find(loaded, "#policies .cell").text.startswith("row 1, column 1: optimum 0.7442 (left)")
     board.send_keys(Keys.ARROW_DOWN, Keys.ARROW_DOWN, Keys.ARROW_DOWN, Keys.ARROW_DOWN)
     board.send_keys(Keys.ARROW_RIGHT, Keys.ARROW_RIGHT)
-    assert find(page, "#policies .cell").text.startswith("row 4, column 3: optimum 0.924 (down)")
-    assert len(find_all(page, '.board [data-cell="14"] .cursor')) == len(find_all(page, ".board"))
-    assert find(page, "#policies .cell").get_attribute("aria-live") == "polite"
+    assert find(loaded, "#policies .cell").text.startswith("row 4, column 3: optimum 0.924 (down)")
+    assert len(find_all(loaded, '.board [data-cell="14"] .cursor')) == len(
+        find_all(loaded, ".board")
+    )
+    assert find(loaded, "#policies .cell").get_attribute("aria-live") == "polite"
 
 
 def test_a_picture_to_take_along_has_title_legend_and_name(page):
@@ -572,8 +586,8 @@ def test_a_picture_to_take_along_has_title_legend_and_name(page):
     assert "<script" not in picture
 
 
-def test_verdicts_to_take_along_are_those_beside_the_page(page, report_study):
-    saved = page.execute_async_script(
+def test_verdicts_to_take_along_are_those_beside_the_page(loaded, report_study):
+    saved = loaded.execute_async_script(
         """
         const done = arguments[0];
         const files = [];
@@ -592,8 +606,8 @@ def test_verdicts_to_take_along_are_those_beside_the_page(page, report_study):
         assert text == verdicts_as(markup, report_study.analysis, "python compare.py 'a & b.yml'")
 
 
-def test_a_table_to_take_along(page):
-    lines = page.execute_script(
+def test_a_table_to_take_along(loaded):
+    lines = loaded.execute_script(
         "return report.csv(document.querySelector('#ranking table'))"
     ).splitlines()
     assert lines[0].startswith('Agent,"Mean, over seeds",')
@@ -601,14 +615,14 @@ def test_a_table_to_take_along(page):
     assert sorted(line[:5] for line in lines[1:]) == ["</scr", "Q-lea", "sarsa"]
     mean = float(lines[1].split(",")[1])
     assert 0 <= mean <= 1
-    matrix = page.execute_script(
+    matrix = loaded.execute_script(
         "return report.csv(document.querySelector('#comparison .square'))"
     ).splitlines()
     assert matrix[0].startswith("Agent,")
     assert matrix[0].count(",") == 3
     assert len(matrix) == 4
     # A label that a spreadsheet would run.
-    guarded = page.execute_script(
+    guarded = loaded.execute_script(
         """
         const table = document.createElement("table");
         table.innerHTML = "<thead><tr><th>a</th><th>b</th></tr></thead>" +
@@ -702,9 +716,9 @@ def test_ten_agents_fit_on_paper(browser, wide_tables):
     assert max(rights) <= PAPER  # else a browser makes all that is printed smaller
 
 
-def test_no_tick_is_printed_over_another(page):
+def test_no_tick_is_printed_over_another(loaded):
     for low, high, linear in ((-27_427, 79, 79), (-1000, 79, 79), (-3, 1e6, 9)):
-        at = page.execute_script(
+        at = loaded.execute_script(
             "const axis = report.symlog(arguments[2]);"
             "const {tickvals} = axis.ticks(arguments[0], arguments[1]);"
             "return [tickvals.sort((a, b) => a - b), axis.height(arguments[0]),"
