@@ -86,7 +86,7 @@ def transition_model(env: Env) -> TransitionModel | None:
         elif isinstance(wrapper, TerminationReward):
             reward = np.where(model.terminated, wrapper.last_reward, reward)
         elif isinstance(wrapper, ClipReward):
-            reward = np.asarray(wrapper.func(reward), dtype=np.float64)  # type: ignore[arg-type]
+            reward = np.asarray(wrapper.func(reward), dtype=np.float64)
     return model if reward is model.reward else replace(model, reward=reward)
 
 
