@@ -42,6 +42,10 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         """Steps that are learnt from at once; None for all of a rollout."""
         return getattr(self, "batch_size", None)
 
+    @property
+    def is_within_rollout(self) -> bool:
+        return self.collected > 0
+
     def _check_compilable(self) -> None:
         check_policy_agent(self)
         check_optimizer(self.policy.optimizer)

@@ -42,6 +42,8 @@ TRAININGS = (
     ("Pendulum-v1", "ars", 20_000, "n_delta:4 n_top:2"),
     ("CartPole-v1", "ppo_lstm", 2000, SMALL),
     ("Warehouse-v0", "ppo_mask", 3000, SMALL),
+    ("FrozenLake-v1", "ppo", 300_000, f"{SMALL} engine:compiled"),
+    ("FrozenLake-v1", "dqn", 200_000, f"{EAGER} n_steps:3 engine:compiled"),
     ("BernoulliBandit-v0", "thompson", 20_000, ""),
     ("LinearBandit-v0", "linucb", 10_000, ""),
     ("BernoulliBandit-v0", "mabwiser_ucb1", 3000, ""),

@@ -30,6 +30,8 @@ class NumberWatch(BlockCallback):
     are finite.
     """
 
+    takes_blocks = True
+
     def update_locals(self, locals_: dict[str, Any]) -> None:
         """Take what the training loop shows, without a copy: this is called at each step."""
         self.locals = locals_

@@ -14,11 +14,23 @@ from agents import ALGORITHMS
 from pipeline.settings.hyperparams import Hyperparams
 from pipeline.train_spec import TrainSpec
 
-# Agents whose random numbers are all their own.
+# Agents whose random numbers are all their own, or drawn after they have been seeded.
 FAMILIES = frozenset({"tabular"})
-HOMES = ("envs.", "gymnasium.envs.")
+# Those of the library, once they train on compiled code: weights are drawn after that too. In the
+# library's own loop they take too long to gain anything.
+NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})
 
-# What such a run may ask for: nothing that names code, and nothing that wraps environments.
+HOMES = ("envs.", "gymnasium.envs.")
+# Around the environments of a training: they hold nothing but numbers.
+WRAPPERS = frozenset(
+    {
+        "envs.wrappers.ScaleReward",
+        "envs.wrappers.TerminationReward",
+        "gymnasium.wrappers.ClipReward",
+    }
+)
+
+# What such a run may ask for besides: nothing that names code.
 _SETTINGS = (
     "algorithm",
     "n_timesteps",
@@ -27,18 +39,29 @@ _SETTINGS = (
     "env_kwargs",
     "train_env_kwargs",
     "eval_env_kwargs",
+    "train_env_wrapper",
 )
 
 
 def is_plain(spec: TrainSpec) -> bool:
     """Whether a run is such a one."""
-    if spec.algo not in ALGORITHMS or ALGORITHMS[spec.algo].family not in FAMILIES:
+    if not _is_known_agent(spec) or not _is_known_wrapping(spec):
         return False
     if spec.gym_packages or spec.user_modules or spec.tensorboard_log or spec.trained_agent:
         return False
     special, untouched = spec.hyperparams, Hyperparams()
     rest = replace(special, **{name: getattr(untouched, name) for name in _SETTINGS})
     return spec.vec_env == "dummy" and rest == untouched and is_known_environment(spec.env_id)
+
+
+def _is_known_agent(spec: TrainSpec) -> bool:
+    if spec.algo in NETWORKS:
+        return bool(spec.hyperparams.algorithm.get("engine") == "compiled")
+    return spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].family in FAMILIES
+
+
+def _is_known_wrapping(spec: TrainSpec) -> bool:
+    return {wrapper.name for wrapper in spec.hyperparams.train_env_wrapper} <= WRAPPERS
 
 
 def is_known_environment(env_id: str) -> bool:

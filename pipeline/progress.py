@@ -47,6 +47,8 @@ class ProgressDisplay(BlockCallback):
         on_variant: whether returns of training are not to be held against those of evaluation.
     """
 
+    takes_blocks = True
+
     def __init__(self, console: Console, live: bool, on_variant: bool = False) -> None:
         super().__init__()
         self.console = console

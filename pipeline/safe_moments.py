@@ -13,6 +13,8 @@ class StopAtSafeMoment(BlockCallback):
     learnt from, and what it is about to see has not happened yet.
     """
 
+    takes_blocks = True
+
     def _on_rollout_start(self) -> None:
         self.stop_if_asked()
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -52,12 +52,15 @@ class BlockCallback(BaseCallback):
             environments since ``num_timesteps`` was 0; where several environments step at once, it
             is called after the step that reaches a multiple or passes it. ``n_calls`` goes on
             counting all steps. None for what `horizon` says.
+        takes_blocks: whether ``_on_rollout_start`` and ``_on_rollout_end`` may be called around
+            each block of steps that compiled networks train for. Else blocks end with rollouts.
 
     Raises:
         ValueError: at the start of the training, if ``every_n_steps`` is no number from 1 on.
     """
 
     every_n_steps: int | None = None
+    takes_blocks: ClassVar[bool] = False
 
     def init_callback(self, model: BaseAlgorithm) -> None:
         """Take note of the model."""
@@ -179,6 +182,15 @@ def horizon(callback: BaseCallback) -> Horizon:
         min((h.calls for h in horizons), default=NEVER),
         min((h.episodes for h in horizons), default=NEVER),
     )
+
+
+def heeds_rollouts(callback: BaseCallback) -> bool:
+    """Whether it acts where a rollout begins or ends, and cannot take blocks of steps for them."""
+    kind = type(callback)
+    if kind is CallbackList or getattr(kind, "takes_blocks", False):
+        return False
+    names = ("_on_rollout_start", "_on_rollout_end")
+    return any(getattr(kind, name) is not getattr(BaseCallback, name) for name in names)
 
 
 def wants_position(callback: BaseCallback) -> bool:

@@ -1,7 +1,9 @@
 """Activation functions in single precision, and their derivatives.
 
-All of these have a derivative that can be told from the output alone, so that inputs need not be
-kept.
+Those of most can be told from the output alone. Of the others, which come last, inputs are kept.
+
+Sources: Clevert, Unterthiner and Hochreiter (2016) for ELU, Klambauer et al. (2017) for SELU,
+Hendrycks and Gimpel (2016) for GELU and SiLU, Misra (2020) for Mish.
 """
 
 from __future__ import annotations
@@ -14,7 +16,12 @@ import numpy as np
 from agents.networks.matrix_products import Singles
 from mdp.machine_code import internal, vectorised
 
-IDENTITY, RELU, TANH, ELU, LEAKY_RELU, SIGMOID = range(6)
+IDENTITY, RELU, TANH, ELU, LEAKY_RELU, SIGMOID, SELU, SOFTPLUS, SILU, GELU, FAST_GELU, MISH = range(
+    12
+)
+
+# From here on the derivative asks for the input.
+FIRST_BY_INPUT = SILU
 
 # Coefficients of a rational function of x squared, from the highest power on, as Eigen's
 # `generic_fast_tanh_float` has them: within a few units in the last place, and without a call, so
@@ -37,6 +44,11 @@ _DENOMINATOR = (
 # From here on the hyperbolic tangent is 1 in single precision.
 _BOUND = np.float32(7.90531110763549805)
 _ZERO, _ONE = np.float32(0), np.float32(1)
+
+_SELU_SCALE, _SELU_ALPHA = 1.0507009873554805, 1.6732632423543772
+_SQRT_HALF, _SQRT_PI = math.sqrt(0.5), math.sqrt(math.pi)
+# Of GELU's approximation, 0.5 (1 + tanh(u)) being sigmoid(2 u).
+_GELU_SCALE, _GELU_CUBE = math.sqrt(2 / math.pi), 0.044715
 
 
 @internal
@@ -78,8 +90,50 @@ def _one_by_one(x: Any, kind: int, slope: Any) -> Any:
     if kind == LEAKY_RELU:
         return x if x > _ZERO else slope * x
     if kind == SIGMOID:
-        return np.float32(1 / (1 + math.exp(-x)))
+        return np.float32(_sigmoid(x))
+    if kind == SELU:
+        return np.float32(_SELU_SCALE * (x if x > _ZERO else _SELU_ALPHA * math.expm1(x)))
+    if kind == SOFTPLUS:
+        return np.float32(_softplus(float(x * slope)) / slope)
     return x
+
+
+@vectorised
+def activate_kept(inputs: Singles, bias: Singles, outputs: Singles, kind: int) -> None:
+    """As `activate`, of a function from `FIRST_BY_INPUT` on; ``inputs`` keep what it is given."""
+    for i in range(len(inputs)):
+        row, to = inputs[i], outputs[i]
+        for j in range(len(row)):
+            row[j] += bias[j]
+            to[j] = np.float32(_by_input(float(row[j]), kind))
+
+
+@internal
+def _by_input(x: float, kind: int) -> float:
+    if kind == SILU:
+        return x * _sigmoid(x)
+    if kind == GELU:
+        return x * _normal_probability(x)
+    if kind == FAST_GELU:
+        return x * _sigmoid(2 * _GELU_SCALE * (x + _GELU_CUBE * x**3))
+    return x * math.tanh(_softplus(x))
+
+
+@internal
+def _sigmoid(x: Any) -> float:
+    return 1 / (1 + math.exp(-x))
+
+
+@internal
+def _softplus(x: float) -> float:
+    """Logarithm of 1 + exp(x), without running over."""
+    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
+
+
+@internal
+def _normal_probability(x: float) -> float:
+    """That a standard normal number is below."""
+    return 0.5 * math.erfc(-x * _SQRT_HALF)
 
 
 @vectorised
@@ -106,4 +160,34 @@ def _derivative(output: Any, kind: int, slope: Any) -> Any:
         return _ONE if output > _ZERO else slope
     if kind == SIGMOID:
         return output * (_ONE - output)
+    if kind == SELU:
+        scale = np.float32(_SELU_SCALE)
+        return scale if output > _ZERO else output + scale * np.float32(_SELU_ALPHA)
+    if kind == SOFTPLUS:
+        return np.float32(-math.expm1(-output * slope))
     return _ONE
+
+
+@vectorised
+def pull_back_kept(errors: Singles, inputs: Singles, kind: int) -> None:
+    """As `pull_back`, of a function from `FIRST_BY_INPUT` on."""
+    for i in range(len(errors)):
+        error, row = errors[i], inputs[i]
+        for j in range(len(error)):
+            error[j] *= np.float32(_derivative_by_input(float(row[j]), kind))
+
+
+@internal
+def _derivative_by_input(x: float, kind: int) -> float:
+    if kind == SILU:
+        share = _sigmoid(x)
+        return share * (1 + x * (1 - share))
+    if kind == GELU:
+        density = math.exp(-0.5 * x * x) * _SQRT_HALF / _SQRT_PI
+        return _normal_probability(x) + x * density
+    if kind == FAST_GELU:
+        share = _sigmoid(2 * _GELU_SCALE * (x + _GELU_CUBE * x**3))
+        inner = 2 * _GELU_SCALE * (1 + 3 * _GELU_CUBE * x * x)
+        return share * (1 + x * (1 - share) * inner)
+    gate = math.tanh(_softplus(x))
+    return gate + x * (1 - gate * gate) * _sigmoid(x)

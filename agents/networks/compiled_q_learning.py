@@ -39,6 +39,10 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
         self.collected = (0, 0)
         super().__init__(*args, **kwargs)
 
+    @property
+    def is_within_rollout(self) -> bool:
+        return self.collected != (0, 0)
+
     def _check_compilable(self) -> None:
         check_q_agent(self)
         check_optimizer(self.policy.optimizer)

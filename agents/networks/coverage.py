@@ -64,8 +64,6 @@ def check_q_agent(agent: Any) -> None:
         raise NotCompilable("its replay buffer is of another kind")
     if agent.n_envs > 1 and agent.train_freq.unit == TrainFrequencyUnit.EPISODE:
         raise NotCompilable("train_freq counts the episodes of several environments")
-    if agent.get_vec_normalize_env() is not None:
-        raise NotCompilable("VecNormalize keeps what is not normalised in the replay buffer")
 
 
 def check_policy_agent(agent: Any) -> None:

@@ -19,12 +19,13 @@ from agents.common.callback_horizons import unknown_callbacks
 from agents.common.setting_checks import check_option
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import compiled_schedule
-from agents.networks.library_networks import in_rows
 from agents.networks.matrix_products import one_thread
 from agents.networks.network_engine import NetworkEngine
 from agents.networks.network_training import NetworkTraining
 from agents.networks.network_worlds import network_world
 from agents.networks.observations import Numbers, OwnVectors
+from agents.networks.rollout_events import RolloutEvents
+from agents.networks.shared_tensors import in_rows
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
 
@@ -65,6 +66,11 @@ class CompiledNetworks(BaseAlgorithm):
     @abstractmethod
     def _check_compilable(self) -> None:
         """Raise `NotCompilable` where compiled code does not do all that the agent does."""
+
+    @property
+    @abstractmethod
+    def is_within_rollout(self) -> bool:
+        """Whether the compiled loop has a rollout under way."""
 
     @abstractmethod
     def _compiled_training(self, seen: Any) -> AbstractContextManager[NetworkTraining]:
@@ -169,7 +175,7 @@ class CompiledNetworks(BaseAlgorithm):
         callback.on_training_start(locals(), globals())
         if self.num_timesteps < total_timesteps:
             # A run that was cut off goes back to its last state here.
-            callback.on_rollout_start()
+            RolloutEvents(self, callback).begin()
             with one_thread(), self._compiled_training(seen) as training:
                 NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
         callback.on_training_end()

@@ -107,63 +107,41 @@ _call: Any = _sgemm
 
 
 @internal
-def multiply(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
-    """``product = left @ right``, of shapes (m, k), (k, n) and (m, n)."""
-    m, k = left.shape
-    n = right.shape[1]
+def _multiply(
+    sgemm: Any, left: Singles, left_kind: int, right: Singles, right_kind: int, product: Singles
+) -> None:
+    """The product of two matrices, each as it is or transposed."""
+    m, n = product.shape
+    inner = left.shape[1] if left_kind == AS_IT_IS else left.shape[0]
     _call(
         sgemm,
-        AS_IT_IS,
-        AS_IT_IS,
+        right_kind,
+        left_kind,
         n,
         m,
-        k,
+        inner,
         right.ctypes.data,
-        n,
+        right.shape[1],
         left.ctypes.data,
-        k,
+        left.shape[1],
         product.ctypes.data,
         n,
     )
+
+
+@internal
+def multiply(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
+    """``product = left @ right``, of shapes (m, k), (k, n) and (m, n)."""
+    _multiply(sgemm, left, AS_IT_IS, right, AS_IT_IS, product)
 
 
 @internal
 def multiply_transposed_left(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
     """``product = left.T @ right``, of shapes (k, m), (k, n) and (m, n)."""
-    k, m = left.shape
-    n = right.shape[1]
-    _call(
-        sgemm,
-        AS_IT_IS,
-        TRANSPOSED,
-        n,
-        m,
-        k,
-        right.ctypes.data,
-        n,
-        left.ctypes.data,
-        m,
-        product.ctypes.data,
-        n,
-    )
+    _multiply(sgemm, left, TRANSPOSED, right, AS_IT_IS, product)
 
 
 @internal
 def multiply_transposed_right(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
     """``product = left @ right.T``, of shapes (m, k), (n, k) and (m, n)."""
-    m, k = left.shape
-    n = right.shape[0]
-    _call(
-        sgemm,
-        TRANSPOSED,
-        AS_IT_IS,
-        n,
-        m,
-        k,
-        right.ctypes.data,
-        k,
-        left.ctypes.data,
-        k,
-        product.ctypes.data,
-        n,
-    )
+    _multiply(sgemm, left, AS_IT_IS, right, TRANSPOSED, product)

@@ -22,6 +22,7 @@ from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import learn_from_last_step, run_block
 from agents.networks.network_training import NetworkTraining
 from agents.networks.network_worlds import NetworkEnvStates
+from agents.networks.rollout_events import RolloutEvents
 
 # Between two blocks signals are seen to, and displays move.
 SECONDS_PER_BLOCK = 0.2
@@ -49,6 +50,8 @@ class NetworkEngine(CompiledEngine):
         log_interval: int | None,
     ) -> None:
         self.training = training
+        self.rollouts = RolloutEvents(training.agent, callback)
+        training.waits = self.rollouts.are_heeded
         self.steps_at_once = 1
         self.has_begun = False
         self.in_loop = training.in_loop()
@@ -94,13 +97,25 @@ class NetworkEngine(CompiledEngine):
             self.training.record()
             self.training.give_up_rollout()
             return False
-        self.training.before_last_step(self.log_interval)
+        self._learn_from_last(episodes, n_steps)
+        self.rollouts.end_block()
+        return True
+
+    def _learn_from_last(self, episodes: Episodes, n_steps: int) -> None:
+        training, progress = self.training, self.progress[0]
+        training.before_last_step()
+        if not training.waits:
+            training.before_training(self.log_interval)
         learn_from_last_step(self._learner(), self.envs, progress)
         last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._take_over_counts(1, len(episodes.envs) - last_step)
-        self.training.record()
-        self.callback.on_rollout_end()
-        return True
+        if training.waits and training.is_rollout_over:
+            self.rollouts.end()
+            training.before_training(self.log_interval)
+            self._learner()
+            training.learn_from_rollout(float(progress["remaining"]))
+            self._take_over_counts(0, 0)
+        training.record()
 
     def _begin_rollout(self) -> None:
         if not self.has_begun:
@@ -108,19 +123,20 @@ class NetworkEngine(CompiledEngine):
             self.has_begun = True
         elif wants_position(self.callback):
             self._write()
-            self.callback.on_rollout_start()
+            self.rollouts.begin()
             self._read()
         else:
-            self.callback.on_rollout_start()
+            self.rollouts.begin()
 
     def _steps_allowed(self, total_timesteps: int) -> Horizon:
         """How far to go until somebody has to be asked."""
         agent = self.agent
         ahead, log = horizon(self.callback), self.training.until_log(self.log_interval)
         left = self.training.until_end(total_timesteps)
-        steps = min(ahead.calls, log.calls, left, self.block_steps, self.steps_at_once)
+        over = self.training.until_rollout_end()
+        steps = min(ahead.calls, log.calls, over.calls, left, self.block_steps, self.steps_at_once)
         self.progress[0]["episodes"] = getattr(agent, "_episode_num", 0)
-        return Horizon(max(steps, 1), min(ahead.episodes, log.episodes))
+        return Horizon(max(steps, 1), min(ahead.episodes, log.episodes, over.episodes))
 
     def _note_speed(self, n_steps: int, seconds: float) -> None:
         """Adapt how many steps a block may have; results do not depend on that."""

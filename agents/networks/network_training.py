@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,10 +10,9 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.compiled.generators import handles_of
-from agents.networks.library_networks import Network
 from agents.networks.observations import Numbers
-from agents.networks.perceptron import Inputs
 from agents.networks.references import Reference
+from agents.networks.shared_tensors import SharedTensors
 
 
 class NetworkTraining(ABC):
@@ -23,26 +21,34 @@ class NetworkTraining(ABC):
     Args:
         agent: the agent.
         seen: how its networks see compiled environments.
-        networks: those that are trained, in the order of the flat vector.
+        tensors: of its networks and its optimizer.
 
     Attributes:
         learner: the agent as compiled functions see it, by reference.
         held: the same itself.
         shown: observations of environments in Python, shape (n_envs, d).
+        waits: whether rollouts are learnt from by `learn_from_rollout`, and not by the loop.
         heeds_budgets: whether a number of episodes to train for moves the schedules.
     """
 
-    learner: Reference
     held: Any
-    shown: Any
     heeds_budgets: ClassVar[bool]
 
-    def __init__(self, agent: Any, seen: Any, networks: Sequence[Network]) -> None:
+    def __init__(self, agent: Any, seen: Any, tensors: SharedTensors) -> None:
         self.agent = agent
         self.seen = seen
-        self.networks = networks
+        self.tensors = tensors
+        self.waits = False
         # A handle does not keep it alive.
         self.generator = agent.rng
+        self.held = self._make_learner()
+        self.learner = Reference(self.held)
+        width = 1 if isinstance(seen, Numbers) else int(tensors.networks[0].layers.sizes[0])
+        self.shown = np.zeros((agent.n_envs, width))
+
+    @abstractmethod
+    def _make_learner(self) -> Any:
+        """The agent as compiled functions see it."""
 
     @abstractmethod
     def in_loop(self) -> Any:
@@ -55,6 +61,17 @@ class NetworkTraining(ABC):
     @abstractmethod
     def read_settings(self) -> None:
         """Take over what a callback has changed."""
+
+    def read_tensors(self) -> None:
+        """Go on with the weights and the optimizer that a callback may have put there.
+
+        Raises:
+            ValueError: if the optimizer has become one that compiled code does not know.
+        """
+        optimizer = self.tensors.take_over()
+        if optimizer is not self.held.optimizer:
+            self.held = self.held._replace(optimizer=optimizer)
+            self.learner.hold(self.held)
 
     def read_generator(self) -> None:
         """Draw from the agent's generator, which a callback may have replaced."""
@@ -78,7 +95,7 @@ class NetworkTraining(ABC):
             ValueError: if they are not.
         """
         if isinstance(self.seen, Numbers) and not (shown.min() >= 0 and shown.max() < self.seen.n):
-            wrong = shown[(shown < 0) | (shown >= self.seen.n)][0]
+            wrong = int(shown[(shown < 0) | (shown >= self.seen.n)][0])
             raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
 
     @abstractmethod
@@ -110,24 +127,30 @@ class NetworkTraining(ABC):
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
         """Let the agent know of episodes that have ended, and log where it is time to."""
 
+    @property
     @abstractmethod
-    def before_last_step(self, log_interval: int | None) -> None:
-        """What comes between the callbacks and learning from the last step of a block."""
+    def is_rollout_over(self) -> bool:
+        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
+
+    @abstractmethod
+    def until_rollout_end(self) -> Horizon:
+        """When a rollout ends that is to wait."""
+
+    @abstractmethod
+    def learn_from_rollout(self, remaining: float) -> None:
+        """Learn from the rollout that waits, with that share of the training left."""
+
+    @abstractmethod
+    def before_last_step(self) -> None:
+        """What comes between the callbacks and the counts of the last step of a block."""
+
+    @abstractmethod
+    def before_training(self, log_interval: int | None) -> None:
+        """What comes before learning from a rollout that ends with the last step of a block."""
 
     @abstractmethod
     def record(self) -> None:
         """Hand what the last training has given to the agent's logger."""
-
-
-def row_of(inputs: Inputs, seen: Any) -> Any:
-    """The memory of a single observation, as the row that it is written to."""
-    return inputs.indices if isinstance(seen, Numbers) else inputs.vectors[0]
-
-
-def room_for_rows(inputs: Inputs, seen: Any, n: int) -> Any:
-    """Room for ``n`` observations of environments in Python, shape (n, d)."""
-    row = row_of(inputs, seen)
-    return np.zeros((n, len(row)), row.dtype)
 
 
 def record_of(kind: np.dtype[np.void], **values: Any) -> Any:

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from agents.compiled.dispatch import by_type
 from agents.networks.matrix_products import Singles
+from agents.networks.perceptron import Inputs
 from mdp.machine_code import inlined
 
 # Before a step; after it, also where it has ended the episode; and after the reset that followed.
@@ -36,10 +39,22 @@ def number_at(env: Any, moment: int) -> int:
 
 
 @inlined
-def copy_row(rows: Any, i: int, row: Any) -> None:
-    """Copy the i-th of some rows."""
-    for j in range(len(row)):
-        row[j] = rows[i, j]
+def look(seen: Any, env: Any, moment: int, inputs: Inputs, one_hot: int) -> None:
+    """Let the first row of a network's inputs be what the environment showed at that moment."""
+    if one_hot:
+        inputs.indices[0] = number_at(env, moment)
+    else:
+        observe(seen, env, moment, inputs.vectors[0])
+
+
+@inlined
+def show(inputs: Inputs, i: int, row: Any, one_hot: int) -> None:
+    """Put a row of a buffer into the i-th of a network's inputs."""
+    if one_hot:
+        inputs.indices[i] = int(row[0])
+    else:
+        for j in range(len(row)):
+            inputs.vectors[i, j] = np.float32(row[j])
 
 
 class Numbers(NamedTuple):

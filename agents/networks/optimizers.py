@@ -1,7 +1,8 @@
 """Steps of gradient descent as PyTorch's optimizers take them, on flat vectors.
 
-Sources: Kingma and Ba (2015) for Adam; Tieleman and Hinton (2012) for RMSprop, with TensorFlow's
-place of epsilon as Stable-Baselines3 has it; Pascanu, Mikolov and Bengio (2013) for clipping.
+Sources: Kingma and Ba (2015) for Adam, Loshchilov and Hutter (2019) for AdamW; Tieleman and Hinton
+(2012) for RMSprop, with TensorFlow's place of epsilon as Stable-Baselines3 has it; Pascanu, Mikolov
+and Bengio (2013) for clipping.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 from agents.networks.matrix_products import Singles
 from mdp.machine_code import vectorised
 
-ADAM, RMSPROP, RMSPROP_TENSORFLOW = range(3)
+ADAM, ADAMW, RMSPROP, RMSPROP_TENSORFLOW = range(4)
 
 # Moments of units that are dead would come so close to zero that processors take a hundred cycles
 # for each operation on them. What lies below counts as zero; what is not a number stays that.
@@ -26,10 +27,12 @@ class Optimizer(NamedTuple):
     """An optimizer and what it remembers.
 
     Attributes:
-        kind: `ADAM`, `RMSPROP` or `RMSPROP_TENSORFLOW`.
+        kind: `ADAM`, `ADAMW`, `RMSPROP` or `RMSPROP_TENSORFLOW`.
         momentum: Adam's beta_1.
         smoothing: Adam's beta_2, RMSprop's alpha.
         epsilon: keeps divisors from zero.
+        weight_decay: how much parameters are drawn to zero: by a part of the gradient, or with
+            `ADAMW` beside it.
         mean: running mean of gradients, as long as the parameters.
         mean_square: of their squares.
         n_steps: steps taken so far, alone in an array, in single precision as PyTorch has it.
@@ -39,6 +42,7 @@ class Optimizer(NamedTuple):
     momentum: float
     smoothing: float
     epsilon: float
+    weight_decay: float
     mean: Singles
     mean_square: Singles
     n_steps: Singles
@@ -55,7 +59,7 @@ def descend(
     """Take one step against the gradient, whose norm is clipped first."""
     scale = _clipping(gradient, max_grad_norm)
     optimizer.n_steps[0] += np.float32(1)
-    if optimizer.kind == ADAM:
+    if optimizer.kind <= ADAMW:
         _adam(optimizer, flat, gradient, scale, learning_rate)
     else:
         _rmsprop(optimizer, flat, gradient, scale, learning_rate)
@@ -81,16 +85,19 @@ def _adam(
     step_size = np.float32(learning_rate / (1 - optimizer.momentum**n_steps))
     correction = np.float32(1 / math.sqrt(1 - optimizer.smoothing**n_steps))
     epsilon = np.float32(optimizer.epsilon)
+    decay = np.float32(optimizer.weight_decay if optimizer.kind == ADAM else 0.0)
+    beside = learning_rate * optimizer.weight_decay if optimizer.kind == ADAMW else 0.0
+    left = np.float32(1 - beside)
     mean, mean_square = optimizer.mean, optimizer.mean_square
     for i in range(len(flat)):
-        slope = gradient[i] * scale
+        slope = gradient[i] * scale + decay * flat[i]
         slope = _ZERO if abs(slope) <= _TINY else slope
         first = mean[i] + (slope - mean[i]) * rate
         first = _ZERO if abs(first) <= _TINY else first
         second = mean_square[i] * kept + slope * slope * square_rate
         second = _ZERO if second <= _TINY_SQUARE else second
         mean[i], mean_square[i] = first, second
-        flat[i] -= step_size * first / (np.sqrt(second) * correction + epsilon)
+        flat[i] = left * flat[i] - step_size * first / (np.sqrt(second) * correction + epsilon)
 
 
 @vectorised
@@ -100,10 +107,10 @@ def _rmsprop(
     kept, square_rate = np.float32(optimizer.smoothing), np.float32(1 - optimizer.smoothing)
     inside = np.float32(optimizer.epsilon if optimizer.kind == RMSPROP_TENSORFLOW else 0.0)
     outside = np.float32(0.0 if optimizer.kind == RMSPROP_TENSORFLOW else optimizer.epsilon)
-    step_size = np.float32(learning_rate)
+    step_size, decay = np.float32(learning_rate), np.float32(optimizer.weight_decay)
     mean_square = optimizer.mean_square
     for i in range(len(flat)):
-        slope = gradient[i] * scale
+        slope = gradient[i] * scale + decay * flat[i]
         slope = _ZERO if abs(slope) <= _TINY else slope
         second = mean_square[i] * kept + slope * slope * square_rate
         second = _ZERO if second <= _TINY_SQUARE else second

@@ -2,7 +2,8 @@
 
 Weights of a layer lie as (inputs, outputs), the transpose of PyTorch's: of an input that is one-hot
 a row is all that has to be read. What layers put out lies in one array as well, a layer after the
-other, so that nothing is allocated while training.
+other, so that nothing is allocated while training; behind it what activation functions were given,
+where their derivatives ask for that.
 
 Source: Goodfellow, Bengio and Courville, Deep Learning (2016), algorithms 6.3 and 6.4.
 """
@@ -14,7 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agents.networks.activations import IDENTITY, activate, pull_back
+from agents.networks.activations import (
+    FIRST_BY_INPUT,
+    IDENTITY,
+    activate,
+    activate_kept,
+    pull_back,
+    pull_back_kept,
+)
 from agents.networks.matrix_products import (
     Singles,
     multiply,
@@ -92,8 +100,9 @@ def n_parameters(layers: Layers) -> int:
 
 
 def make_outputs(layers: Layers, n: int) -> Singles:
-    """Room for all that the layers put out for ``n`` rows."""
-    return np.zeros(n * int(layers.sizes[1:].sum()), np.float32)
+    """Room for all that the layers put out for ``n`` rows, and for what functions are given."""
+    n_kept = 2 if layers.activation >= FIRST_BY_INPUT else 1
+    return np.zeros(n * n_kept * int(layers.sizes[1:].sum()), np.float32)
 
 
 @view
@@ -120,6 +129,14 @@ def outputs_of(layers: Layers, outputs: Singles, layer: int, n: int) -> Singles:
 
 
 @view
+def kept_inputs_of(layers: Layers, outputs: Singles, layer: int, n: int) -> Singles:
+    """What a layer's activation function is given for ``n`` rows, shape (n, outputs)."""
+    width = layers.sizes[layer + 1]
+    begin = n * (layers.outputs_at[-1] + layers.sizes[-1] + layers.outputs_at[layer])
+    return outputs[begin : begin + n * width].reshape((n, width))
+
+
+@view
 def last_outputs(layers: Layers, outputs: Singles, n: int) -> Singles:
     """What the perceptron puts out for ``n`` rows, shape (n, sizes[-1])."""
     return outputs_of(layers, outputs, len(layers.sizes) - 2, n)
@@ -131,14 +148,20 @@ def forward(layers: Layers, flat: Singles, inputs: Inputs, n: int, outputs: Sing
     below = inputs.vectors[:n]
     n_layers = len(layers.sizes) - 1
     for layer in range(n_layers):
-        weights = weights_of(layers, flat, layer)
+        weights, bias = weights_of(layers, flat, layer), biases_of(layers, flat, layer)
         above = outputs_of(layers, outputs, layer, n)
-        if layer == 0 and layers.one_hot:
-            _pick_rows(weights, inputs.indices, above)
-        else:
-            multiply(layers.sgemm, below, weights, above)
         kind = layers.activation if layer < n_layers - 1 else IDENTITY
-        activate(above, biases_of(layers, flat, layer), kind, np.float32(layers.slope))
+        product = above
+        if kind >= FIRST_BY_INPUT:
+            product = kept_inputs_of(layers, outputs, layer, n)
+        if layer == 0 and layers.one_hot:
+            _pick_rows(weights, inputs.indices, product)
+        else:
+            multiply(layers.sgemm, below, weights, product)
+        if kind >= FIRST_BY_INPUT:
+            activate_kept(product, bias, above, kind)
+        else:
+            activate(above, bias, kind, np.float32(layers.slope))
         below = above
 
 
@@ -185,7 +208,11 @@ def backward(
         error_below = outputs_of(layers, errors, layer - 1, n)
         multiply_transposed_left(layers.sgemm, below, error, slot)
         multiply_transposed_right(layers.sgemm, error, weights_of(layers, flat, layer), error_below)
-        pull_back(error_below, below, layers.activation, np.float32(layers.slope))
+        if layers.activation >= FIRST_BY_INPUT:
+            kept = kept_inputs_of(layers, outputs, layer - 1, n)
+            pull_back_kept(error_below, kept, layers.activation)
+        else:
+            pull_back(error_below, below, layers.activation, np.float32(layers.slope))
 
 
 @vectorised

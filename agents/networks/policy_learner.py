@@ -12,7 +12,7 @@ from agents.compiled.generators import next_uniform
 from agents.compiled.training_records import SCHEDULE
 from agents.networks.categorical import draw, log_probability
 from agents.networks.matrix_products import Singles
-from agents.networks.observations import AFTER, BEFORE, copy_row, move_on, observe
+from agents.networks.observations import AFTER, BEFORE, look, move_on, observe, show
 from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.policy_updates import RolloutMinibatch, learn_from_rollout_minibatch
@@ -33,6 +33,7 @@ RULES = np.dtype(
         ("target_kl", np.float64),  # infinite for none
         ("normalize_advantage", np.bool_),
         ("n_epochs", np.int64),
+        ("waits", np.bool_),  # for callbacks, before it learns from a rollout
         ("clip_range", SCHEDULE),
         ("clip_range_vf", SCHEDULE),
     ],
@@ -80,7 +81,6 @@ class PolicyLearner(NamedTuple):
         value_outputs: as for the policy.
         value_errors: as for the policy.
         single: one observation, to act on.
-        row: the same memory as a row.
         rng: a handle of the agent's generator, alone in an array.
     """
 
@@ -102,13 +102,12 @@ class PolicyLearner(NamedTuple):
     value_outputs: Singles
     value_errors: Singles
     single: Inputs
-    row: Any
     rng: NDArray[np.void]
 
 
 @kernel
 def evaluate(learner: Any, _: float, __: float) -> int:
-    """Put the value of the observation in ``learner.row`` into ``place.expected``."""
+    """Put the value of the observation in ``learner.single`` into ``place.expected``."""
     forward(learner.value, learner.flat, learner.single, 1, learner.value_outputs)
     values = last_outputs(learner.value, learner.value_outputs, 1)
     learner.place[0].expected = float(values[0, 0])
@@ -117,7 +116,7 @@ def evaluate(learner: Any, _: float, __: float) -> int:
 
 @kernel
 def choose_randomly(learner: Any, _: float, __: float) -> int:
-    """An action for the observation in ``learner.row``, whose value and chance are noted."""
+    """An action for the observation in ``learner.single``, whose value and chance are noted."""
     evaluate(learner, 0.0, 0.0)
     forward(learner.policy, learner.flat, learner.single, 1, learner.policy_outputs)
     logits = last_outputs(learner.policy, learner.policy_outputs, 1)[0]
@@ -209,7 +208,7 @@ class PolicyAgent(NamedTuple):
     @inlined
     def act(self, env: Any, progress: Any) -> None:
         """Draw an action, and note how likely it was and what is expected."""
-        observe(self.seen, env, BEFORE, self.learner.row)
+        look(self.seen, env, BEFORE, self.learner.single, self.learner.policy.one_hot)
         env.action = call(self.choose, self.learner, 0.0, 0.0)
         env.value = self.learner.place[0].expected
         env.log_probability = self.learner.place[0].log_probability
@@ -226,15 +225,17 @@ class PolicyAgent(NamedTuple):
             for i in range(len(envs)):
                 learner.last_values[i] = np.float32(value_at(self, envs[i], BEFORE))
             call(self.estimate, learner, 0.0, 0.0)
-            call(self.train, learner, progress.remaining, progress.learning_rate)
+            if not learner.rules[0].waits:
+                call(self.train, learner, progress.remaining, progress.learning_rate)
 
 
 @inlined
 def value_at(agent: PolicyAgent, env: Any, moment: int) -> float:
     """The value of what an environment showed at that moment."""
-    observe(agent.seen, env, moment, agent.learner.row)
-    call(agent.evaluate, agent.learner, 0.0, 0.0)
-    return float(agent.learner.place[0].expected)
+    learner = agent.learner
+    look(agent.seen, env, moment, learner.single, learner.policy.one_hot)
+    call(agent.evaluate, learner, 0.0, 0.0)
+    return float(learner.place[0].expected)
 
 
 @inlined
@@ -262,7 +263,7 @@ def act_on_rows(learner: Any, shown: Any, actions: Ints) -> None:
     rollout, place = learner.rollout, learner.place[0]
     step = place.step
     for i in range(len(actions)):
-        copy_row(shown, i, learner.row)
+        show(learner.single, 0, shown[i], learner.policy.one_hot)
         actions[i] = choose_randomly(learner, 0.0, 0.0)
         rollout.values[step, i] = np.float32(place.expected)
         rollout.log_probs[step, i] = np.float32(place.log_probability)
@@ -276,6 +277,6 @@ def act_on_rows(learner: Any, shown: Any, actions: Ints) -> None:
 def evaluate_rows(learner: Any, shown: Any, values: Singles) -> None:
     """Work out the values, shape (n,), of observations of shape (n, d)."""
     for i in range(len(values)):
-        copy_row(shown, i, learner.row)
+        show(learner.single, 0, shown[i], learner.policy.one_hot)
         evaluate(learner, 0.0, 0.0)
         values[i] = np.float32(learner.place[0].expected)

@@ -15,16 +15,9 @@ from agents.common.callback_horizons import NEVER, Horizon
 from agents.common.schedules import ScheduleRow
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import compiled_schedule
-from agents.networks.library_networks import (
-    Network,
-    network_of,
-    shared_optimizer,
-    shared_parameters,
-)
-from agents.networks.matrix_products import Singles
-from agents.networks.network_training import NetworkTraining, record_of, room_for_rows, row_of
+from agents.networks.library_networks import Network, network_of
+from agents.networks.network_training import NetworkTraining, record_of
 from agents.networks.observations import Numbers
-from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import make_inputs, make_outputs, n_parameters
 from agents.networks.policy_learner import (
     PLACE,
@@ -36,8 +29,9 @@ from agents.networks.policy_learner import (
     train,
 )
 from agents.networks.policy_updates import LOSSES, RolloutMinibatch
-from agents.networks.references import Reference, address_of
+from agents.networks.references import address_of
 from agents.networks.rollouts import Rollout, estimate_advantages
+from agents.networks.shared_tensors import shared_tensors
 
 # How far a number may move that nothing bounds.
 UNBOUNDED = 1e30
@@ -65,52 +59,33 @@ def policy_networks(policy: Any, seen: Any) -> tuple[Network, Network]:
 @contextmanager
 def policy_training(agent: Any, seen: Any) -> Iterator[PolicyTraining]:
     """Let the agent's networks and its optimizer lie in the memory of compiled code for a while."""
-    networks = policy_networks(agent.policy, seen)
-    with (
-        shared_parameters(networks) as flat,
-        shared_optimizer(agent.policy.optimizer, networks) as optimizer,
-    ):
-        yield PolicyTraining(agent, seen, networks, flat, optimizer)
+    with shared_tensors(agent.policy, policy_networks(agent.policy, seen)) as tensors:
+        yield PolicyTraining(agent, seen, tensors)
 
 
 class PolicyTraining(NetworkTraining):
-    """PPO or A2C in training.
-
-    Args:
-        agent: the agent.
-        seen: how its networks see compiled environments.
-        networks: that of action probabilities and that of values.
-        flat: their parameters.
-        optimizer: what moves them.
-    """
+    """PPO or A2C in training; of its networks the first gives action probabilities."""
 
     # The library's rollouts take what remains from the steps to do.
     heeds_budgets = False
 
-    def __init__(
-        self,
-        agent: Any,
-        seen: Any,
-        networks: tuple[Network, Network],
-        flat: Singles,
-        optimizer: Optimizer,
-    ) -> None:
-        super().__init__(agent, seen, networks)
-        actor, critic = (network.layers for network in networks)
+    def _make_learner(self) -> PolicyLearner:
+        agent, tensors = self.agent, self.tensors
+        actor, critic = (network.layers for network in tensors.networks)
         n_steps = agent.n_steps * agent.n_envs
         size = min(agent.minibatch_size or n_steps, n_steps)
         rows = max(size, agent.n_envs)
-        single = make_inputs(actor, 1)
-        self.recorded = 0
-        self.held = PolicyLearner(
+        flat = tensors.trained.vector
+        self.recorded, self.place = 0, record_of(PLACE)
+        return PolicyLearner(
             self._rules(self._bound_now),
-            record_of(PLACE),
+            self.place,
             record_of(LOSSES),
             actor,
             critic,
             flat,
             np.zeros_like(flat),
-            optimizer,
+            tensors.take_over(),
             self._rollout(),
             np.zeros(agent.n_envs, np.float32),
             np.zeros(agent.n_envs, np.float32),
@@ -124,13 +99,9 @@ class PolicyTraining(NetworkTraining):
             make_outputs(actor, size),
             make_outputs(critic, rows),
             make_outputs(critic, size),
-            single,
-            row_of(single, seen),
+            make_inputs(actor, 1),
             handles_of([agent.rng]),
         )
-        self.learner = Reference(self.held)
-        self.shown = room_for_rows(single, seen, agent.n_envs)
-        self.place = self.held.place
 
     def _rules(self, bound: Callable[[Schedule | None], ScheduleRow]) -> Any:
         agent = self.agent
@@ -146,6 +117,7 @@ class PolicyTraining(NetworkTraining):
             target_kl=np.inf if target_kl is None else target_kl,
             normalize_advantage=agent.normalize_advantage,
             n_epochs=getattr(agent, "n_epochs", 1),
+            waits=self.waits,
             clip_range=tuple(bound(getattr(agent, "clip_range", None))),
             clip_range_vf=tuple(bound(getattr(agent, "clip_range_vf", None))),
         )
@@ -158,6 +130,7 @@ class PolicyTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         self.read_generator()
+        self.read_tensors()
         self.held.rules[:] = self._rules(_bound)
 
     def _rollout(self) -> Rollout:
@@ -205,7 +178,7 @@ class PolicyTraining(NetworkTraining):
         agent.collected = int(place["step"])
         agent._last_episode_starts = self.held.starts.astype(bool)
         buffer = agent.rollout_buffer
-        buffer.full = bool(place["n_rollouts"]) and place["step"] == 0
+        buffer.full = self.is_rollout_over or (bool(place["n_rollouts"]) and place["step"] == 0)
         buffer.pos = len(buffer.rewards) if buffer.full else int(place["step"])
 
     def until_end(self, total_timesteps: int) -> int:
@@ -228,16 +201,31 @@ class PolicyTraining(NetworkTraining):
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
         """Nothing: it logs by rollouts."""
 
-    def before_last_step(self, log_interval: int | None) -> None:
+    def before_last_step(self) -> None:
+        """Nothing: it logs by rollouts."""
+
+    @property
+    def is_rollout_over(self) -> bool:
+        return bool(self.place["step"][0] == self.agent.n_steps)
+
+    def until_rollout_end(self) -> Horizon:
+        in_rollout = self.agent.n_steps - int(self.place["step"][0])
+        return Horizon(in_rollout if self.waits else NEVER, NEVER)
+
+    def learn_from_rollout(self, remaining: float) -> None:
+        train(self.learner, remaining, float(self.agent.lr_schedule(remaining)))
+
+    def before_training(self, log_interval: int | None) -> None:
         """Log as the library does, at the end of a rollout and before what is learnt from it."""
         iteration = int(self.place["n_rollouts"][0]) + 1
-        ends = self.place["step"][0] == self.agent.n_steps - 1
+        ends = self.place["step"][0] >= self.agent.n_steps - 1
         if ends and log_interval is not None and iteration % log_interval == 0:
             self.agent.dump_logs(iteration)
 
     def train(self) -> None:
         """Learn from the rollout, where environments are Python's."""
         agent = self.agent
+        self.read_tensors()
         self.place["n_updates"] = agent._n_updates
         self.held.rules[:] = self._rules(self._bound_now)
         remaining = agent._current_progress_remaining

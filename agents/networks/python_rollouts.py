@@ -51,6 +51,7 @@ def _act(training: PolicyTraining, step: int) -> Any:
     actions = np.zeros(training.agent.n_envs, np.int64)
     training.place["step"] = step
     training.read_generator()
+    training.tensors.trained.take_over()
     training.show(training.agent._last_obs)
     act_on_rows(training.learner, training.shown, actions)
     return actions

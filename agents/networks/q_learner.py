@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
-from agents.networks.observations import AFTER, BEFORE, copy_row, move_on, observe
+from agents.networks.observations import AFTER, BEFORE, look, move_on, observe, show
 from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.q_updates import best_of, follow, learn_from_minibatch
 from agents.networks.references import call
-from agents.networks.replay_batches import Minibatch, Replay, draw_minibatch
+from agents.networks.replay_batches import Minibatch
 from mdp.array_types import Ints
 from mdp.machine_code import inlined, kernel
 
@@ -31,8 +31,14 @@ RULES = np.dtype(
         ("learning_starts", np.int64),
         ("train_freq", np.int64),
         ("counts_episodes", np.bool_),  # rather than steps, for train_freq
+        ("waits", np.bool_),  # for callbacks, before it learns from a rollout
         ("gradient_steps", np.int64),
         ("target_interval", np.int64),  # in steps of all environments
+        ("normalises_observations", np.bool_),  # by VecNormalize
+        ("clip_obs", np.float64),
+        ("normalises_rewards", np.bool_),
+        ("reward_spread", np.float64),
+        ("clip_reward", np.float64),
     ],
     align=True,
 )
@@ -52,6 +58,8 @@ PLACE = np.dtype(
         ("losses", np.float64),  # sum over the last training
         ("n_losses", np.int64),
         ("learning_rate", np.float64),  # of that training
+        ("is_over", np.bool_),  # the rollout, which waits to be learnt from
+        ("n_due", np.int64),  # the number of minibatches to learn from then
     ],
     align=True,
 )
@@ -68,13 +76,13 @@ class QLearner(NamedTuple):
         target: those of its lagging copy.
         gradient: for work, as long.
         optimizer: what moves the parameters.
-        replay: the transitions.
+        draw: the address of `draw_minibatch`, which goes by the type of observations.
+        memory: that of what it draws from.
         batch: the minibatch.
         outputs: for what the network puts out for the minibatch.
         next_outputs: for what is put out for its next states.
         errors: for derivatives.
         single: one observation, to act on.
-        row: the same memory as a row.
         single_outputs: for what is put out for it.
         rng: a handle of the agent's generator, alone in an array.
     """
@@ -86,20 +94,20 @@ class QLearner(NamedTuple):
     target: Singles
     gradient: Singles
     optimizer: Optimizer
-    replay: Replay
+    draw: np.uintp
+    memory: np.uintp
     batch: Minibatch
     outputs: Singles
     next_outputs: Singles
     errors: Singles
     single: Inputs
-    row: Any
     single_outputs: Singles
     rng: NDArray[np.void]
 
 
 @kernel
 def choose_greedily(learner: Any, _: float, __: float) -> int:
-    """The best action for the observation in ``learner.row``."""
+    """The best action for the observation in ``learner.single``."""
     forward(learner.layers, learner.flat, learner.single, 1, learner.single_outputs)
     return best_of(last_outputs(learner.layers, learner.single_outputs, 1)[0])
 
@@ -110,14 +118,7 @@ def train(learner: Any, n_updates: float, learning_rate: float) -> int:
     place = learner.place[0]
     place.losses, place.n_losses, place.learning_rate = 0.0, int(n_updates), learning_rate
     for _ in range(int(n_updates)):
-        draw_minibatch(
-            learner.replay,
-            learner.batch,
-            place,
-            learner.rules[0],
-            learner.layers.one_hot,
-            learner.rng[0],
-        )
+        call(learner.draw, learner.memory, 0.0, 0.0)
         place.losses += learn_from_minibatch(learner, learning_rate)
     place.n_updates += int(n_updates)
     return int(n_updates)
@@ -128,12 +129,14 @@ class QAgent(NamedTuple):
 
     Attributes:
         learner: a reference to a `QLearner`.
+        memory: one to the `Memory` that it learns from.
         seen: how observations are read, of `agents.networks.observations`.
         choose: the address of `choose_greedily`.
         train: that of `train`.
     """
 
     learner: Any
+    memory: Any
     seen: Any
     choose: np.uintp
     train: np.uintp
@@ -149,7 +152,7 @@ class QAgent(NamedTuple):
         if place.explores:
             env.action = random_action(learner)
         else:
-            observe(self.seen, env, BEFORE, learner.row)
+            look(self.seen, env, BEFORE, learner.single, learner.layers.one_hot)
             env.action = call(self.choose, learner, 0.0, 0.0)
 
     @inlined
@@ -157,12 +160,14 @@ class QAgent(NamedTuple):
         """Store the transitions, and train where it is time to."""
         n_done = 0
         for i in range(len(envs)):
-            store(self.learner, self.seen, envs[i], i)
+            store(self, envs[i], i)
             n_done += envs[i].done
             move_on(self.seen, envs[i])
-        count_step(self.learner, progress.exploration, n_done)
-        n_updates = updates_due(self.learner, progress.num_timesteps)
-        if n_updates > 0:
+        count_step(self, progress.exploration, n_done)
+        n_updates = updates_due(self.learner, progress.num_timesteps, len(envs))
+        if self.learner.rules[0].waits:
+            self.learner.place[0].n_due = n_updates
+        elif n_updates > 0:
             call(self.train, self.learner, float(n_updates), progress.learning_rate)
 
 
@@ -188,29 +193,30 @@ def act_on_rows(learner: Any, shown: Any, num_timesteps: int, actions: Ints) -> 
         if random:
             actions[i] = random_action(learner)
         else:
-            copy_row(shown, i, learner.row)
+            show(learner.single, 0, shown[i], learner.layers.one_hot)
             actions[i] = choose_greedily(learner, 0.0, 0.0)
 
 
 @inlined
-def store(learner: Any, seen: Any, env: Any, i: int) -> None:
+def store(agent: QAgent, env: Any, i: int) -> None:
     """Write down the step of environment ``i``."""
-    replay, position = learner.replay, learner.place[0].position
-    observe(seen, env, BEFORE, replay.observations[position, i])
-    observe(seen, env, AFTER, replay.next_observations[position, i])
+    replay, position = agent.memory.replay, agent.learner.place[0].position
+    observe(agent.seen, env, BEFORE, replay.observations[position, i])
+    observe(agent.seen, env, AFTER, replay.next_observations[position, i])
     replay.actions[position, i, 0] = env.action
     replay.rewards[position, i] = np.float32(env.reward)
     replay.dones[position, i] = np.float32(env.done)
-    cut_off = env.done and not env.terminated and learner.rules[0].handles_timeouts
+    cut_off = env.done and not env.terminated and agent.learner.rules[0].handles_timeouts
     replay.timeouts[position, i] = np.float32(cut_off)
 
 
 @inlined
-def count_step(learner: Any, exploration_rate: float, n_done: int) -> None:
+def count_step(agent: QAgent, exploration_rate: float, n_done: int) -> None:
     """Count a step of every environment, and move the target network where it is time to."""
+    learner = agent.learner
     place, rules = learner.place[0], learner.rules[0]
     place.position += 1
-    if place.position == len(learner.replay.rewards):
+    if place.position == len(agent.memory.replay.rewards):
         place.full, place.position = True, 0
     place.n_calls += 1
     if place.n_calls % rules.target_interval == 0:
@@ -221,13 +227,14 @@ def count_step(learner: Any, exploration_rate: float, n_done: int) -> None:
 
 
 @inlined
-def updates_due(learner: Any, num_timesteps: int) -> int:
+def updates_due(learner: Any, num_timesteps: int, n_envs: int) -> int:
     """How many minibatches to learn from now: 0 unless enough has been collected."""
     place, rules = learner.place[0], learner.rules[0]
     collected = place.collected_episodes if rules.counts_episodes else place.collected
-    if collected < rules.train_freq:
+    place.is_over = collected >= rules.train_freq
+    if not place.is_over:
         return 0
-    n_steps = place.collected * learner.replay.rewards.shape[1]
+    n_steps = place.collected * n_envs
     place.collected = place.collected_episodes = 0
     if num_timesteps <= rules.learning_starts:
         return 0

@@ -10,19 +10,13 @@ import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
 from stable_baselines3.common.utils import update_learning_rate
+from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.compiled.generators import handles_of
-from agents.networks.library_networks import (
-    Network,
-    network_of,
-    shared_optimizer,
-    shared_parameters,
-)
-from agents.networks.matrix_products import Singles
-from agents.networks.network_training import NetworkTraining, record_of, room_for_rows, row_of
+from agents.networks.library_networks import Network, network_of
+from agents.networks.network_training import NetworkTraining, record_of
 from agents.networks.observations import Numbers
-from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import make_inputs, make_outputs
 from agents.networks.q_learner import (
     PLACE,
@@ -35,7 +29,8 @@ from agents.networks.q_learner import (
 )
 from agents.networks.q_updates import DOUBLE, ONLINE_NETWORK, TARGET_NETWORK
 from agents.networks.references import Reference, address_of
-from agents.networks.replay_batches import Minibatch, Replay
+from agents.networks.replay_batches import Memory, Minibatch, Replay, draw_minibatch
+from agents.networks.shared_tensors import shared_tensors
 from mdp.array_types import Ints
 
 _TARGETS = {"double_q": DOUBLE, "online": ONLINE_NETWORK, "target": TARGET_NETWORK}
@@ -53,69 +48,52 @@ def q_network(network: Any, seen: Any) -> Network:
 @contextmanager
 def q_training(agent: Any, seen: Any) -> Iterator[QTraining]:
     """Let the agent's networks and its optimizer lie in the memory of compiled code for a while."""
-    online, lagging = q_network(agent.q_net, seen), q_network(agent.q_net_target, seen)
-    with (
-        shared_parameters([online]) as flat,
-        shared_parameters([lagging]) as target,
-        shared_optimizer(agent.policy.optimizer, [online]) as optimizer,
-    ):
-        yield QTraining(agent, seen, online, flat, target, optimizer)
+    networks = ([q_network(network, seen)] for network in (agent.q_net, agent.q_net_target))
+    with shared_tensors(agent.policy, *networks) as tensors:
+        yield QTraining(agent, seen, tensors)
 
 
 class QTraining(NetworkTraining):
-    """DQN, double DQN or deep Q-learning in training.
-
-    Args:
-        agent: the agent.
-        seen: how its network sees compiled environments.
-        network: the network.
-        flat: its parameters.
-        target: those of its lagging copy.
-        optimizer: what moves them.
-    """
+    """DQN, double DQN or deep Q-learning in training."""
 
     heeds_budgets = True
 
-    def __init__(
-        self,
-        agent: Any,
-        seen: Any,
-        network: Network,
-        flat: Singles,
-        target: Singles,
-        optimizer: Optimizer,
-    ) -> None:
-        super().__init__(agent, seen, [network])
+    def _make_learner(self) -> QLearner:
+        agent, tensors = self.agent, self.tensors
         self.recorded = agent._n_updates
-        layers, n = network.layers, agent.batch_size
-        single = make_inputs(layers, 1)
-        self.held = QLearner(
-            self._rules(),
-            record_of(PLACE, decided_at=-1),
+        layers, n = tensors.networks[0].layers, agent.batch_size
+        rules, self.place = self._rules(), record_of(PLACE, decided_at=-1)
+        batch = Minibatch(
+            make_inputs(layers, n),
+            make_inputs(layers, n),
+            np.zeros(n, np.int64),
+            np.zeros(n, np.float32),
+            np.zeros(n, np.float32),
+        )
+        rng = handles_of([agent.rng])
+        centre, spread = np.zeros(layers.sizes[0]), np.ones(layers.sizes[0])
+        self.memory = Reference(
+            Memory(self._replay(), batch, self.place, rules, centre, spread, rng, layers.one_hot)
+        )
+        flat = tensors.trained.vector
+        return QLearner(
+            rules,
+            self.place,
             layers,
             flat,
-            target,
+            tensors.lagging.vector,
             np.zeros_like(flat),
-            optimizer,
-            self._replay(),
-            Minibatch(
-                make_inputs(layers, n),
-                make_inputs(layers, n),
-                np.zeros(n, np.int64),
-                np.zeros(n, np.float32),
-                np.zeros(n, np.float32),
-            ),
+            tensors.take_over(),
+            address_of(draw_minibatch, self.memory),
+            np.uintp(self.memory.address),
+            batch,
             make_outputs(layers, n),
             make_outputs(layers, n),
             make_outputs(layers, n),
-            single,
-            row_of(single, seen),
+            make_inputs(layers, 1),
             make_outputs(layers, 1),
-            handles_of([agent.rng]),
+            rng,
         )
-        self.learner = Reference(self.held)
-        self.shown = room_for_rows(single, seen, agent.n_envs)
-        self.place = self.held.place
 
     def _rules(self) -> Any:
         agent = self.agent
@@ -133,8 +111,10 @@ class QTraining(NetworkTraining):
             learning_starts=agent.learning_starts,
             train_freq=agent.train_freq.frequency,
             counts_episodes=agent.train_freq.unit == TrainFrequencyUnit.EPISODE,
+            waits=self.waits,
             gradient_steps=agent.gradient_steps,
             target_interval=max(agent.target_update_interval // agent.n_envs, 1),
+            **normalising_rules(agent.get_vec_normalize_env()),
         )
 
     def _replay(self) -> Replay:
@@ -151,9 +131,8 @@ class QTraining(NetworkTraining):
 
     def in_loop(self) -> QAgent:
         learner = self.learner
-        return QAgent(
-            learner, self.seen, address_of(choose_greedily, learner), address_of(train, learner)
-        )
+        choose, learn = (address_of(function, learner) for function in (choose_greedily, train))
+        return QAgent(learner, self.memory, self.seen, choose, learn)
 
     def schedules(self) -> dict[str, Schedule]:
         return {
@@ -163,7 +142,13 @@ class QTraining(NetworkTraining):
 
     def read_settings(self) -> None:
         self.read_generator()
+        self.read_tensors()
         self.held.rules[:] = self._rules()
+        env = self.agent.get_vec_normalize_env()
+        if env is not None and env.norm_obs:
+            memory = self.memory.held
+            memory.centre[:] = env.obs_rms.mean.ravel()
+            memory.spread[:] = np.sqrt(env.obs_rms.var + env.epsilon).ravel()
 
     def take_over_progress(self, remaining: float) -> None:
         self.agent._current_progress_remaining = remaining
@@ -211,6 +196,7 @@ class QTraining(NetworkTraining):
         """Actions for the agent's present observations, where environments are Python's."""
         self.read()
         self.read_generator()
+        self.tensors.trained.take_over()
         self.held.rules["learning_starts"] = learning_starts
         self.show(self.agent._last_obs)
         actions = np.zeros(len(self.shown), np.int64)
@@ -227,9 +213,29 @@ class QTraining(NetworkTraining):
         agent._n_updates += n_updates
         self._record_training()
 
-    def before_last_step(self, log_interval: int | None) -> None:
+    def before_last_step(self) -> None:
         """Training on that step comes after what is logged at the end of an episode."""
         self._record_training()
+
+    def before_training(self, log_interval: int | None) -> None:
+        """Nothing: it logs by episodes."""
+
+    @property
+    def is_rollout_over(self) -> bool:
+        return bool(self.place["is_over"][0])
+
+    def until_rollout_end(self) -> Horizon:
+        place, rules = self.place[0], self.held.rules[0]
+        if not self.waits:
+            return Horizon(NEVER, NEVER)
+        if rules["counts_episodes"]:
+            return Horizon(NEVER, int(rules["train_freq"] - place["collected_episodes"]))
+        return Horizon(int(rules["train_freq"] - place["collected"]), NEVER)
+
+    def learn_from_rollout(self, remaining: float) -> None:
+        n_due, self.place["is_over"] = int(self.place["n_due"][0]), False
+        if n_due:
+            train(self.learner, float(n_due), float(self.agent.lr_schedule(remaining)))
 
     def record(self) -> None:
         self.agent.logger.record("rollout/exploration_rate", self.agent.exploration_rate)
@@ -244,3 +250,16 @@ class QTraining(NetworkTraining):
         agent.logger.record("train/loss", place["losses"] / place["n_losses"])
         agent.logger.record("train/learning_rate", float(place["learning_rate"]))
         update_learning_rate(agent.policy.optimizer, float(place["learning_rate"]))
+
+
+def normalising_rules(env: VecNormalize | None) -> dict[str, Any]:
+    """What VecNormalize does to observations and rewards, as settings in a record of `RULES`."""
+    if env is None:
+        return {}
+    return {
+        "normalises_observations": env.norm_obs,
+        "clip_obs": env.clip_obs,
+        "normalises_rewards": env.norm_reward,
+        "reward_spread": np.sqrt(env.ret_rms.var + env.epsilon),
+        "clip_reward": env.clip_reward,
+    }

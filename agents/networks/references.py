@@ -10,7 +10,7 @@ lies behind an address as well, so that it is compiled by itself, and once for a
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import typeof as _typeof
@@ -44,7 +44,7 @@ class Reference:
     """A named tuple of arrays and numbers, to be handed on by address.
 
     Args:
-        held: the tuple, whose parts may be such tuples as well; arrays stay where they are.
+        held: the named tuple, whose parts may be such tuples as well; arrays stay where they are.
 
     Attributes:
         held: the same; its arrays live as long as the reference.
@@ -55,12 +55,17 @@ class Reference:
         TypeError: if a part is anything else.
     """
 
-    def __init__(self, held: NamedTuple) -> None:
+    def __init__(self, held: Any) -> None:
         self.held = held
         self._words = np.array(list(_words(held)), dtype=np.int64)
         self.address = int(self._words.ctypes.data)
         # To find it takes Numba longer than most functions that a reference is handed to.
         self.kind = ReferenceType(typeof(held))
+
+    def hold(self, held: Any) -> None:
+        """Refer to another tuple of the same kind from now on, at the same address."""
+        self.held = held
+        self._words[:] = list(_words(held))
 
 
 def _words(value: Any) -> Iterator[int]:
@@ -158,7 +163,10 @@ def address_of(function: Any, reference: Reference) -> np.uintp:
 @intrinsic
 def _call(typing_context: Any, address: Any, reference: Any, first: Any, second: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        address, *passed = arguments
+        address, reference, *numbers = arguments
+        if isinstance(reference.type, ir.IntType):
+            reference = builder.inttoptr(reference, cgutils.voidptr_t)
+        passed = [reference, *numbers]
         kind = ir.FunctionType(ir.IntType(64), [value.type for value in passed])
         return builder.call(builder.inttoptr(address, kind.as_pointer()), passed)
 
@@ -171,6 +179,6 @@ _call_address: Any = _call
 
 @internal
 def call(address: Any, reference: Any, first: float, second: float) -> int:
-    """Call what `address_of` has found."""
+    """Call what `address_of` has found, with a reference or the address of one."""
     result: int = _call_address(address, reference, first, second)
     return result

@@ -1,7 +1,8 @@
 """Minibatches out of the library's replay buffer, in whose own arrays transitions lie.
 
 With n-step returns as in `stable_baselines3.common.buffers.NStepReplayBuffer`: rewards are summed
-until the episode ends, or the newest transition is reached.
+until the episode ends, or the newest transition is reached. What VecNormalize shows otherwise lies
+there as it was, and is shown by the statistics of the moment, as in the library.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
+from agents.networks.observations import show
 from agents.networks.perceptron import Inputs
-from mdp.array_types import Ints
-from mdp.machine_code import called, inlined
+from mdp.array_types import Floats, Ints
+from mdp.machine_code import inlined, kernel
 
 
 class Replay(NamedTuple):
@@ -55,47 +58,82 @@ class Minibatch(NamedTuple):
     discounts: Singles
 
 
-@inlined
-def show(inputs: Inputs, i: int, row: Any, one_hot: bool) -> None:
-    """Put a row of a buffer into the i-th of the inputs."""
-    if one_hot:
-        inputs.indices[i] = int(row[0])
-    else:
-        for j in range(len(row)):
-            inputs.vectors[i, j] = np.float32(row[j])
+class Memory(NamedTuple):
+    """What minibatches are drawn from, by reference.
 
-
-@called
-def draw_minibatch(
-    replay: Replay, batch: Minibatch, place: Any, rules: Any, one_hot: bool, rng: Any
-) -> None:
-    """Fill the minibatch with transitions drawn with replacement.
-
-    Args:
-        replay: where they are drawn from.
+    Attributes:
+        replay: the transitions.
         batch: what is filled.
         place: says where the next transition will lie, and whether the ring is full.
-        rules: with the discount factor and the number of steps.
+        rules: with the discount factor, the number of steps and what VecNormalize does.
+        centre: what it takes from observations, shape (d,).
+        spread: what it divides them by, shape (d,).
+        rng: a handle of the agent's generator, alone in an array.
         one_hot: whether observations are numbers of states.
-        rng: a handle of the generator.
     """
+
+    replay: Replay
+    batch: Minibatch
+    place: NDArray[np.void]
+    rules: NDArray[np.void]
+    centre: Floats
+    spread: Floats
+    rng: NDArray[np.void]
+    one_hot: int
+
+
+@inlined
+def clipped(number: float, bound: float) -> float:
+    """As it is within the bound; what is not a number stays that."""
+    if number > bound:
+        return bound
+    return -bound if number < -bound else number
+
+
+@inlined
+def show_normalised(memory: Memory, inputs: Inputs, i: int, row: Any) -> None:
+    """As `show`, the way VecNormalize shows it now."""
+    rules = memory.rules[0]
+    if not rules.normalises_observations:
+        show(inputs, i, row, memory.one_hot)
+        return
+    for j in range(len(row)):
+        moved = (row[j] - memory.centre[j]) / memory.spread[j]
+        inputs.vectors[i, j] = np.float32(clipped(moved, rules.clip_obs))
+
+
+@inlined
+def reward_of(memory: Memory, at: int, env: int) -> Any:
+    """A reward, the way VecNormalize gives it now."""
+    reward, rules = memory.replay.rewards[at, env], memory.rules[0]
+    if not rules.normalises_rewards:
+        return reward
+    return np.float32(clipped(reward / rules.reward_spread, rules.clip_reward))
+
+
+@kernel
+def draw_minibatch(memory: Any, _: float, __: float) -> int:
+    """Fill the minibatch with transitions drawn with replacement; their number is returned."""
+    replay, batch, place = memory.replay, memory.batch, memory.place[0]
+    rules, rng = memory.rules[0], memory.rng[0]
     n_places, n_envs = replay.rewards.shape
     filled = n_places if place.full else place.position
     newest = (place.position - 1) % n_places
     for i in range(len(batch.actions)):
         begin = int(next_uniform(rng) * filled)
         env = int(next_uniform(rng) * n_envs)
-        at, discount, total = begin, np.float32(rules.gamma), replay.rewards[begin, env]
+        at, discount, total = begin, np.float32(rules.gamma), reward_of(memory, begin, env)
         for _ in range(rules.n_steps - 1):
             if replay.dones[at, env] or replay.timeouts[at, env] or at == newest:
                 break
             at = (at + 1) % n_places
-            total += discount * replay.rewards[at, env]
+            total += discount * reward_of(memory, at, env)
             discount *= np.float32(rules.gamma)
         if replay.dones[at, env] and not replay.timeouts[at, env]:
             discount = np.float32(0)
-        show(batch.states, i, replay.observations[begin, env], one_hot)
-        show(batch.next_states, i, replay.next_observations[at, env], one_hot)
+        show_normalised(memory, batch.states, i, replay.observations[begin, env])
+        show_normalised(memory, batch.next_states, i, replay.next_observations[at, env])
         batch.actions[i] = replay.actions[begin, env, 0]
         batch.rewards[i] = total
         batch.discounts[i] = discount
+    return len(batch.actions)

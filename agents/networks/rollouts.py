@@ -8,7 +8,7 @@ import numpy as np
 
 from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
-from agents.networks.replay_batches import show
+from agents.networks.observations import show
 from mdp.array_types import Ints
 from mdp.machine_code import called, inlined, kernel
 

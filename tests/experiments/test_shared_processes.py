@@ -37,6 +37,7 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.evaluation import kept_evaluators
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.plain_runs import is_plain
+from pipeline.settings.hyperparams import ComponentSpec
 
 AGENTS = (
     AgentSpec("first", "qlearning", tuned=False),
@@ -44,6 +45,12 @@ AGENTS = (
         "second", "sarsa", tuned=False, settings={"learning_rate": 0.3, "mask_actions": True}
     ),
     AgentSpec("third", "double_qlearning", tuned=False, settings={"n_envs": 2}),
+)
+SMALL = {"engine": "compiled", "n_timesteps": 600, "policy_kwargs": {"net_arch": [8]}}
+Q = {"learning_starts": 50, "buffer_size": 300, "batch_size": 16}
+NETWORKS = (
+    AgentSpec("ppo", "ppo", tuned=False, settings={**SMALL, "n_steps": 64, "n_envs": 2}),
+    AgentSpec("dqn", "dqn", tuned=False, settings={**SMALL, **Q}),
 )
 ENVIRONMENTS = (
     EnvironmentSpec("house", "Warehouse-v0", {"n_episodes": 60, "env_kwargs": {"slip": 0.1}}),
@@ -220,6 +227,45 @@ def test_runs_in_one_process_leave_what_each_leaves_alone(tmp_path):
             assert found == theirs[name], (mine.path, name)
 
 
+def test_so_do_runs_of_compiled_networks(tmp_path):
+    """On an environment that is evaluated exactly, and on one where episodes are played."""
+    lake = EnvironmentSpec("lake", "FrozenLake-v1", {"train_env_wrapper": CLIPPED})
+    poles = EnvironmentSpec("poles", "CartPole-v1", {})
+    together = runs_of(tmp_path / "together", 2, NETWORKS, (lake, poles))
+    alone = runs_of(tmp_path / "alone", 2, NETWORKS, (lake, poles))[-4:]
+    assert all(is_plain(run.spec) for run in together)
+    assert not execute(together, tmp_path / "together", "c", 1, lambda *_: None)
+    with local_executor(2) as executor:
+        tasks = [
+            executor.submit(
+                supervise, do_run, run, draft_path(tmp_path / "alone", run), "c", clean_up=nothing
+            )
+            for run in alone
+        ]
+        for task in tasks:
+            task.result()
+    for mine, its in zip(together[-4:], alone, strict=True):
+        assert mine.run.read_info()["engine"] == "compiled"
+        assert learnt(mine.path) == learnt(its.path)
+
+
+CLIPPED = [{"gymnasium.wrappers.ClipReward": {"min_reward": 0, "max_reward": 0.5}}]
+
+
+def learnt(folder):
+    """The bits of weights and optimizers; what Monitor and evaluations have seen."""
+    found = {}
+    for path in sorted(folder.rglob("*.zip")):
+        with zipfile.ZipFile(path) as archive:
+            names = ("policy.pth", "policy.optimizer.pth")
+            found[path.name] = [archive.read(name) for name in names]
+    with np.load(folder / "evaluations.npz") as evaluations:
+        found |= {name: array.tobytes() for name, array in evaluations.items()}
+    for path in sorted(folder.glob("*.monitor.csv")):
+        found[path.name] = [row.split(",")[:2] for row in path.read_text().splitlines()[1:]]
+    return found
+
+
 def test_seconds_of_runs_that_share_a_process_are_their_own(tmp_path):
     short = AgentSpec("short", "qlearning", tuned=False, settings={"n_timesteps": 1000})
     long = AgentSpec("long", "qlearning", tuned=False, settings={"n_timesteps": 6_000_000})
@@ -235,15 +281,19 @@ def test_seconds_of_runs_that_share_a_process_are_their_own(tmp_path):
 def test_what_a_run_must_not_share_its_process_with():
     spec = runs_of(Path("x"))[0].spec
     special = spec.hyperparams
+    own = ComponentSpec("mine.Wrapper")
+    library = replace(special, algorithm={"engine": "library"})
     for other in (
         replace(spec, gym_packages=("mine",)),
         replace(spec, tensorboard_log=Path("t")),
         replace(spec, trained_agent=Path("a.zip")),
         replace(spec, algo="dqn"),
+        replace(spec, algo="ppo", hyperparams=library),
+        replace(spec, algo="sac", hyperparams=replace(special, algorithm={"engine": "compiled"})),
         replace(spec, algo="no_such_agent"),
         replace(spec, hyperparams=replace(special, callback="mine.Callback")),
         replace(spec, hyperparams=replace(special, env_wrapper="mine.Wrapper")),
-        replace(spec, hyperparams=replace(special, train_env_wrapper="mine.Wrapper")),
+        replace(spec, hyperparams=replace(special, train_env_wrapper=(own,))),
         replace(spec, hyperparams=replace(special, normalize={})),
         replace(spec, vec_env="subproc"),
         replace(spec, env_id="Nowhere-v0"),

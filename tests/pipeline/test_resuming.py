@@ -42,6 +42,7 @@ ARMS, LINEAR = "BernoulliBandit-v0", "LinearBandit-v0"
 SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
 EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
 EAGER["policy_kwargs"] = {"net_arch": [16]}
+LAGGING = {"n_steps": 3, "train_freq": 4, "target_update_interval": 30, "tau": 0.7}
 
 # Every agent, and the settings whose state is kept in a place of its own.
 TRAININGS = [
@@ -62,6 +63,11 @@ TRAININGS = [
     (LEFT_RIGHT, "ppo", 600, {**SMALL, "learning_rate": "lin_0.001", "clip_range": "lin_0.2"}),
     (SWING, "ppo", 600, {**SMALL, "use_sde": True, "normalize": True, "frame_stack": 2}),
     (LEFT_RIGHT, "a2c", 300, {}),
+    # Cut off in the middle of rollouts, and after some moves of the target network.
+    (LEFT_RIGHT, "ppo", 600, {**SMALL, "engine": "compiled", "learning_rate": "lin_0.001"}),
+    (LEFT_RIGHT, "ppo", 600, {**SMALL, "engine": "compiled", "normalize": True}),
+    (GRID, "dqn", 300, {**EAGER, **LAGGING, "engine": "compiled"}),
+    (GRID, "a2c", 300, {"n_envs": 2, "n_steps": 7, "engine": "compiled"}),
     (SWING, "sac", 200, {**EAGER, "use_sde": True, "normalize": True}),
     (SWING, "td3", 200, {**EAGER, "noise_type": "ornstein-uhlenbeck", "noise_std": 0.1}),
     (SWING, "ddpg", 200, {**EAGER, "noise_type": "normal", "noise_std": 0.1}),

@@ -5,6 +5,8 @@ their own size, so that a weight whose gradients all but vanish goes where round
 as any other goes, and single weights tell little of how well the rest agrees.
 """
 
+from functools import partial
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -15,6 +17,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.buffers import NStepReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from agents import load_algorithm
@@ -29,6 +32,12 @@ FUNCTIONS = {
     "leaky": lambda: nn.LeakyReLU(negative_slope=0.2),
     "sigmoid": nn.Sigmoid,
     "identity": nn.Identity,
+    "selu": nn.SELU,
+    "softplus": lambda: nn.Softplus(beta=1.5),
+    "silu": nn.SiLU,
+    "gelu": nn.GELU,
+    "fast gelu": lambda: nn.GELU(approximate="tanh"),
+    "mish": nn.Mish,
 }
 widths = st.lists(st.integers(1, 70), max_size=3)
 
@@ -47,11 +56,13 @@ class Nowhere(gym.Env):
 
 
 NUMBERS = spaces.Discrete(7)
-VECTORS = spaces.Box(-1, 1, (2, 2), np.float64)
+VECTORS = spaces.Box(-1, 1, (2, 2), np.float32)
+DOUBLES = spaces.Box(-1, 1, (3,), np.float64)
 
 
-def make(name, engine, observations, n_envs=2, policy_kwargs=None, **kwargs):
+def make(name, engine, observations, n_envs=2, policy_kwargs=None, wrap=None, **kwargs):
     env = make_vec_env(Nowhere, n_envs, env_kwargs={"observations": observations})
+    env = env if wrap is None else wrap(env)
     return load_algorithm(name)(
         "MlpPolicy", env, seed=0, engine=engine, policy_kwargs=policy_kwargs, **kwargs
     )
@@ -104,6 +115,8 @@ def as_library(networks, flat, names):
 
 # --- deep Q-learning -----------------------------------------------------------------------------
 
+Q_NAMES = ("dqn", "double_dqn", "deep_qlearning")
+
 
 def fill_replay(model, place, seed):
     """A ring of made-up transitions, of which some end episodes, by a time limit or not."""
@@ -148,7 +161,7 @@ def train_q_agents(name, observations, place, n_updates, n_envs=2, **kwargs):
     with ours._learning_compiled():
         ours.train(n_updates, ours.batch_size)
         held = ours._shared_training().held
-        slopes = as_library(ours._shared_training().networks, held.gradient, names)
+        slopes = as_library(ours._shared_training().tensors.networks, held.gradient, names)
     with pytest.MonkeyPatch.context() as patch:
         draw_as_compiled(patch, theirs, rng)
         theirs.train(n_updates, theirs.batch_size)
@@ -156,8 +169,8 @@ def train_q_agents(name, observations, place, n_updates, n_envs=2, **kwargs):
 
 
 @given(
-    name=st.sampled_from(["dqn", "double_dqn", "deep_qlearning"]),
-    observations=st.sampled_from([NUMBERS, VECTORS]),
+    name=st.sampled_from(Q_NAMES),
+    observations=st.sampled_from([NUMBERS, VECTORS, DOUBLES]),
     net_arch=widths,
     function=st.sampled_from(sorted(FUNCTIONS)),
     batch_size=st.integers(1, 40),
@@ -184,13 +197,15 @@ def test_q_gradient(name, observations, net_arch, function, batch_size, place, n
     assert losses[0] == pytest.approx(losses[1], rel=1e-5)
 
 
-@pytest.mark.parametrize("observations", [NUMBERS, VECTORS], ids=["numbers", "vectors"])
-@pytest.mark.parametrize("function", sorted(FUNCTIONS))
-@pytest.mark.parametrize("name", ["dqn", "double_dqn", "deep_qlearning"])
-def test_q_weights_after_100_updates(name, function, observations):
+Q_NETWORKS = [(name, "relu", space) for name in Q_NAMES for space in ("numbers", "vectors")]
+Q_NETWORKS += [("dqn", function, "vectors") for function in sorted(FUNCTIONS)]
+
+
+@pytest.mark.parametrize(("name", "function", "space"), dict.fromkeys(Q_NETWORKS))
+def test_q_weights_after_100_updates(name, function, space, **kwargs):
     ours, theirs, _ = train_q_agents(
         name,
-        observations,
+        {"numbers": NUMBERS, "vectors": VECTORS}[space],
         (9, True),
         100,
         learning_rate=1e-3,
@@ -198,10 +213,32 @@ def test_q_weights_after_100_updates(name, function, observations):
         gamma=0.9,
         n_steps=3,
         policy_kwargs={"net_arch": [24, 17], "activation_fn": FUNCTIONS[function]},
+        **kwargs,
     )
     assert_same(parameters(ours), parameters(theirs))
     assert_same_optimizers(ours, theirs)
     assert ours._n_updates == theirs._n_updates == 100
+
+
+def normalised(env, **kwargs):
+    """Statistics as they might be after a while."""
+    env, rng = VecNormalize(env, clip_obs=1.5, clip_reward=0.8, **kwargs), np.random.default_rng(4)
+    if env.norm_obs:
+        env.obs_rms.mean, env.obs_rms.var = rng.normal(size=(2, 2)), rng.uniform(0.3, 2, (2, 2))
+    env.ret_rms.var, env.training = 7.0, False
+    return env
+
+
+@pytest.mark.parametrize(
+    ("space", "kwargs"),
+    [
+        ("vectors", {}),
+        ("vectors", {"norm_reward": False}),
+        ("numbers", {"norm_obs": False}),
+    ],
+)
+def test_minibatches_are_normalised(space, kwargs):
+    test_q_weights_after_100_updates("dqn", "tanh", space, wrap=partial(normalised, **kwargs))
 
 
 # --- policy gradients ----------------------------------------------------------------------------
@@ -259,7 +296,7 @@ def train_policy_agents(name, observations, n_envs=2, **kwargs):
         held.last_values[:], held.starts[:] = last_values, dones
         estimate_advantages(ours._shared_training().learner, 0.0, 0.0)
         ours.train()
-        slopes = as_library(ours._shared_training().networks, held.gradient, names)
+        slopes = as_library(ours._shared_training().tensors.networks, held.gradient, names)
     with pytest.MonkeyPatch.context() as patch:
         shuffle_as_compiled(patch, theirs, rng)
         theirs.rollout_buffer.compute_returns_and_advantage(th.as_tensor(last_values), dones)
@@ -320,13 +357,30 @@ SETTINGS = {
     "Adam as asked for": {
         "policy_kwargs": {"optimizer_kwargs": {"betas": (0.5, 0.9), "eps": 1e-3}}
     },
+    "Adam with decay": {"policy_kwargs": {"optimizer_kwargs": {"weight_decay": 0.1}}},
+    "AdamW": {
+        "policy_kwargs": {
+            "optimizer_class": th.optim.AdamW,
+            "optimizer_kwargs": {"weight_decay": 3.0},
+        }
+    },
+    "RMSprop with decay": {
+        "policy_kwargs": {
+            "optimizer_class": th.optim.RMSprop,
+            "optimizer_kwargs": {"weight_decay": 0.1},
+        }
+    },
 }
 
 
-@pytest.mark.parametrize("observations", [NUMBERS, VECTORS], ids=["numbers", "vectors"])
-@pytest.mark.parametrize("which", SETTINGS)
+# What observations are like does not matter to what comes behind the first layer.
+BY_TURNS = [(which, i % 2) for i, which in enumerate(SETTINGS)]
+
+
+@pytest.mark.parametrize(("which", "is_vector"), [("as it is", 1), *BY_TURNS])
 @pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
-def test_ppo_after_100_updates(which, observations):
+def test_ppo_after_100_updates(which, is_vector):
+    observations = VECTORS if is_vector else NUMBERS
     arguments = {"n_steps": 20, "batch_size": 10, "n_epochs": 25, **SETTINGS[which]}
     ours, theirs, _ = train_policy_agents("ppo", observations, **arguments)
     assert_same(parameters(ours), parameters(theirs))
@@ -344,11 +398,18 @@ def test_ppo_stops_where_the_library_stops():
     assert_same_logs(ours, theirs)
 
 
-@pytest.mark.parametrize("observations", [NUMBERS, VECTORS], ids=["numbers", "vectors"])
-@pytest.mark.parametrize("normalize", [False, True])
-@pytest.mark.parametrize("optimizer", [th.optim.RMSprop, RMSpropTFLike, th.optim.Adam])
-def test_a2c_after_100_updates(optimizer, normalize, observations):
-    kwargs = {"optimizer_class": optimizer, "optimizer_kwargs": {"eps": 1e-5}}
+@pytest.mark.parametrize(
+    ("optimizer", "decay", "normalize", "observations"),
+    [
+        (th.optim.RMSprop, 0, False, NUMBERS),
+        (RMSpropTFLike, 0, True, NUMBERS),
+        (RMSpropTFLike, 0.1, False, VECTORS),
+        (th.optim.Adam, 0, True, VECTORS),
+    ],
+)
+def test_a2c_after_100_updates(optimizer, decay, normalize, observations):
+    optimizer_kwargs = {"eps": 1e-5, "weight_decay": decay}
+    kwargs = {"optimizer_class": optimizer, "optimizer_kwargs": optimizer_kwargs}
     arguments = {"n_steps": 5, "policy_kwargs": kwargs, "normalize_advantage": normalize}
     ours, theirs = (
         make("a2c", engine, observations, **arguments) for engine in ("compiled", "library")

@@ -214,7 +214,38 @@ def load_other_weights(model):
     model.policy.load_state_dict(state)
 
 
+def load_another_optimizer_state(model):
+    """As of an optimizer that has come far."""
+    optimizer, rng = model.policy.optimizer, np.random.default_rng(8)
+    state = optimizer.state_dict()
+    for kept in state["state"].values():
+        kept["step"] = kept["step"] + 1000
+        for name in ("exp_avg", "exp_avg_sq"):
+            noise = rng.random(tuple(kept[name].shape), np.float32)
+            kept[name] = th.from_numpy(noise).square() / 100
+    optimizer.load_state_dict(state)
+
+
+def put_other_weights_in_place(model):
+    for parameter in model.policy.parameters():
+        parameter.data = parameter.data * 0.7
+
+
+def take_another_optimizer(model):
+    parameters = model.policy.optimizer.param_groups[0]["params"]
+    model.policy.optimizer = th.optim.RMSprop(parameters, lr=0.01)
+
+
+def decay_weights(model):
+    model.policy.optimizer.param_groups[0].update(weight_decay=0.3, betas=(0.5, 0.7))
+
+
 CHANGES = {
+    "optimizer's state": load_another_optimizer_state,
+    "weights in place": put_other_weights_in_place,
+    "another optimizer": take_another_optimizer,
+    "optimizer's settings": decay_weights,
+    "all parameters": lambda model: model.set_parameters(model.get_parameters()),
     "gamma": lambda model: setattr(model, "gamma", 0.3),
     "norm": lambda model: setattr(model, "max_grad_norm", 0.01),
     "rate": lambda model: setattr(model, "lr_schedule", FloatSchedule(0.03)),
@@ -236,4 +267,70 @@ def test_a_change_counts_in_both_ways(what, kind):
     assert_same(*models)
     unchanged = learn(make("FrozenLake", kind), "compiled", 400).policy.state_dict()
     ours = models[0].policy.state_dict()
-    assert not all(th.equal(value, unchanged[name]) for name, value in ours.items())
+    is_same = all(th.equal(value, unchanged[name]) for name, value in ours.items())
+    assert is_same == (what == "all parameters")
+
+
+def test_a_state_that_is_loaded_before_the_first_step_stays():
+    """Where nothing has been learnt yet, nothing is remembered that would have to be forgotten."""
+    taught = make("FrozenLake", "dqn")
+    learn(taught, "compiled", 200)
+    state = taught.policy.optimizer.state_dict()
+    model = make("FrozenLake", "dqn", learning_starts=10_000)
+    load = Change(lambda model: model.policy.optimizer.load_state_dict(state))
+    found = learn(model, "compiled", 200, load).policy.optimizer.state_dict()["state"]
+    for i, kept in state["state"].items():
+        assert all(th.equal(found[i][name], value) for name, value in kept.items())
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_an_optimizer_that_is_not_known_ends_the_training(mode):
+    def take(model):
+        parameters = model.policy.optimizer.param_groups[0]["params"]
+        model.policy.optimizer = th.optim.SGD(parameters, lr=0.01)
+
+    with pytest.raises(ValueError, match="cannot go on: its optimizer is SGD, not Adam or RMSp"):
+        learn(make("FrozenLake", "dqn"), mode, 400, Change(take))
+
+
+def freeze(model):
+    model.policy.action_net.weight.requires_grad_(False)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_so_do_parameters_that_are_frozen_meanwhile(mode):
+    with pytest.raises(ValueError, match="cannot go on: some of its parameters are frozen"):
+        learn(make("FrozenLake", "ppo"), mode, 400, Change(freeze))
+
+
+class Counting(BlockCallback):
+    """Changes what is learnt at the end of each rollout, and counts what it is told."""
+
+    def __init__(self):
+        super().__init__()
+        self.n_starts = self.n_ends = 0
+
+    def _on_rollout_start(self):
+        self.n_starts += 1
+
+    def _on_rollout_end(self):
+        self.n_ends += 1
+        self.model.gamma = 0.5 + 0.4 * (self.n_ends % 2)
+        self.model.lr_schedule = FloatSchedule(0.01 / self.n_ends)
+        if hasattr(self.model, "rollout_buffer"):
+            self.model.rollout_buffer.advantages *= self.n_ends % 3
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("kind", ["dqn", "dqn, two", "dqn, episodes", "ppo, two", "a2c"])
+def test_rollouts_are_told_of_where_they_are_heeded(kind):
+    counts = [Counting(), Counting()]
+    models = [
+        learn(make("CartPole", kind), mode, 600, count)
+        for mode, count in zip(MODES, counts, strict=True)
+    ]
+    assert_same(*models)
+    assert counts[0].n_starts == counts[1].n_starts > 3
+    assert counts[0].n_ends == counts[1].n_ends > 3

@@ -52,7 +52,7 @@ def with_policy(name, **policy_kwargs):
 
 
 SMALL = {"buffer_size": 100, "learning_starts": 10}
-ADAM = {"optimizer_kwargs": {"weight_decay": 0.1}}
+ADAM = {"optimizer_kwargs": {"amsgrad": True}}
 REFUSALS = {
     "masks": (
         with_env("dqn", lambda: ActionMasks(gym.make("Warehouse-v0")), mask_actions=True),
@@ -78,16 +78,23 @@ REFUSALS = {
         with_env("ppo", lambda: Any(spaces.Box(0, 9, (3,), np.int64))),
         "observations are of int64",
     ),
-    "SiLU": (with_policy("ppo", activation_fn=nn.SiLU), "a network has a layer of SiLU"),
+    "Hardtanh": (
+        with_policy("ppo", activation_fn=nn.Hardtanh),
+        "a network has a layer of Hardtanh",
+    ),
+    "softer": (
+        with_policy("dqn", activation_fn=lambda: nn.Softplus(threshold=5)),
+        "a network has a Softplus with a threshold of 5",
+    ),
     "falling": (
         with_policy("dqn", activation_fn=lambda: nn.LeakyReLU(-0.1)),
         "a network has a layer of LeakyReLU that falls",
     ),
-    "AdamW": (
-        with_policy("ppo", optimizer_class=th.optim.AdamW),
-        "its optimizer is AdamW, not Adam or RMSprop",
+    "NAdam": (
+        with_policy("ppo", optimizer_class=th.optim.NAdam),
+        "its optimizer is NAdam, not Adam or RMSprop",
     ),
-    "weight decay": (with_policy("dqn", **ADAM), "its optimizer has weight_decay 0.1"),
+    "amsgrad": (with_policy("dqn", **ADAM), "its optimizer has amsgrad True"),
     "of one's own": (
         lambda **more: OwnDQN("MlpPolicy", Any(), **more),
         "OwnDQN may do things in Python of its own",
@@ -101,10 +108,6 @@ REFUSALS = {
             **SMALL,
         ),
         "its replay buffer is of another kind",
-    ),
-    "normalised": (
-        with_env("dqn", lambda: VecNormalize(make_vec_env(Any)), **SMALL),
-        "VecNormalize keeps what is not normalised in the replay buffer",
     ),
     "episodes of several": (
         with_env("dqn", lambda: make_vec_env(Any, 2), train_freq=(1, "episode"), **SMALL),
@@ -122,10 +125,11 @@ def test_compiled_says_why_not(case):
     assert model.num_timesteps == 0
 
 
-@pytest.mark.parametrize("case", ["masks", "SiLU", "AdamW", "of one's own", "normalised", "dict"])
+@pytest.mark.parametrize("case", ["masks", "Hardtanh", "NAdam", "of one's own", "dict"])
 def test_auto_falls_back_and_says_so(case):
     make, reason = REFUSALS[case]
-    model = make(engine="auto").learn(30)
+    short = {} if case in {"masks", "of one's own"} else {"n_steps": 16, "batch_size": 16}
+    model = make(engine="auto", **short).learn(30)
     assert model.engine_in_use == f"library: {reason}"
     assert model.num_timesteps >= 30
 
@@ -237,8 +241,43 @@ def test_normalised_environments(name):
     assert np.abs(buffer.rewards - 1).max() > 0.01
 
 
+@pytest.mark.parametrize("name", ["dqn", "double_dqn"])
+def test_normalised_environments_whose_buffer_is_not(name):
+    """It acts on what is normalised, and keeps what was there before."""
+    env = VecNormalize(make_vec_env("CartPole-v1", 2, seed=0))
+    model = load_algorithm(name)(
+        "MlpPolicy", env, engine="compiled", seed=0, **{**SMALL, "buffer_size": 400}
+    )
+    seen = []
+
+    class Watch(BaseCallback):
+        def _on_step(self):
+            seen.append((self.training_env.get_original_obs(), self.locals["new_obs"]))
+            return True
+
+    model.learn(100, callback=Watch())
+    assert model.engine_in_use.startswith("compiled but for the environment")
+    assert model._n_updates > 0
+    buffer, last = model.replay_buffer, len(seen) - 1
+    np.testing.assert_array_equal(buffer.observations[last], seen[-2][0])
+    assert np.abs(seen[-1][0] - seen[-1][1]).max() > 0.01
+    np.testing.assert_array_equal(buffer.rewards[: len(seen)], 1)
+    rules, memory = model_rules(model)
+    np.testing.assert_array_equal(memory.centre, env.obs_rms.mean)
+    assert rules["reward_spread"] == np.sqrt(env.ret_rms.var + env.epsilon)
+
+
+def model_rules(model):
+    """What a training would go by now."""
+    with model._learning_compiled():
+        training = model._shared_training()
+        training.read_settings()
+        return training.held.rules[0], training.memory.held
+
+
 def test_processes_of_their_own():
-    env = make_vec_env("CartPole-v1", 2, seed=0, vec_env_cls=SubprocVecEnv)
+    forks = {"start_method": "fork"}  # they would import for seconds
+    env = make_vec_env("CartPole-v1", 2, 0, vec_env_cls=SubprocVecEnv, vec_env_kwargs=forks)
     model = load_algorithm("a2c")("MlpPolicy", env, engine="auto").learn(50)
     env.close()
     reason = "SubprocVecEnv is not DummyVecEnv"

@@ -43,12 +43,11 @@ class Plain(BaseCallback):
 
 
 class Diary(BlockCallback):
-    """Writes down what can be seen after each step, and at the end of each of Python's rollouts."""
+    """Writes down what can be seen after each step."""
 
     def __init__(self):
         super().__init__()
         self.steps = []
-        self.rollouts = []
 
     def horizon(self):
         return Horizon(calls=1)
@@ -83,10 +82,33 @@ class Diary(BlockCallback):
             episode and (episode["r"], episode["l"]),
         )
 
+
+class Rollouts(BlockCallback):
+    """Writes down what rollouts begin and end with."""
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def look(self, *more):
+        model = self.model
+        weights = th.cat([p.detach().flatten() for p in model.policy.parameters()])
+        self.found.append((self.n_calls, model._n_updates, float(weights.sum()), *more))
+
+    def _on_rollout_start(self):
+        self.look()
+
     def _on_rollout_end(self):
-        if hasattr(self.model, "rollout_buffer"):
-            buffer = self.model.rollout_buffer
-            self.rollouts.append([np.array(getattr(buffer, name)) for name in ROLLOUT])
+        if hasattr(self.model, "replay_buffer"):
+            self.look(self.model.replay_buffer.pos)
+            return
+        buffer = self.model.rollout_buffer
+        assert buffer.full
+        arrays = [np.array(getattr(buffer, name)) for name in ROLLOUT]
+        self.look(buffer.pos, *arrays)
+
+    def _on_step(self):
+        return True
 
 
 ROLLOUT = ("observations", "actions", "rewards", "episode_starts", "values", "log_probs")
@@ -135,15 +157,27 @@ def train(mode, name, make_env, n_envs, steps, log_interval, **kwargs):
         policy_kwargs={"net_arch": [16]},
         **kwargs,
     )
-    lists, diary = Lists(), Diary()
+    lists, diary, rollouts = Lists(), Diary(), Rollouts()
     model.set_logger(Logger(None, [lists]))
-    callback = CallbackList([diary, Plain()]) if mode == "parts" else diary
+    asked = {"compiled": [diary], "parts": [diary, Plain(), rollouts]}
+    callback = CallbackList(asked.get(mode, [diary, rollouts]))
     with pytest.MonkeyPatch.context() as patch:
         if mode == "library":
             draw_as_compiled(patch, model)
         model.learn(steps, callback=callback, log_interval=log_interval)
-    assert (model.engine_in_use == "compiled") == (mode == "compiled")
-    return model, diary, lists.dumps
+    assert (model.engine_in_use == "compiled") == (mode in {"compiled", "rollouts"})
+    return model, diary, lists.dumps, rollouts.found
+
+
+def by_library(name, make_env, n_envs, steps, log_interval, **kwargs):
+    """What the library does, once for all that is held against it."""
+    key = name, make_env, n_envs, steps, log_interval, repr(kwargs)
+    if key not in _by_library:
+        _by_library[key] = train("library", name, make_env, n_envs, steps, log_interval, **kwargs)
+    return _by_library[key]
+
+
+_by_library = {}
 
 
 def unflattened(model, name):
@@ -172,6 +206,14 @@ def assert_same_steps(ours, theirs):
                 assert our[name] == pytest.approx(value, rel=1e-12), (i, name)
             else:
                 assert our[name] == value, (i, name)
+
+
+def assert_same_rollouts(ours, theirs):
+    assert len(ours) == len(theirs) > 5
+    for our, their in zip(ours, theirs, strict=True):
+        assert our[:2] == their[:2]
+        for pair in zip(our[2:], their[2:], strict=True):
+            assert_close(*pair)
 
 
 def assert_same_logs(ours, theirs):
@@ -204,16 +246,17 @@ Q_CASES = {
 }
 
 
-@pytest.mark.parametrize("mode", ["parts", "compiled"])
+@pytest.mark.parametrize("mode", ["parts", "compiled", "rollouts"])
 @pytest.mark.parametrize("case", Q_CASES)
 def test_deep_q_learning_does_what_the_library_does(case, mode):
     name, make_env, n_envs, kwargs = Q_CASES[case]
-    arguments = {**Q, **kwargs}
-    (ours, diary, logs), (theirs, their_diary, their_logs) = (
-        train(which, name, make_env, n_envs, 403, 3, **arguments) for which in (mode, "library")
-    )
-    assert ours.num_timesteps == theirs.num_timesteps >= 403
+    arguments = name, make_env, n_envs, 303, 3
+    ours, diary, logs, rollouts = train(mode, *arguments, **Q, **kwargs)
+    theirs, their_diary, their_logs, their_rollouts = by_library(*arguments, **Q, **kwargs)
+    assert ours.num_timesteps == theirs.num_timesteps >= 303
     assert_same_steps(diary, their_diary)
+    if mode != "compiled":
+        assert_same_rollouts(rollouts, their_rollouts)
     assert len(their_logs) > 5
     assert_same_logs(logs, their_logs)
     for array in REPLAY:
@@ -238,14 +281,15 @@ POLICY_CASES = {
 }
 
 
-@pytest.mark.parametrize(("mode", "log_interval"), [("parts", 2), ("compiled", 1), ("compiled", 3)])
+@pytest.mark.parametrize(
+    ("mode", "log_interval"), [("parts", 3), ("rollouts", 3), ("compiled", 3), ("compiled", 1)]
+)
 @pytest.mark.parametrize("case", POLICY_CASES)
 def test_policy_gradients_do_what_the_library_does(case, mode, log_interval):
     name, make_env, n_envs, kwargs = POLICY_CASES[case]
-    (ours, diary, logs), (theirs, their_diary, their_logs) = (
-        train(which, name, make_env, n_envs, 250, log_interval, **kwargs)
-        for which in (mode, "library")
-    )
+    arguments = name, make_env, n_envs, 250, log_interval
+    ours, diary, logs, rollouts = train(mode, *arguments, **kwargs)
+    theirs, their_diary, their_logs, their_rollouts = by_library(*arguments, **kwargs)
     assert ours.num_timesteps == theirs.num_timesteps >= 250
     assert_same_steps(diary, their_diary)
     assert_same_logs(logs, their_logs)
@@ -254,8 +298,5 @@ def test_policy_gradients_do_what_the_library_does(case, mode, log_interval):
     assert ours.rollout_buffer.full
     assert ours._n_updates == theirs._n_updates
     assert ours._last_episode_starts.tolist() == theirs._last_episode_starts.tolist()
-    if mode == "parts":
-        assert len(diary.rollouts) == len(their_diary.rollouts)
-        for pair in zip(diary.rollouts, their_diary.rollouts, strict=True):
-            for arrays in zip(*pair, strict=True):
-                assert_close(*arrays)
+    if mode != "compiled":
+        assert_same_rollouts(rollouts, their_rollouts)
