@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from experiments.planned_runs import PlannedRun
+from experiments.run_curves import Curve
 from experiments.study_results import read_run
 from pipeline.errors import UserError
 from tuning.tuning_spec import Objective, TuningSpec
@@ -67,7 +67,7 @@ def _figure(row: Mapping[str, Any], name: str) -> float:
     return float(value)
 
 
-def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: pd.DataFrame) -> float:
+def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> float:
     """Steps or seconds until the learning curve comes to the threshold.
 
     Source: a run that never does counts twice, as in the PAR-k of Hutter et al. (2009), "ParamILS",
@@ -79,8 +79,9 @@ def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: pd.DataFrame)
             f"--metric {name}: nobody says which return is to be reached on "
             f"{tuning.environment.env_id}; give --threshold"
         )
-    points = evaluations["step" if name == "steps" else "seconds"].to_numpy(dtype=np.float64)
-    reached = steps_to_threshold(points, evaluations["value"].to_numpy(), float(threshold))
+    figures = evaluations.figures
+    points = figures["step" if name == "steps" else "seconds"]
+    reached = steps_to_threshold(points, figures["value"], float(threshold))
     whole = float(row["n_timesteps"] if name == "steps" else row["seconds"])
     return float(reached) if math.isfinite(reached) else WHOLE_RUNS * whole
 
