@@ -1,11 +1,11 @@
 """What a setting is worth by its runs, worked out by hand."""
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments.run_curves import Curve
 from experiments.study_results import RunResults
 from pipeline.errors import UserError
 from tuning import judging
@@ -37,9 +37,8 @@ def test_a_cost_is_a_score_with_its_sign_turned(figures, objective):
 
 
 def outcome(toy, monkeypatch, figure, **row):
-    evaluations = pd.DataFrame(
-        {"step": [10, 20, 30], "seconds": [0.5, 1.0, 1.5], "value": [0.0, 0.6, 0.4]}
-    )
+    figures = {"step": [10, 20, 30], "seconds": [0.5, 1.0, 1.5], "value": [0.0, 0.6, 0.4]}
+    evaluations = Curve({}, {name: np.array(values) for name, values in figures.items()})
     row = {"seconds": 2.0, "n_timesteps": 30, "threshold": 0.5, **row}
     results = RunResults([row], [evaluations])
     monkeypatch.setattr(judging, "read_run", lambda *_: results)
