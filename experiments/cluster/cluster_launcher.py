@@ -224,6 +224,7 @@ class ClusterLauncher:
                 sent.refuse(one_line(error))
         else:
             sent.worker = None
+            self._workers = {}
             self.connection.lose(task.client)
         self._send(sent)
 

@@ -7,9 +7,11 @@ import logging
 import math
 import signal
 import sys
+import warnings
 from collections.abc import Callable, Iterator
 from multiprocessing import resource_tracker
 
+import dask
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
@@ -24,6 +26,10 @@ from experiments.cluster.connections import SECONDS_TO_CONNECT
 from experiments.cluster.job_queues import QUEUES, has_certificates, opened_queue
 from pipeline.errors import UserError, one_line
 from pipeline.stopping import current
+
+# How long a killed worker may take to be started again, before it is given up for another: Dask's
+# 15 seconds are soon over on a machine that is busy.
+SECONDS_TO_RESTART = 60
 
 Connect = Callable[[], Client]
 
@@ -52,15 +58,17 @@ def opened(
         is_told: whether the user has said that an open one will do.
 
     Yields:
-        What makes a client of it; and what is to be called now and then, so that jobs that have
-        ended are replaced.
+        What makes a client of it; and what is to be called now and then, so that workers and jobs
+        that have ended are replaced.
     """
     _be_quiet()
+    dask.config.set({"distributed.deploy.lost-worker-timeout": SECONDS_TO_RESTART})
     if isinstance(cluster, SchedulerAddress):
         yield lambda: _client_of(cluster, is_told), _nothing
     elif isinstance(cluster, LocalWorkers):
         with _local(cluster.n_workers) as local:
-            yield lambda: Client(local, set_as_default=False), _nothing
+            n_workers = cluster.n_workers
+            yield lambda: Client(local, set_as_default=False), lambda: local.scale(n_workers)
     else:
         n_jobs = math.ceil(n_runs / cluster.n_cores)
         with opened_queue(cluster) as queue:
@@ -73,6 +81,7 @@ def _be_quiet() -> None:
     for name in ("distributed", *logging.root.manager.loggerDict):
         if name.partition(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Creating scratch directories")
 
 
 def _nothing() -> None:
