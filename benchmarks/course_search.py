@@ -1,7 +1,7 @@
 """A course's search for learning rate, discount and epsilon, and how often it is fooled.
 
-    python benchmarks/course_search.py       # twenty searches of each kind: five minutes of one core
-    python benchmarks/course_search.py 5     # fewer
+    python benchmarks/course_search.py      # ten searches of each kind: three minutes
+    python benchmarks/course_search.py 5    # fewer
 
 Q-learning on the warehouse is searched for by a grid and by a TPE study of as many trials, each
 judging a setting by one seed or by five, from the file that ``tune.py`` takes:
@@ -38,7 +38,7 @@ ROOT = Path(__file__).resolve().parent.parent
 ENV, ALGO = "Warehouse-v0", "qlearning"
 SPACE = read_search_space(ALGO, ENV, ROOT / "studies" / "search" / "warehouse.yml")
 POINTS = 3  # of each of three settings
-N_SEARCHES = 20
+N_SEARCHES = 10
 HELD_OUT = range(1000, 1020)
 # Below the last digit that is shown.
 NOTHING = 0.0005

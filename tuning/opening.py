@@ -5,12 +5,14 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents import ALGORITHMS
 from experiments.study_plan import check_settings
 from pipeline.errors import UserError
+from tuning.judging import judged
 from tuning.pruning import is_hopeless
 from tuning.samplers import make_sampler
 from tuning.search_spaces import read_search_space
@@ -52,7 +54,9 @@ class OpenTuning:
             if trial.number != number
         }
         scores = {seed: sign * figure for seed, figure in figures.items()}
-        return is_hopeless(scores, list(others.values()), self.tuning.pruner)
+        # Costs have their sign turned: of what is left, higher is better.
+        value = partial(judged, objective=self.tuning.objective, is_cost=False)
+        return is_hopeless(scores, list(others.values()), self.tuning.pruner, value)
 
 
 def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pipeline.errors import unknown
 
 Scores = Mapping[int, float]  # by seed
+Value = Callable[[Sequence[float]], float]
 
 # The least that anything is concluded from.
 MIN_SEEDS = 2
@@ -24,40 +25,48 @@ REDUCTION = 3
 SEEDS_FOR_RANKS = 10
 
 
-def is_hopeless(scores: Scores, others: Sequence[Scores], method: str = "auto") -> bool:
+def mean(scores: Sequence[float]) -> float:
+    """The mean of scores."""
+    return sum(scores) / len(scores)
+
+
+def is_hopeless(
+    scores: Scores, others: Sequence[Scores], method: str = "auto", value: Value = mean
+) -> bool:
     """Whether to end a trial early.
 
     Args:
         scores: of the trial's seeds so far, the higher the better.
         others: the same of all other trials, ended ones and those under way.
         method: a key of `PRUNERS`.
+        value: what scores are worth together.
 
     Raises:
         UserError: if there is no such method.
     """
     if method not in PRUNERS:
         raise unknown("--pruner: there is none called", method, PRUNERS)
-    return bool(scores) and PRUNERS[method](scores, others)
+    return bool(scores) and PRUNERS[method](scores, others, value)
 
 
-def never(scores: Scores, others: Sequence[Scores]) -> bool:
+def never(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
     """No trial is ended early."""
     return False
 
 
-def below_median(scores: Scores, others: Sequence[Scores]) -> bool:
-    """Whether the mean is below the median of the others' on the same seeds.
+def below_median(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+    """Whether the trial is below the median of the others on the same seeds.
 
     Source: the median stopping rule of Golovin et al. (2017), "Google Vizier", KDD.
     """
     import numpy as np
 
-    theirs = _means(others, scores)
+    theirs = _values(others, scores, value)
     enough = len(scores) >= MIN_SEEDS and len(theirs) >= MIN_OTHERS
-    return enough and _mean(scores, scores) < float(np.median(theirs))
+    return enough and value([*scores.values()]) < float(np.median(theirs))
 
 
-def out_of_the_race(scores: Scores, others: Sequence[Scores]) -> bool:
+def out_of_the_race(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
     """Whether the trial is not among the best third at a rung of 1, 3, 9, ... seeds.
 
     Source: asynchronous successive halving, Li et al. (2020), "A system for massively parallel
@@ -66,15 +75,15 @@ def out_of_the_race(scores: Scores, others: Sequence[Scores]) -> bool:
     n_seeds = 1
     while n_seeds < len(scores):
         n_seeds *= REDUCTION
-    theirs = _means(others, scores)
+    theirs = _values(others, scores, value)
     if n_seeds != len(scores) or len(theirs) < MIN_OTHERS:
         return False
-    own = _mean(scores, scores)
-    n_better = sum(mean > own for mean in theirs)
+    own = value([*scores.values()])
+    n_better = sum(other > own for other in theirs)
     return n_better >= max(1, (len(theirs) + 1) // REDUCTION)
 
 
-def worse_by_ranks(scores: Scores, others: Sequence[Scores]) -> bool:
+def worse_by_ranks(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
     """Whether a signed-rank test on the seeds in common finds the trial worse than the best one.
 
     A trial whose mean is not below the best one's goes on whatever the test says.
@@ -83,14 +92,14 @@ def worse_by_ranks(scores: Scores, others: Sequence[Scores]) -> bool:
     """
     from scipy.stats import wilcoxon
 
-    differences = _differences(scores, others)
+    differences = _differences(scores, _best(others, value))
     if len(differences) < MIN_SEEDS or sum(differences) >= 0:
         return False
     test = wilcoxon(differences, alternative="less", zero_method="zsplit")
     return bool(test.pvalue < P_THRESHOLD)
 
 
-def worse_by_means(scores: Scores, others: Sequence[Scores]) -> bool:
+def worse_by_means(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
     """Whether a paired t test on the seeds in common finds the trial worse than the best one.
 
     Source: racing as in Birattari et al. (2002), "A racing algorithm for configuring
@@ -99,7 +108,7 @@ def worse_by_means(scores: Scores, others: Sequence[Scores]) -> bool:
     import numpy as np
     from scipy.stats import t
 
-    differences = np.asarray(_differences(scores, others))
+    differences = np.asarray(_differences(scores, _best(others, value)))
     if len(differences) < MIN_SEEDS or differences.sum() >= 0:
         return False
     error = differences.std(ddof=1) / np.sqrt(len(differences))
@@ -108,29 +117,30 @@ def worse_by_means(scores: Scores, others: Sequence[Scores]) -> bool:
     return bool(t.cdf(differences.mean() / error, len(differences) - 1) < P_THRESHOLD)
 
 
-def cannot_win(scores: Scores, others: Sequence[Scores]) -> bool:
-    """Whether the mean stays below the best trial's even if all that is left goes perfectly.
+def cannot_win(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+    """Whether the trial stays below the best one even if all that is left goes perfectly.
 
     Perfect is the highest score that any trial has had. The only rule that ends no trial that would
     have been chosen, as far as that holds.
     """
-    best = _best(others)
+    best = _best(others, value)
     if len(best) <= len(scores):
         return False
     perfect = max(max(each.values()) for each in (*others, scores) if each)
-    missing = len(best) - len(scores)
-    total = sum(best.values())
-    return sum(scores.values()) + missing * perfect < total - 1e-9 * max(1.0, abs(total))
+    at_most = value([*scores.values()] + [perfect] * (len(best) - len(scores)))
+    to_beat = value([*best.values()])
+    return at_most < to_beat - 1e-9 * max(1.0, abs(to_beat))
 
 
-def no_chance(scores: Scores, others: Sequence[Scores]) -> bool:
+def no_chance(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
     """Whether the trial cannot win, or has many seeds to come and loses by ranks."""
-    if cannot_win(scores, others):
+    if cannot_win(scores, others, value):
         return True
-    return len(_best(others)) >= SEEDS_FOR_RANKS and worse_by_ranks(scores, others)
+    has_many = len(_best(others, value)) >= SEEDS_FOR_RANKS
+    return has_many and worse_by_ranks(scores, others, value)
 
 
-PRUNERS: Mapping[str, Callable[[Scores, Sequence[Scores]], bool]] = {
+PRUNERS: Mapping[str, Callable[[Scores, Sequence[Scores], Value], bool]] = {
     "auto": no_chance,
     "none": never,
     "bound": cannot_win,
@@ -141,23 +151,18 @@ PRUNERS: Mapping[str, Callable[[Scores, Sequence[Scores]], bool]] = {
 }
 
 
-def _mean(scores: Scores, seeds: Scores) -> float:
-    return sum(scores[seed] for seed in seeds) / len(seeds)
+def _values(others: Sequence[Scores], seeds: Scores, value: Value) -> list[float]:
+    """On these seeds, of those trials that have them all."""
+    return [value([each[seed] for seed in seeds]) for each in others if seeds.keys() <= each.keys()]
 
 
-def _means(others: Sequence[Scores], seeds: Scores) -> list[float]:
-    """Of those that have these seeds all."""
-    return [_mean(each, seeds) for each in others if seeds.keys() <= each.keys()]
-
-
-def _best(others: Sequence[Scores]) -> Scores:
-    """The trial with the highest mean among those with the most seeds."""
+def _best(others: Sequence[Scores], value: Value) -> Scores:
+    """The best trial among those with the most seeds."""
     longest = max((len(each) for each in others), default=0)
     whole = [each for each in others if len(each) == longest > 0]
-    return max(whole, key=lambda each: _mean(each, each), default={})
+    return max(whole, key=lambda each: value([*each.values()]), default={})
 
 
-def _differences(scores: Scores, others: Sequence[Scores]) -> list[float]:
+def _differences(scores: Scores, best: Scores) -> list[float]:
     """By how much the trial is better than the best one on each of the seeds in common."""
-    best = _best(others)
     return [score - best[seed] for seed, score in scores.items() if seed in best]

@@ -1,7 +1,8 @@
 """Spaces of settings to search: read from files, asked by Optuna, and back from settings.
 
-``search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see `docs/tuning.md`. What an
-environment's entry says replaces what ``default`` says of the same name; null takes it out.
+``search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see
+`docs/search-spaces.md`. What an environment's entry says replaces what ``default`` says of the same
+name; null takes it out.
 """
 
 from __future__ import annotations

@@ -63,16 +63,17 @@ def _edge(trials: Trials) -> float | None:
         return None
     sign = -1.0 if trials.is_cost else 1.0
     goods = np.sort(sign * values)
-    least = float(goods[int((1 - _SHOWN) * (goods.size - 1))])
-    edge = least - 0.15 * (float(goods[-1]) - least)
-    return sign * edge if edge > goods[0] else None
+    worst, best = float(goods[0]), float(goods[-1])
+    least = float(goods[math.ceil((1 - _SHOWN) * (goods.size - 1))])
+    edge = least - 0.15 * (best - least)
+    return sign * edge if edge - worst > best - edge else None
 
 
 def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
     """Each trial as a line through its parameters, the most important ones first."""
     ranges = trials.distributions()
     names = [*shares, *(name for name in ranges if name not in shares)]
-    ranked = sorted(trials.judged, key=lambda t: t["value"], reverse=not trials.is_cost)
+    ranked = sorted(trials.judged, key=lambda t: t["value"], reverse=trials.is_cost)
     return {
         "axes": [{"name": name, "ticks": _ticks(ranges[name])} for name in names],
         "lines": [

@@ -65,7 +65,7 @@ def cost(trials: Trials) -> list[tuple[str, str]]:
 def _duration(seconds: float | None) -> str:
     if seconds is None:
         return LEFT_OUT
-    if seconds < 60:
+    if seconds < 90:
         return f"{seconds:.0f} s"
     minutes, hours = seconds / 60, seconds / 3600
     return f"{minutes:.0f} min" if minutes < 90 else f"{hours:.1f} h"

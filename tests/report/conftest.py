@@ -1,5 +1,6 @@
 """Analyses made up by hand, so that what is drawn and printed can be worked out on paper."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -177,3 +178,80 @@ def canvases(monkeypatch):
 
     monkeypatch.setattr(style.Figure, "savefig", keep)
     return seen
+
+
+# As Optuna writes them.
+SEARCH_SPACE = {
+    "rate": ("Float", {"step": None, "low": 0.01, "high": 1.0, "log": True}),
+    "kind": ("Categorical", {"choices": ["a", None, True]}),
+    "steps": ("Int", {"step": 1, "low": 1, "high": 5, "log": False}),
+}
+
+
+def made_up_trial(number, value, figures, state="complete", failure=None, **params):
+    return {
+        "number": number,
+        "state": state,
+        "value": value,
+        "params": {"rate": 0.1, "kind": "a", "steps": 3} | params,
+        "settings": {"learning_rate": number, "gamma": 0.9} | ({"tau": 1.0} if number == 2 else {}),
+        "figures": figures,
+        "seconds": 2.0 * len(figures),
+        "failure": failure,
+        "began": f"2026-01-01T00:00:{number % 60:02d}",
+        "ended": f"2026-01-01T00:01:{number % 60:02d}",
+    }
+
+
+@pytest.fixture
+def tuning_record():
+    """What a tuning wrote down, made up."""
+    retested = {"held_out": 0.5, "verdict": "", "n_runs": 4, "in_search": 0.6, "number": 0}
+    interval = {"point": 0.5, "low": 0.4, "high": 0.6, "n": 4, "n_missing": 0}
+    return {
+        "name": "t",
+        "command": "python tune.py <script>",
+        "asked": {
+            "algo": "dqn",
+            "env": "Toy-v0",
+            "sampler": "tpe",
+            "pruner": "auto",
+            "search_space": {
+                name: json.dumps({"name": f"{kind}Distribution", "attributes": attributes})
+                for name, (kind, attributes) in SEARCH_SPACE.items()
+            },
+        },
+        "figure": "score",
+        "objective": "mean",
+        "lower_is_better": False,
+        "n_trials": 10,
+        "seeds": [1, 0],
+        "held_out_seeds": [1000, 1001],
+        "widened": ["rate"],
+        "trials": [
+            made_up_trial(0, 0.6, {"1": 0.6, "0": 0.6}),
+            made_up_trial(1, -30.0, {"1": -30.0}, "pruned", rate=1.0),
+            made_up_trial(2, 0.8, {"1": 0.8, "0": 0.8}, kind=None),
+            made_up_trial(3, 0.7, {"1": 0.7, "0": 0.7}, steps=5),
+            made_up_trial(4, None, {}, "pruned", failure="it broke"),
+            made_up_trial(5, None, {}, "running"),
+            made_up_trial(6, 0.75, {"1": 0.75}, "pruned", kind=True),
+        ],
+        "retest": {
+            "settings": [
+                {**retested, "label": "shipped", "interval": interval},
+                {**retested, "label": "trial 2", "number": 2, "held_out": 0.7, "verdict": "better"}
+                | {"interval": interval},
+            ],
+            "winner": "trial 2",
+            "winner_file": "winner.yml",
+            "reason": "",
+            "optimism": 0.1,
+        },
+    }
+
+
+@pytest.fixture
+def tuning_trial():
+    """Makes up a trial."""
+    return made_up_trial

@@ -23,6 +23,7 @@ from report.page.markup import STYLES, package_file, templates
 from report.page.settings_section import SettingsTable
 from report.series.agent_marks import agent_marks
 from report.series.study_series import study_series
+from report.tuning_page import write_tuning_page
 from report.verdict_table import verdicts_as
 from verdicts import Estimate
 
@@ -716,3 +717,16 @@ def test_no_tick_is_printed_over_another(page):
         assert len(ticks) >= 4
         gaps = [b - a for a, b in pairwise(ticks)]
         assert min(gaps) >= 0.085 * (top - bottom)
+
+
+def test_the_page_of_a_search_draws_and_fits_a_telephone(browser, tuning_record, tmp_path):
+    path = tmp_path / "report.html"
+    write_tuning_page(tuning_record, path, "retest/report.html")
+    resize(browser, 390)
+    browser.get_log("browser")
+    browser.get(path.as_uri())
+    wait(browser, lambda: plots(browser) >= 3)
+    assert browser.execute_script("return document.querySelectorAll('.js-plotly-plot').length") == 3
+    assert browser.execute_script("return document.documentElement.scrollWidth") == 390
+    assert "Triangles at the edge lie beyond it. Failed: trial 4." in find(browser, "#history").text
+    assert browser.get_log("browser") == []

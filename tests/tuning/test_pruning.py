@@ -1,5 +1,7 @@
 """Trials are ended early when they are hopeless, and not before."""
 
+import statistics
+
 import pytest
 
 from pipeline.errors import UserError
@@ -47,6 +49,14 @@ def test_perfect_is_the_highest_score_that_any_trial_has_had():
     best = scored(-110.0, -110.0)
     assert not is_hopeless(scored(-115.0), [best, scored(-100.0, -200.0)], "bound")
     assert is_hopeless(scored(-115.0), [best, scored(-108.0, -200.0)], "bound")
+
+
+def test_the_bound_holds_for_whatever_a_setting_is_judged_by():
+    others = [scored(0.9, 0.9, 0.9), scored(1.0, 0.1)]
+    # One failed seed of three sinks a mean, and no median.
+    assert is_hopeless(scored(0.1), others, "bound")
+    assert not is_hopeless(scored(0.1), others, "bound", statistics.median)
+    assert is_hopeless(scored(0.1, 0.1), others, "bound", statistics.median)
 
 
 def test_the_median_is_that_of_the_others_on_the_same_seeds():
