@@ -150,9 +150,9 @@ def best_actions(
 
 def _table_alone(agent: BaseAlgorithm) -> QTablePolicy | None:
     """The agent's table, where what it says is best is what `predict` would tell."""
-    is_ours = isinstance(agent, TabularAlgorithm) and type(agent.policy) is QTablePolicy
-    is_as_it_was = type(agent).predict is TabularAlgorithm.predict
-    return agent.policy if is_ours and is_as_it_was and not takes_masks(agent) else None
+    is_ours = type(agent).predict is TabularAlgorithm.predict and not takes_masks(agent)
+    table: object = agent.policy if is_ours else None
+    return table if type(table) is QTablePolicy else None
 
 
 def _in_parts(

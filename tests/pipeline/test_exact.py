@@ -243,6 +243,26 @@ def test_a_large_warehouse_is_evaluated_exactly(slip):
     assert evaluator.yardstick.optimum == pytest.approx(best.start_value, rel=1e-9)
 
 
+def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
+    class Contrary(load_algorithm("qlearning")):
+        def predict(self, observation, **kwargs):
+            actions, state = super().predict(observation, **kwargs)
+            return 3 - actions, state
+
+    rng, states = np.random.default_rng(0), np.arange(16)
+    for tables, algorithm in (
+        (1, load_algorithm("qlearning")),
+        (2, load_algorithm("double_qlearning")),
+    ):
+        agent = algorithm(env="FrozenLake-v1")
+        assert len(agent.policy.q_tables) == tables
+        agent.policy.q_tables.numpy()[:] = rng.normal(size=(tables, 16, 4)).round(1)
+        expected, _ = agent.predict(states, deterministic=True)
+        assert (asked_policies.best_actions(agent, states) == expected).all()
+    contrary = Contrary(env="FrozenLake-v1")
+    assert (asked_policies.best_actions(contrary, states) == 3).all()
+
+
 def test_what_an_unknown_agent_samples_from_is_not_guessed():
     env = exact_evaluator(spec_of("FrozenLake"))
     with pytest.raises(TypeError, match="action probabilities of Lookup are not known"):
