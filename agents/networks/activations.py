@@ -1,6 +1,6 @@
 """Activation functions in single precision, and their derivatives.
 
-Those of most can be told from the output alone. Of the others, which come last, inputs are kept.
+Those of the first can be told from the output alone. Of the others inputs are kept.
 
 Sources: Clevert, Unterthiner and Hochreiter (2016) for ELU, Klambauer et al. (2017) for SELU,
 Hendrycks and Gimpel (2016) for GELU and SiLU, Misra (2020) for Mish.
@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 
 from agents.networks.matrix_products import Singles
-from mdp.machine_code import internal, vectorised
+from mdp.machine_code import called, internal, vectorised
 
-IDENTITY, RELU, TANH, ELU, LEAKY_RELU, SIGMOID, SELU, SOFTPLUS, SILU, GELU, FAST_GELU, MISH = range(
-    12
-)
+IDENTITY, RELU, TANH, ELU, LEAKY_RELU, SIGMOID = range(6)
+SELU, SOFTPLUS, SILU, GELU, FAST_GELU, MISH = range(6, 12)
 
-# From here on the derivative asks for the input.
-FIRST_BY_INPUT = SILU
+# From here on inputs are kept for the derivative.
+FIRST_BY_INPUT = SELU
 
 # Coefficients of a rational function of x squared, from the highest power on, as Eigen's
 # `generic_fast_tanh_float` has them: within a few units in the last place, and without a call, so
@@ -90,26 +89,32 @@ def _one_by_one(x: Any, kind: int, slope: Any) -> Any:
     if kind == LEAKY_RELU:
         return x if x > _ZERO else slope * x
     if kind == SIGMOID:
-        return np.float32(_sigmoid(x))
-    if kind == SELU:
-        return np.float32(_SELU_SCALE * (x if x > _ZERO else _SELU_ALPHA * math.expm1(x)))
-    if kind == SOFTPLUS:
-        return np.float32(_softplus(float(x * slope)) / slope)
+        return np.float32(1 / (1 + math.exp(-x)))
     return x
 
 
-@vectorised
-def activate_kept(inputs: Singles, bias: Singles, outputs: Singles, kind: int) -> None:
+# Those of the other kinds are rare: by functions of their own, which are called for each number,
+# they add little to what has to be compiled.
+
+
+@called
+def activate_kept(
+    inputs: Singles, bias: Singles, outputs: Singles, kind: int, slope: float
+) -> None:
     """As `activate`, of a function from `FIRST_BY_INPUT` on; ``inputs`` keep what it is given."""
     for i in range(len(inputs)):
         row, to = inputs[i], outputs[i]
         for j in range(len(row)):
             row[j] += bias[j]
-            to[j] = np.float32(_by_input(float(row[j]), kind))
+            to[j] = np.float32(_by_input(float(row[j]), kind, slope))
 
 
-@internal
-def _by_input(x: float, kind: int) -> float:
+@called
+def _by_input(x: float, kind: int, slope: float) -> float:
+    if kind == SELU:
+        return _SELU_SCALE * (x if x > 0 else _SELU_ALPHA * math.expm1(x))
+    if kind == SOFTPLUS:
+        return _softplus(x * slope) / slope
     if kind == SILU:
         return x * _sigmoid(x)
     if kind == GELU:
@@ -120,7 +125,7 @@ def _by_input(x: float, kind: int) -> float:
 
 
 @internal
-def _sigmoid(x: Any) -> float:
+def _sigmoid(x: float) -> float:
     return 1 / (1 + math.exp(-x))
 
 
@@ -160,25 +165,24 @@ def _derivative(output: Any, kind: int, slope: Any) -> Any:
         return _ONE if output > _ZERO else slope
     if kind == SIGMOID:
         return output * (_ONE - output)
-    if kind == SELU:
-        scale = np.float32(_SELU_SCALE)
-        return scale if output > _ZERO else output + scale * np.float32(_SELU_ALPHA)
-    if kind == SOFTPLUS:
-        return np.float32(-math.expm1(-output * slope))
     return _ONE
 
 
-@vectorised
-def pull_back_kept(errors: Singles, inputs: Singles, kind: int) -> None:
+@called
+def pull_back_kept(errors: Singles, inputs: Singles, kind: int, slope: float) -> None:
     """As `pull_back`, of a function from `FIRST_BY_INPUT` on."""
     for i in range(len(errors)):
         error, row = errors[i], inputs[i]
         for j in range(len(error)):
-            error[j] *= np.float32(_derivative_by_input(float(row[j]), kind))
+            error[j] *= np.float32(_derivative_by_input(float(row[j]), kind, slope))
 
 
-@internal
-def _derivative_by_input(x: float, kind: int) -> float:
+@called
+def _derivative_by_input(x: float, kind: int, slope: float) -> float:
+    if kind == SELU:
+        return _SELU_SCALE * (1.0 if x > 0 else _SELU_ALPHA * math.exp(x))
+    if kind == SOFTPLUS:
+        return _sigmoid(x * slope)
     if kind == SILU:
         share = _sigmoid(x)
         return share * (1 + x * (1 - share))

@@ -159,7 +159,7 @@ def forward(layers: Layers, flat: Singles, inputs: Inputs, n: int, outputs: Sing
         else:
             multiply(layers.sgemm, below, weights, product)
         if kind >= FIRST_BY_INPUT:
-            activate_kept(product, bias, above, kind)
+            activate_kept(product, bias, above, kind, layers.slope)
         else:
             activate(above, bias, kind, np.float32(layers.slope))
         below = above
@@ -210,7 +210,7 @@ def backward(
         multiply_transposed_right(layers.sgemm, error, weights_of(layers, flat, layer), error_below)
         if layers.activation >= FIRST_BY_INPUT:
             kept = kept_inputs_of(layers, outputs, layer - 1, n)
-            pull_back_kept(error_below, kept, layers.activation)
+            pull_back_kept(error_below, kept, layers.activation, layers.slope)
         else:
             pull_back(error_below, below, layers.activation, np.float32(layers.slope))
 
