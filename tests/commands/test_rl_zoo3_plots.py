@@ -81,25 +81,33 @@ def call(main, *words):
         assert main() == 0
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    """Two seeds of all agents as a study, and two of them by train.py as well."""
-    folder = tmp_path_factory.mktemp("zoo")
-    shared = {"n_timesteps": 120, "n_envs": 1, "eval_env_kwargs": {"max_episode_steps": 20}}
-    agents = {"qlearning": {}} | {
-        name: {"tuned": False, "policy": "MlpPolicy", **own} for name, own in LIBRARY.items()
-    }
+def compared(folder, name, settings, agents, env_id):
+    """Do a study of two seeds."""
     study = {
         "seeds": 2,
         "eval_freq": 40,
-        "settings": shared,
-        "agents": agents,
-        "environments": [ENV_ID],
+        "settings": {"n_timesteps": 120, **settings},
+        "agents": {
+            name: {"tuned": False, "policy": "MlpPolicy", **own} if own is not None else {}
+            for name, own in agents.items()
+        },
+        "environments": [env_id],
     }
-    (folder / "zoo.yml").write_text(yaml.safe_dump(study))
-    call(compare.main, "compare.py", folder / "zoo.yml", "--no-report", "-f", folder)
+    (folder / name).write_text(yaml.safe_dump(study))
+    call(compare.main, "compare.py", folder / name, "--no-report", "-f", folder)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Two seeds of all agents in two studies, and two of some of them by train.py as well."""
+    folder = tmp_path_factory.mktemp("zoo")
+    shared = {"n_envs": 1, "eval_env_kwargs": {"max_episode_steps": 20}}
+    compared(folder, "zoo.yml", shared, {"qlearning": None, **LIBRARY}, ENV_ID)
+    short = {"env_kwargs": {"max_episode_steps": 30}}
+    compared(folder, "robots.yml", short, CONTINUOUS, "Pendulum-v1")
     conf = folder / "short.yml"
-    conf.write_text(yaml.safe_dump({ENV_ID: {"policy": "MlpPolicy", **LIBRARY["ppo"], **shared}}))
+    entry = {"policy": "MlpPolicy", "n_timesteps": 120, **LIBRARY["ppo"], **shared}
+    conf.write_text(yaml.safe_dump({ENV_ID: entry}))
     words = ["train.py", "--env", ENV_ID, "--verbose", 0, "-f", folder / "logs", "--eval-freq", 40]
     for seed in (0, 1):
         call(train.main, *words, "--seed", seed, "--algo", "qlearning", "-n", 120)
@@ -107,35 +115,60 @@ def folder(tmp_path_factory):
     return folder
 
 
-@pytest.fixture(params=["logs", "zoo/runs"])
-def runs(folder, request):
-    return folder / request.param
-
-
 def agents_in(runs):
     return sorted(path.name for path in runs.iterdir())
 
 
-def test_plot_train(runs, tmp_path):
-    commands = [
-        ["rl_zoo3.plots.plot_train", "-a", algo, "-e", ENV_ID, "-f", runs, "-x", axis, "-w", 2]
-        for algo in agents_in(runs)
+def plot_commands(folder, name):
+    """Plots of a folder of runs, by what they are."""
+    runs, data = folder / name, folder / name.partition("/")[0]
+    algos, base = agents_in(runs), ["-e", ENV_ID, "-f", runs]
+    commands = {
+        ("plot_train", name, algo, axis): [*base, "-a", algo, "-x", axis, "-w", 2]
+        for algo in algos
         for axis in ("steps", "episodes", "time")
-    ]
-    assert not any("No data" in out for out in zoo(*commands, cwd=tmp_path))
+    }
+    words = [*base, "-a", *algos, "-l", "ours", "--no-display", "-print", "-o", f"{data}_data"]
+    commands["all_plots", name] = words
+    picture = ["-i", f"{data}_data.pkl", "-o", f"{data}_picture"]
+    commands["plot_from_file", name] = picture
+    return {key: [f"rl_zoo3.plots.{key[0]}", *words] for key, words in commands.items()}
 
 
-def test_all_plots_and_plot_from_file(runs, tmp_path):
+def enjoy(algo, env_id, runs, n_steps):
+    words = ["--algo", algo, "--env", env_id, "-f", runs, "--no-render", "-n", n_steps]
+    return ["rl_zoo3.enjoy", *words, "--device", "cpu", "--gym-packages", "envs"]
+
+
+@pytest.fixture(scope="module")
+def printed(folder):
+    """What commands print, by what they are: all in one process, since it imports for seconds."""
+    robots = folder / "robots" / "runs"
+    swings = ["-a", *CONTINUOUS, "-e", "Pendulum-v1", "-f", robots, "-l", "ours"]
+    commands = {
+        **plot_commands(folder, "logs"),
+        **plot_commands(folder, "zoo/runs"),
+        ("all_plots", "robots"): ["rl_zoo3.plots.all_plots", *swings, "--no-display", "-print"],
+        **{("enjoy", algo): enjoy(algo, ENV_ID, folder / "zoo/runs", 150) for algo in LIBRARY},
+        **{("enjoy", algo): enjoy(algo, "Pendulum-v1", robots, 60) for algo in CONTINUOUS},
+    }
+    return dict(zip(commands, zoo(*commands.values(), cwd=folder), strict=True))
+
+
+@pytest.mark.parametrize("name", ["logs", "zoo/runs"])
+def test_plot_train(printed, name):
+    said = [out for key, out in printed.items() if key[:2] == ("plot_train", name)]
+    assert len(said) >= 6
+    assert not any("No data" in out for out in said)
+
+
+@pytest.mark.parametrize("name", ["logs", "zoo/runs"])
+def test_all_plots_and_plot_from_file(folder, printed, name):
+    runs, begin = folder / name, name.partition("/")[0]
     algos = agents_in(runs)
-    words = ["-a", *algos, "-e", ENV_ID, "-f", runs, "-l", "ours", "--no-display"]
-    out, _ = zoo(
-        ["rl_zoo3.plots.all_plots", *words, "-print", "-o", "data"],
-        ["rl_zoo3.plots.plot_from_file", "-i", "data.pkl", "-o", "picture"],
-        cwd=tmp_path,
-    )
     for algo in algos:
-        assert f"{ENV_ID}-{algo.upper()}-ours: 2" in out
-    with (tmp_path / "data.pkl").open("rb") as file:
+        assert f"{ENV_ID}-{algo.upper()}-ours: 2" in printed["all_plots", name]
+    with (folder / f"{begin}_data.pkl").open("rb") as file:
         data = pickle.load(file)
     for algo in algos:
         curve = data[ENV_ID][f"{algo.upper()}-ours"]
@@ -143,42 +176,18 @@ def test_all_plots_and_plot_from_file(runs, tmp_path):
         assert curve["timesteps"].tolist() == ours[0]["timesteps"].tolist()
         expected = np.mean([run["results"].mean(axis=1) for run in ours], axis=0)
         assert np.allclose(curve["mean"], expected)
-    assert len(list(tmp_path.glob("picture*"))) == 1
+    assert len(list(folder.glob(f"{begin}_picture*"))) == 1
 
 
-def test_enjoy_plays_the_runs_of_a_study(folder, tmp_path):
-    options = ["--no-render", "-n", 150, "--device", "cpu", "--gym-packages", "envs"]
-    commands = [
-        ["rl_zoo3.enjoy", "--algo", algo, "--env", ENV_ID, "-f", folder / "zoo" / "runs", *options]
-        for algo in LIBRARY
-    ]
-    for algo, out in zip(LIBRARY, zoo(*commands, cwd=tmp_path), strict=True):
-        assert f"{algo}/{ENV_ID}_2" in out
-        assert "pisode" in out
+def test_enjoy_plays_the_runs_of_a_study(printed):
+    for algo in LIBRARY:
+        assert f"{algo}/{ENV_ID}_2" in printed["enjoy", algo]
+        assert "pisode" in printed["enjoy", algo]
 
 
-def test_agents_of_continuous_actions(tmp_path):
+def test_agents_of_continuous_actions(printed):
     """The same for those that act in Box spaces: compared here, plotted and played there."""
-    study = {
-        "seeds": 2,
-        "eval_freq": 40,
-        "settings": {"n_timesteps": 120, "env_kwargs": {"max_episode_steps": 30}},
-        "agents": {
-            name: {"tuned": False, "policy": "MlpPolicy", **own} for name, own in CONTINUOUS.items()
-        },
-        "environments": ["Pendulum-v1"],
-    }
-    (tmp_path / "robots.yml").write_text(yaml.safe_dump(study))
-    call(compare.main, "compare.py", tmp_path / "robots.yml", "--no-report", "-f", tmp_path)
-    where = ["-f", tmp_path / "robots" / "runs"]
-    words = ["--env", "Pendulum-v1", *where, "--no-render", "-n", 60, "--device", "cpu"]
-    labelled = ["-l", "ours", "--no-display", "-print"]
-    plots, *played = zoo(
-        ["rl_zoo3.plots.all_plots", "-a", *CONTINUOUS, "-e", "Pendulum-v1", *where, *labelled],
-        *(["rl_zoo3.enjoy", "--algo", algo, *words] for algo in CONTINUOUS),
-        cwd=tmp_path,
-    )
-    for algo, out in zip(CONTINUOUS, played, strict=True):
-        assert f"Pendulum-v1-{algo.upper()}-ours: 2" in plots
-        assert f"{algo}/Pendulum-v1_2" in out
-        assert out.count("Episode Length 30") == 2
+    for algo in CONTINUOUS:
+        assert f"Pendulum-v1-{algo.upper()}-ours: 2" in printed["all_plots", "robots"]
+        assert f"{algo}/Pendulum-v1_2" in printed["enjoy", algo]
+        assert printed["enjoy", algo].count("Episode Length 30") == 2

@@ -41,7 +41,6 @@ GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
 ARMS, LINEAR = "BernoulliBandit-v0", "LinearBandit-v0"
 SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
 EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
-EAGER["policy_kwargs"] = {"net_arch": [16]}
 LAGGING = {"n_steps": 3, "train_freq": 4, "target_update_interval": 30, "tau": 0.7}
 
 # Every agent, and the settings whose state is kept in a place of its own.
@@ -98,6 +97,8 @@ class CutOffError(BaseException):
 
 def spec_of(folder, env_id, algo, n_timesteps, settings, **more):
     entry = read_hyperparams(algo, env_id, None) if settings is not EAGER else {}
+    if env_id == SWING and algo != "ars":  # whose networks are large by themselves
+        entry["policy_kwargs"] = {"net_arch": [16]}
     raw = override({**entry, "n_timesteps": n_timesteps}, settings)
     raw.pop("n_episodes", None)
     common = {"seed": 3, "log_folder": folder, "verbose": 0, "pictures": False}
