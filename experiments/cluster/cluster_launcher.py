@@ -107,7 +107,6 @@ class ClusterLauncher:
         self._n_wanted = n_wanted
         self._workers: Mapping[str, int] = {}  # with how many runs each does at once
         self._replaced = time.monotonic()
-        self._is_closed = False
         self._end: UserError | None = None
 
     @property
@@ -147,7 +146,7 @@ class ClusterLauncher:
                 replace_jobs()
         except UserError as error:
             self._end_all(error)
-        except (OSError, RuntimeError):  # gone just now: the next look knows more
+        except Exception:  # noqa: BLE001  # of the library, gone just now: the next look knows more
             self._workers = {}
 
     def close(self) -> None:

@@ -89,6 +89,7 @@ def probing(root: Path) -> Iterator[Probe]:
     name = f".cluster-{secrets.token_hex(8)}.tmp"
     probe = Probe(Path.cwd(), root, name, secrets.token_hex(16))
     path = root / name
+    root.mkdir(parents=True, exist_ok=True)
     path.write_text(probe.content, encoding="utf-8")
     try:
         yield probe
