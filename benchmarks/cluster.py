@@ -112,17 +112,18 @@ def cluster(folder: Path) -> Iterator[tuple[str, dict[str, int]]]:
     with contextlib.ExitStack() as stack:
 
         def started(words: str) -> int:
-            command = [sys.executable, "-m", *words.split(), "--scheduler-file", str(file)]
+            common = ["--scheduler-file", str(file), "--dashboard-address", "127.0.0.1:0"]
+            command = [sys.executable, "-m", *words.split(), *common]
             quiet = subprocess.DEVNULL
             process = subprocess.Popen(command, stdout=quiet, stderr=quiet, cwd=folder)
             stack.callback(process.wait)
             stack.callback(process.terminate)
             return process.pid
 
-        pid = started("distributed.cli.dask_scheduler --host 127.0.0.1 --port 0 --no-dashboard")
+        pid = started("distributed.cli.dask_scheduler --host 127.0.0.1 --port 0")
         while not file.exists():
             time.sleep(0.1)
-        started(f"distributed.cli.dask_worker --nworkers {N_WORKERS} --nthreads 1 --no-dashboard")
+        started(f"distributed.cli.dask_worker --nworkers {N_WORKERS} --nthreads 1")
         yield str(file), {"scheduler": pid, "driver": os.getpid()}
 
 

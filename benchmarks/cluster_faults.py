@@ -50,7 +50,7 @@ class Processes:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
         self.address = f"tcp://127.0.0.1:{port}"
-        node = f"dask_worker {self.address} --nworkers 2 --nthreads 1 --no-dashboard"
+        node = f"dask_worker {self.address} --nworkers 2 --nthreads 1"
         self.commands = {
             "scheduler": self._dask(f"dask_scheduler --host 127.0.0.1 --port {port}"),
             "node 0": self._dask(f"{node} --local-directory {folder / 'a'}"),
@@ -61,7 +61,8 @@ class Processes:
 
     def _dask(self, words: str) -> list[str]:
         command, *rest = words.split()
-        return [sys.executable, "-m", f"distributed.cli.{command}", *rest]
+        page = ["--dashboard-address", "127.0.0.1:0"]
+        return [sys.executable, "-m", f"distributed.cli.{command}", *rest, *page]
 
     def start(self, name: str) -> None:
         """Start one of them."""

@@ -17,8 +17,9 @@ from typing import Any
 
 from pipeline.files import portable_name
 
-DONE, FAILED, STOPPED = "done", "failed", "stopped"
-KINDS = (DONE, FAILED, STOPPED)
+# The last is for a worker that can do no run at all.
+DONE, FAILED, STOPPED, UNFIT = "done", "failed", "stopped", "unfit"
+KINDS = (DONE, FAILED, STOPPED, UNFIT)
 LARGEST = 256 << 20  # bytes, of all files of a run
 MOST_FILES = 10_000
 LONGEST_TEXT = 200_000  # characters

@@ -18,8 +18,8 @@ from distributed import Future as DaskFuture
 from distributed.scheduler import KilledWorker
 
 from experiments.child_processes import NO_LIMITS
-from experiments.cluster.addresses import Cluster, JobQueue
-from experiments.cluster.answers import FAILED, STOPPED, RefusedAnswerError, unpacked
+from experiments.cluster.addresses import Cluster, JobQueue, LocalWorkers
+from experiments.cluster.answers import FAILED, STOPPED, UNFIT, RefusedAnswerError, unpacked
 from experiments.cluster.clusters import opened
 from experiments.cluster.connections import Connection
 from experiments.cluster.orders import LEAVING, Probe, RunOrder, probing, version
@@ -69,6 +69,7 @@ def cluster_launcher(
         UserError: if there is no such cluster.
     """
     plugin, wanted = Supervisors(warm_ups), n_runs if isinstance(cluster, JobQueue) else 0
+    wanted = cluster.n_workers if isinstance(cluster, LocalWorkers) else wanted
     with probing(root) as probe, opened(cluster, n_runs, is_told) as (connect, replace_jobs):
         launcher = ClusterLauncher(probe, command, limits, wanted)
         prepare = partial(launcher.prepare, plugin)
@@ -168,6 +169,9 @@ class ClusterLauncher:
             if self._end is not None:
                 raise self._end
             function(sent, *args)
+        except UserError as error:  # of the cluster as a whole
+            _set_error(sent.future, error)
+            self._end_all(error)
         except Exception as error:  # noqa: BLE001  # whoever waits for it has to know
             _set_error(sent.future, error)
 
@@ -220,6 +224,7 @@ class ClusterLauncher:
                 sent.refuse(one_line(error))
         else:
             sent.worker = None
+            self._workers = {}
             self.connection.lose(task.client)
         self._send(sent)
 
@@ -230,6 +235,8 @@ class ClusterLauncher:
             if answer.kind == FAILED:
                 self._settle(sent, answer.reason, answer.details)
                 return True
+            if answer.kind == UNFIT:
+                raise UserError(f"--cluster: {answer.reason}: start it anew, from the same folder")
             if answer.kind == STOPPED:
                 sent.worker = None
                 return False

@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import logging
 import math
+import signal
+import sys
+import warnings
 from collections.abc import Callable, Iterator
-from typing import Any
+from multiprocessing import resource_tracker
 
+import dask
 from distributed import Client, LocalCluster
 from distributed.security import Security
 
@@ -21,6 +25,11 @@ from experiments.cluster.addresses import (
 from experiments.cluster.connections import SECONDS_TO_CONNECT
 from experiments.cluster.job_queues import QUEUES, has_certificates, opened_queue
 from pipeline.errors import UserError, one_line
+from pipeline.stopping import current
+
+# How long a killed worker may take to be started again, before it is given up for another: Dask's
+# 15 seconds are soon over on a machine that is busy.
+SECONDS_TO_RESTART = 60
 
 Connect = Callable[[], Client]
 
@@ -49,15 +58,17 @@ def opened(
         is_told: whether the user has said that an open one will do.
 
     Yields:
-        What makes a client of it; and what is to be called now and then, so that jobs that have
-        ended are replaced.
+        What makes a client of it; and what is to be called now and then, so that workers and jobs
+        that have ended are replaced.
     """
     _be_quiet()
+    dask.config.set({"distributed.deploy.lost-worker-timeout": SECONDS_TO_RESTART})
     if isinstance(cluster, SchedulerAddress):
         yield lambda: _client_of(cluster, is_told), _nothing
     elif isinstance(cluster, LocalWorkers):
         with _local(cluster.n_workers) as local:
-            yield lambda: Client(local, set_as_default=False), _nothing
+            n_workers = cluster.n_workers
+            yield lambda: Client(local, set_as_default=False), lambda: local.scale(n_workers)
     else:
         n_jobs = math.ceil(n_runs / cluster.n_cores)
         with opened_queue(cluster) as queue:
@@ -70,6 +81,7 @@ def _be_quiet() -> None:
     for name in ("distributed", *logging.root.manager.loggerDict):
         if name.partition(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
+    warnings.filterwarnings("ignore", "Creating scratch directories")
 
 
 def _nothing() -> None:
@@ -85,18 +97,44 @@ def _client_of(cluster: SchedulerAddress, is_told: bool) -> Client:
         raise UserError(f"--cluster {address}: {one_line(error)}") from error
 
 
-def _local(n_workers: int) -> Any:
+@contextlib.contextmanager
+def _left_to_driver() -> Iterator[None]:
+    """Let what is started leave signals to this process, which reach all of a terminal at once."""
+    if sys.platform == "win32":
+        yield
+        return
+    # It lets SIGINT through again after its own start, so that has to come first.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGHUP))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextlib.contextmanager
+def _local(n_workers: int) -> Iterator[LocalCluster]:
     """Workers on this machine, and nobody but them and this process can talk to the scheduler.
 
     Loopback alone would not do: any user of the machine could, and have their code run by this one.
     """
-    return LocalCluster(
-        n_workers=n_workers,
-        threads_per_worker=1,
-        host="127.0.0.1",
-        protocol="tls://",
-        security=Security.temporary(),
-        dashboard_address="127.0.0.1:0",
-        memory_limit=0,  # a run's memory is its child's, and --run-memory's matter
-        silence_logs=logging.CRITICAL,
-    )
+    with current().held(), _left_to_driver():
+        cluster = LocalCluster(
+            n_workers=0,
+            threads_per_worker=1,
+            host="127.0.0.1",
+            protocol="tls://",
+            security=Security.temporary(),
+            dashboard_address="127.0.0.1:0",
+            memory_limit=0,  # a run's memory is its child's, and what --run-memory is about
+            silence_logs=logging.CRITICAL,
+        )
+    try:
+        current().raise_if_asked()
+        cluster.scale(n_workers)
+        yield cluster
+    finally:
+        # Workers that are about to start make it fail; they end with this process.
+        with contextlib.suppress(Exception):
+            cluster.close()
+        LocalCluster._instances.discard(cluster)  # it would try again at the end

@@ -106,7 +106,7 @@ class Connection:
         while time.monotonic() < until and not self._closed.is_set():
             try:
                 return self._connected()
-            except OSError as error:
+            except (OSError, UserError) as error:  # its file may be missing, or half-written
                 reason = one_line(error)
             time.sleep(_SECONDS_BETWEEN_LOOKS)
         raise ClusterGoneError(

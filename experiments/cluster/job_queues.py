@@ -43,7 +43,7 @@ def opened_queue(queue: JobQueue) -> Any:
     settings = {**queue.settings, **_retiring(queue)}
     words = settings.get("worker-extra-args") or []
     if not any("dashboard" in str(word) for word in words):
-        settings["worker-extra-args"] = [*words, "--no-dashboard"]  # it would be open to all
+        settings["worker-extra-args"] = [*words, "--dashboard-address", "127.0.0.1:0"]
     dask.config.set({f"jobqueue.{queue.system}": {**_defaults(queue.system), **settings}})
     kind = getattr(_library(), QUEUES[queue.system])
     security = Security()

@@ -14,7 +14,7 @@ from distributed import Worker, WorkerPlugin, get_worker
 
 from experiments import child_processes
 from experiments.child_processes import StoppedError, TaskFailedError
-from experiments.cluster.answers import DONE, FAILED, STOPPED, Answer, files_in, packed
+from experiments.cluster.answers import DONE, FAILED, STOPPED, UNFIT, Answer, files_in, packed
 from experiments.cluster.orders import LEAVING, RunOrder, version
 from experiments.launching import do_supervised
 from experiments.run_limits import RunLimits
@@ -41,6 +41,7 @@ class Supervisors(WorkerPlugin):
         """Get ready; what takes long goes on in the background."""
         multiprocessing.current_process().daemon = False  # those of a nanny may have no children
         child_processes.be_ready(self.warm_ups)
+        version()  # of what has been loaded, before it can change
 
     def teardown(self, worker: Worker) -> None:
         """End what is under way: it leaves its state where it can be reached."""
@@ -72,8 +73,10 @@ def answer_to(content: bytes) -> bytes:
     # From the driver of this very cluster, and no more than what Dask itself would unpickle.
     order: RunOrder = pickle.loads(content)  # noqa: S301
     worker.log_event(order.topic, {"run": key, "at": worker.address})
+    if Supervisors.name not in worker.plugins:  # as after a scheduler was started again
+        Supervisors("[]").setup(worker)
     if order.version != version():
-        return packed(Answer(FAILED, f"{worker.address} has another version of code or libraries"))
+        return packed(Answer(UNFIT, f"{worker.address} has other code or libraries than this"))
     limits = order.limits
     watched = WatchedLimits(limits.seconds, limits.memory, lambda: _is_wanted(worker, key))
     order = replace(order, limits=watched)

@@ -15,8 +15,9 @@ from experiments.cluster import connections
 from experiments.cluster.addresses import SchedulerAddress
 from experiments.cluster.cluster_launcher import cluster_launcher
 from experiments.cluster.orders import Probe
+from experiments.drafts import draft_path
 from experiments.execution import execute
-from experiments.launching import local_launcher
+from experiments.run_in_child import do_run
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
@@ -73,18 +74,22 @@ def runs_of(root, modules=(), **more):
     return plan(study, root)
 
 
-def done(root, launchers, runs):
-    """What runs leave, by name; and the failures, by environment."""
-    root.mkdir()
-    failures = execute(runs, root, launchers, lambda *_: None)
+def left_in(root):
     sys.path.insert(0, str(ROOT / "benchmarks"))
     try:
         from _run_contents import contents
     finally:
         sys.path.pop(0)
-    found = contents(root / "runs")
+    return contents(root / "runs")
+
+
+def done(root, launchers, runs):
+    """What runs leave, by name; and the failures, by environment."""
+    root.mkdir()
+    failures = execute(runs, root, launchers, lambda *_: None)
     assert sorted({path.name for path in root.iterdir()} - {"failures"}) == ["runs"]
-    return found, {(each.planned.environment, each.planned.seed): each for each in failures}
+    by_run = {(each.planned.environment, each.planned.seed): each for each in failures}
+    return left_in(root), by_run
 
 
 def check_what_dies(there, folder, here):
@@ -132,8 +137,9 @@ def check_what_is_refused(there, folder, monkeypatch):
 def test_a_cluster_does_what_this_machine_does_whatever_dies(there, tmp_path, monkeypatch):
     """All in one: several processes of the suite would start a cluster each."""
     root = tmp_path / "here"
-    here, failures = done(root, partial(local_launcher, root, "c", 1), runs_of(root))
-    assert not failures
+    for run in runs_of(root):
+        do_run(run, draft_path(root, run), "c")
+    here = left_in(root)
     assert here
     check_what_dies(there, tmp_path, here)
     check_what_is_sent(there, tmp_path, here, monkeypatch)
