@@ -1,6 +1,7 @@
 """Search spaces: read strictly, asked by Optuna, and back from settings."""
 
 import math
+from functools import cache
 
 import gymnasium as gym
 import optuna
@@ -9,6 +10,7 @@ from optuna.trial import FixedTrial
 
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError
+from pipeline.settings import hyperparam_entries
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
 from pipeline.settings.components import wrapper_factory
 from pipeline.settings.hyperparam_entries import entry_names, read_hyperparams
@@ -55,6 +57,15 @@ class Masked(gym.Env):
 
     def step(self, action):
         return 1, 0.0, True, False, {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def files_read_once():
+    """They hold a dozen entries each, and reading them is most of what these tests take."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (search_spaces, hyperparam_entries):
+            patch.setattr(module, "read_yaml", cache(read_yaml))
+        yield
 
 
 @pytest.fixture
