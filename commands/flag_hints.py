@@ -10,7 +10,7 @@ from pipeline.errors import OTHER_NAMES, did_you_mean
 from pipeline.settings.constructor_arguments import RANGES
 from pipeline.settings.hyperparams import SPECIAL_KEYS
 
-_SEARCH = "the command tune searches for hyperparameters, by the same flags: see tune --help"
+_SEARCH = "hyperparameters are not searched for here, but by the command tune: see tune --help"
 _NO_WANDB = "Weights & Biases is not supported; -tb DIR writes TensorBoard logs"
 
 # Flags of rl_zoo3's train and enjoy that are not here, and why.
@@ -32,8 +32,8 @@ INSTEAD: Mapping[str, str] = {
         ),
         _SEARCH,
     ),
-    "--n-evaluations": "how often to evaluate is said in steps: --eval-freq",
-    "--trial-id": "what tune finds is a file: --conf-file logs/tuning/.../winner.yml",
+    "--n-evaluations": "it is not said in numbers but in steps between them: --eval-freq",
+    "--trial-id": "trials are not read here: what tune finds is a file for --conf-file, winner.yml",
     **dict.fromkeys(
         (
             "--track",

@@ -15,7 +15,7 @@ from commands.study_output import say
 from commands.study_progress import duration
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome, Retested
-from tuning.trial_queue import FAILURE, FIGURES, SECONDS
+from tuning.trial_queue import FAILURE, figures_of, seconds_of
 
 
 def print_opened(console: Console, place: OpenTuning, where: str) -> None:
@@ -38,8 +38,8 @@ def print_search(console: Console, place: OpenTuning) -> None:
         "failed" if FAILURE in trial.user_attrs else _STATES.get(trial.state.name, "to do")
         for trial in trials
     )
-    n_runs = sum(len(trial.user_attrs.get(FIGURES, {})) for trial in trials)
-    seconds = sum(float(trial.user_attrs.get(SECONDS, 0.0)) for trial in trials)
+    n_runs = sum(len(figures_of(trial.user_attrs)) for trial in trials)
+    seconds = sum(seconds_of(trial.user_attrs) for trial in trials)
     counts = ", ".join(f"{count} {state}" for state, count in states.items())
     say(
         console,

@@ -6,13 +6,14 @@ from pathlib import Path
 
 import pytest
 
-from commands import compare_agents, enjoy_agent, train_agent
+from commands import compare_agents, enjoy_agent, train_agent, tune_flags
 from commands.study_request import study_spec
 from commands.train_request import train_spec
+from commands.tune_request import tuning_spec
 
 ROOT = Path(__file__).parent.parent
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
-COMMAND = re.compile(r"python ((?:train|enjoy|compare)\.py [^`\n)#]*)")
+COMMAND = re.compile(r"python ((?:train|enjoy|compare|tune)\.py [^`\n)#]*)")
 
 
 def commands(script):
@@ -63,6 +64,12 @@ def test_compare_commands_are_accepted(monkeypatch, document, command):
     assert bool(args.logged) == bool(args.policy)
     if not args.logged:
         assert study_spec(args).agents
+
+
+@pytest.mark.parametrize(("document", "command"), commands("tune.py"))
+def test_tune_commands_are_accepted(document, command):
+    args = tune_flags.build_parser().parse_args(arguments(command))
+    assert tuning_spec(args).environment.env_id == args.env
 
 
 def test_there_are_commands_to_check():

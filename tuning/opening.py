@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import contextlib
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from tuning.samplers import make_sampler
 from tuning.search_spaces import read_search_space
 from tuning.study_opening import open_study
 from tuning.suggesting import Suggestions
-from tuning.trial_queue import FIGURES, TrialQueue, turn
+from tuning.trial_queue import TrialQueue, figures_of, turn
 from tuning.trial_runs import shipped_run
 from tuning.trial_storage import open_storage
 from tuning.tuning_spec import AUTO, TuningSpec
@@ -48,7 +49,7 @@ class OpenTuning:
         """Whether a trial has no more hope to be the best, by its seeds so far."""
         sign = -1.0 if self.tuning.is_cost else 1.0
         others = {
-            trial.number: {int(k): sign * v for k, v in trial.user_attrs.get(FIGURES, {}).items()}
+            trial.number: {k: sign * v for k, v in figures_of(trial.user_attrs).items()}
             for trial in self.queue.trials()
             if trial.number != number
         }
@@ -81,12 +82,25 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
         raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
     n_trials = suggestions.n_trials
     asked = tuning.identity(suggestions.shipped, _as_json(suggestions))
-    root.mkdir(parents=True, exist_ok=True)
-    with turn(root):  # of several that make a file's tables at once, all but one would fail
-        opened = open_storage(root, storage)
-    name = tuning.study.name
-    study = open_study(name, root, opened, make_sampler(tuning), asked, is_cost=tuning.is_cost)
+    with _made(root):
+        with turn(root):  # of several that make a file's tables at once, all but one would fail
+            opened = open_storage(root, storage)
+        sampler = make_sampler(tuning)
+        study = open_study(tuning.study.name, root, opened, sampler, asked, is_cost=tuning.is_cost)
     return OpenTuning(tuning, root, study, TrialQueue(study, root, n_trials), suggestions)
+
+
+@contextlib.contextmanager
+def _made(root: Path) -> Iterator[None]:
+    """A folder that is there, and gone again where something fails and nothing came into it."""
+    root.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in (root, *list(root.parents)[:2]):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
 
 
 def _as_json(suggestions: Suggestions) -> dict[str, Any]:

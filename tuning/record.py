@@ -9,7 +9,7 @@ from pipeline.files import write_json
 from pipeline.json_text import plain
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome
-from tuning.trial_queue import FAILURE, FIGURES, SECONDS, SETTINGS
+from tuning.trial_queue import FAILURE, SETTINGS, figures_of, seconds_of
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
@@ -57,8 +57,8 @@ def _trial(trial: FrozenTrial) -> dict[str, Any]:
         "value": trial.value,
         "params": dict(trial.params),
         "settings": said.get(SETTINGS),
-        "figures": said.get(FIGURES, {}),
-        "seconds": said.get(SECONDS, 0.0),
+        "figures": {str(seed): figure for seed, figure in figures_of(said).items()},
+        "seconds": seconds_of(said),
         "failure": said.get(FAILURE),
         "began": None if began is None else began.isoformat(),
         "ended": None if ended is None else ended.isoformat(),

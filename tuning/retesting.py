@@ -56,8 +56,9 @@ def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candida
     found: dict[str, Candidate] = {}
     for trial in trials:
         entry = trial.user_attrs.get(SETTINGS)
-        if trial.state == TrialState.COMPLETE and trial.value is not None and entry is not None:
-            found.setdefault(name_of(entry), Candidate(trial.number, entry, trial.value))
+        value = trial.value if trial.state == TrialState.COMPLETE else None
+        if value is not None and isinstance(entry, Mapping):
+            found.setdefault(name_of(entry), Candidate(trial.number, entry, value))
     sign = 1 if is_cost else -1
     return sorted(found.values(), key=lambda each: (sign * each.value, each.number))
 

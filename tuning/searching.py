@@ -18,7 +18,15 @@ from pipeline.file_digests import DamagedFileError
 from pipeline.json_text import plain
 from tuning.judging import UnjudgedError, judged, outcome_of
 from tuning.suggesting import Suggestions
-from tuning.trial_queue import FAILURE, FIGURES, SECONDS, SETTINGS, TrialQueue
+from tuning.trial_queue import (
+    FAILURE,
+    FIGURES,
+    SECONDS,
+    SETTINGS,
+    TrialQueue,
+    figures_of,
+    seconds_of,
+)
 from tuning.trial_runs import planned_run
 from tuning.tuning_spec import TuningSpec
 
@@ -138,9 +146,9 @@ class Search:
         while (trial := self.queue.claim(self.suggestions.params)) is not None:
             entry = self.suggestions.entry(trial)
             trial.set_user_attr(SETTINGS, plain(entry))
-            known = _known_figures(trial.user_attrs)
+            known = figures_of(trial.user_attrs)
             seeds = [seed for seed in self.tuning.seeds if seed not in known]
-            seconds = float(trial.user_attrs.get(SECONDS, 0.0))
+            seconds = seconds_of(trial.user_attrs)
             new = TrialUnderWay(trial, entry, seeds, known, seconds)
             self._trials.append(new)
             if seeds:
@@ -238,14 +246,6 @@ class Search:
             if other is each:
                 future.cancel()  # those that have begun go on, and their folders stay
         self.listener.trial_ended(each.trial.number, value, reason)
-
-
-def _known_figures(attributes: Mapping[str, Any]) -> dict[int, float]:
-    """What a driver before has found out of a trial."""
-    given = attributes.get(FIGURES)
-    if not isinstance(given, Mapping):
-        return {}
-    return {int(seed): float(figure) for seed, figure in given.items()}
 
 
 @contextlib.contextmanager

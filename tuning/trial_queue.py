@@ -8,6 +8,7 @@ settings are tried on, with the seeds that are done. Optuna's own heartbeat know
 from __future__ import annotations
 
 import contextlib
+import math
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -183,6 +184,24 @@ def turn(root: Path) -> Iterator[None]:
             except FolderInUseError:
                 time.sleep(_SECONDS_BETWEEN_TRIES)
         yield
+
+
+def figures_of(said: Mapping[str, Any]) -> dict[int, float]:
+    """What is known of a trial's seeds; nothing where it is no such thing that stands there."""
+    given = said.get(FIGURES)
+    if not isinstance(given, Mapping):
+        return {}
+    return {
+        int(seed): float(figure)
+        for seed, figure in given.items()
+        if str(seed).isdecimal() and isinstance(figure, int | float) and math.isfinite(figure)
+    }
+
+
+def seconds_of(said: Mapping[str, Any]) -> float:
+    """What the runs of a trial took together, as far as it is said."""
+    given = said.get(SECONDS)
+    return float(given) if isinstance(given, int | float) else 0.0
 
 
 def _nobody(_: str = "") -> None:

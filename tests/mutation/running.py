@@ -23,6 +23,7 @@ ABOVE = {
     "agents": ("pipeline", "experiments", "studies"),
     "pipeline": ("experiments", "report", "commands", "studies"),
     "experiments": ("report", "commands", "studies"),
+    "tuning": ("commands", "report"),
     "report": ("experiments", "commands"),
     "commands": ("pipeline",),
 }

@@ -88,8 +88,8 @@ def test_another_process_imports_from_anywhere(write, monkeypatch, tmp_path):
 
 # --- names that are taken ------------------------------------------------------------------------
 
-OURS = ["envs", "agents", "mdp", "verdicts", "pipeline", "experiments", "report", "commands"]
-OURS += ["train", "enjoy", "compare"]
+OURS = ["envs", "agents", "mdp", "verdicts", "pipeline", "experiments", "tuning"]
+OURS += ["report", "commands", "train", "enjoy", "compare", "tune"]
 
 
 @pytest.mark.parametrize("name", OURS)

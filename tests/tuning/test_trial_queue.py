@@ -18,13 +18,14 @@ def storage_of(kind, tmp_path):
 @pytest.mark.parametrize("kind", STORAGES)
 def test_no_two_drivers_take_the_same_trial_and_none_takes_more_than_there_are(toy, kind, tmp_path):
     drivers = [
-        toy.opened(toy.tuning(), tmp_path, storage_of(kind, tmp_path)).queue for _ in range(3)
+        toy.opened(toy.tuning(n_trials=4), tmp_path, storage_of(kind, tmp_path)).queue
+        for _ in range(3)
     ]
     for driver in drivers:
         driver._add_places()
-    taken = [driver.claim(lambda _: {}) for _ in range(4) for driver in drivers]
-    assert sorted(trial.number for trial in taken if trial is not None) == list(range(10))
-    assert len(drivers[0].study.trials) == 10
+    taken = [driver.claim(lambda _: {}) for _ in range(2) for driver in drivers]
+    assert sorted(trial.number for trial in taken if trial is not None) == list(range(4))
+    assert len(drivers[0].study.trials) == 4
     assert not drivers[0].is_done
 
 
@@ -97,3 +98,11 @@ def test_more_trials_are_added_to_those_that_are_there(toy, tmp_path):
     launcher = toy.search(more, toy.Launcher())
     assert toy.states(more) == ["COMPLETE"] * 6
     assert len(launcher.done) == 6
+
+
+@pytest.mark.parametrize(
+    "said", [None, 3, [0.5], {"a": 0.5, "0": "x", "-1": 0.5, "1": float("nan")}]
+)
+def test_figures_that_are_none_are_not_believed(said):
+    assert trial_queue.figures_of({"figures": said}) == {}
+    assert trial_queue.seconds_of({"seconds": said}) == 0.0 or said == 3
