@@ -106,7 +106,7 @@ def search(settings: Settings, method: str, most_runs: int) -> tuple[int, list[i
             scores[seed] = float(settings.scores[number, seed])
             n_runs += 1
             whole = len(scores) == n_seeds
-            if not whole and number and is_hopeless(scores, others, method):
+            if not whole and number and is_hopeless(scores, others, method, n_seeds=n_seeds):
                 break
             if whole:
                 judged.append(number)

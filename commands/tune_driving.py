@@ -22,6 +22,7 @@ from commands.tune_output import (
 )
 from commands.tune_progress import TuningProgress
 from experiments.child_processes import stop_all
+from experiments.drafts import remove_dead_drafts
 from experiments.study_plan import plan
 from experiments.study_results import EarlyResults
 from pipeline.folder_lock import FolderInUseError, folder_lock
@@ -76,6 +77,8 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
             progress,
             how.deadline,
         ).run()
+    if queue.is_done:
+        remove_dead_drafts(place.root)  # of runs that nobody asks for any more
 
 
 def _judge(console: Console, place: OpenTuning, how: How) -> int:

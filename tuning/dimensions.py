@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pipeline.settings.literals import DottedName
@@ -80,13 +81,17 @@ class Choice:
     def keys(self) -> tuple[str, ...]:
         return tuple(dict.fromkeys(key for option in self.options.values() for key in option))
 
-    def distributions(self) -> dict[str, BaseDistribution]:
+    @cached_property
+    def _words(self) -> BaseDistribution:
         from optuna.distributions import CategoricalDistribution
 
-        return {self.name: CategoricalDistribution(tuple(self.options))}
+        return CategoricalDistribution(tuple(self.options))
+
+    def distributions(self) -> dict[str, BaseDistribution]:
+        return {self.name: self._words}
 
     def settings(self, pick: Pick) -> dict[str, Any]:
-        chosen = self.options[pick(self.name, self.distributions()[self.name])]
+        chosen = self.options[pick(self.name, self._words)]
         return {key: chosen.get(key, LEFT_OUT) for key in self.keys}
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:

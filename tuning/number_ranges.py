@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.errors import UserError
@@ -67,6 +68,10 @@ class NumberRange:
         return (*self.forms, *self.instead)
 
     def distributions(self) -> dict[str, BaseDistribution]:
+        return dict(self._ends)
+
+    @cached_property
+    def _ends(self) -> dict[str, BaseDistribution]:
         from optuna.distributions import CategoricalDistribution, FloatDistribution
 
         found: dict[str, BaseDistribution] = {}
@@ -107,7 +112,7 @@ class NumberRange:
         return min(max(number, self.low), self.high)
 
     def settings(self, pick: Pick) -> dict[str, Any]:
-        ranges = self.distributions()
+        ranges = self._ends
         form = pick(self._form, ranges[self._form]) if self._form in ranges else self._words[0]
         if form not in self.forms:
             return {self.name: self.instead[form]}
@@ -125,7 +130,7 @@ class NumberRange:
             if same(value, other):
                 return {self._form: word}
         params = self._numeric_params(value)
-        ranges = self.distributions()
+        ranges = self._ends
         inside = all(name in ranges and _holds(ranges[name], p) for name, p in params.items())
         if inside:
             again = self.settings(lambda name, _: params[name])[self.name]

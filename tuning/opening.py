@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -56,7 +57,18 @@ class OpenTuning:
         scores = {seed: sign * figure for seed, figure in figures.items()}
         # Costs have their sign turned: of what is left, higher is better.
         value = partial(judged, objective=self.tuning.objective, is_cost=False)
-        return is_hopeless(scores, list(others.values()), self.tuning.pruner, value)
+        # A score of 1 is the optimum. Where nobody knows that, returns stand in its place; of some
+        # of them, all below 0, no 1 says anything.
+        seen = [score for each in (scores, *others.values()) for score in each.values()]
+        is_score = self.tuning.figure == "score" and max(seen, default=0.0) > 0
+        return is_hopeless(
+            scores,
+            list(others.values()),
+            self.tuning.pruner,
+            value,
+            n_seeds=len(self.tuning.seeds),
+            ceiling=1.0 if is_score else -math.inf,
+        )
 
 
 def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:

@@ -7,7 +7,9 @@ by seed. Scores are the better the higher; a cost is handed over with its sign t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 from pipeline.errors import unknown
 
@@ -25,13 +27,46 @@ REDUCTION = 3
 SEEDS_FOR_RANKS = 10
 
 
+@dataclass(frozen=True)
+class Rivals:
+    """The other trials.
+
+    Attributes:
+        others: their scores, of ended ones and those under way.
+        n_seeds: how many a whole trial has.
+        value: what scores are worth together.
+        ceiling: no score is above that; minus infinity where nobody knows.
+    """
+
+    others: Sequence[Scores]
+    n_seeds: int
+    value: Value
+    ceiling: float
+
+    @property
+    def best(self) -> Scores:
+        """The best of those with all seeds; one under way may be lucky yet. Empty without any."""
+        whole = [each for each in self.others if len(each) == self.n_seeds]
+        return max(whole, key=lambda each: self.value([*each.values()]), default={})
+
+    def values(self, seeds: Scores) -> list[float]:
+        """On these seeds, of those that have them all."""
+        having = [each for each in self.others if seeds.keys() <= each.keys()]
+        return [self.value([each[seed] for seed in seeds]) for each in having]
+
+
 def mean(scores: Sequence[float]) -> float:
     """The mean of scores."""
     return sum(scores) / len(scores)
 
 
 def is_hopeless(
-    scores: Scores, others: Sequence[Scores], method: str = "auto", value: Value = mean
+    scores: Scores,
+    others: Sequence[Scores],
+    method: str = "auto",
+    value: Value = mean,
+    n_seeds: int | None = None,
+    ceiling: float = -math.inf,
 ) -> bool:
     """Whether to end a trial early.
 
@@ -40,33 +75,37 @@ def is_hopeless(
         others: the same of all other trials, ended ones and those under way.
         method: a key of `PRUNERS`.
         value: what scores are worth together.
+        n_seeds: how many a whole trial has; None for as many as any has so far.
+        ceiling: no score is above that; what has been seen counts where it is not said.
 
     Raises:
         UserError: if there is no such method.
     """
     if method not in PRUNERS:
         raise unknown("--pruner: there is none called", method, PRUNERS)
-    return bool(scores) and PRUNERS[method](scores, others, value)
+    longest = max(map(len, others), default=0)
+    rivals = Rivals(others, longest if n_seeds is None else n_seeds, value, ceiling)
+    return len(scores) > 0 and PRUNERS[method](scores, rivals)
 
 
-def never(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+def never(scores: Scores, rivals: Rivals) -> bool:
     """No trial is ended early."""
     return False
 
 
-def below_median(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+def below_median(scores: Scores, rivals: Rivals) -> bool:
     """Whether the trial is below the median of the others on the same seeds.
 
     Source: the median stopping rule of Golovin et al. (2017), "Google Vizier", KDD.
     """
     import numpy as np
 
-    theirs = _values(others, scores, value)
+    theirs = rivals.values(scores)
     enough = len(scores) >= MIN_SEEDS and len(theirs) >= MIN_OTHERS
-    return enough and value([*scores.values()]) < float(np.median(theirs))
+    return enough and rivals.value([*scores.values()]) < float(np.median(theirs))
 
 
-def out_of_the_race(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+def out_of_the_race(scores: Scores, rivals: Rivals) -> bool:
     """Whether the trial is not among the best third at a rung of 1, 3, 9, ... seeds.
 
     Source: asynchronous successive halving, Li et al. (2020), "A system for massively parallel
@@ -75,15 +114,15 @@ def out_of_the_race(scores: Scores, others: Sequence[Scores], value: Value) -> b
     n_seeds = 1
     while n_seeds < len(scores):
         n_seeds *= REDUCTION
-    theirs = _values(others, scores, value)
+    theirs = rivals.values(scores)
     if n_seeds != len(scores) or len(theirs) < MIN_OTHERS:
         return False
-    own = value([*scores.values()])
+    own = rivals.value([*scores.values()])
     n_better = sum(other > own for other in theirs)
     return n_better >= max(1, (len(theirs) + 1) // REDUCTION)
 
 
-def worse_by_ranks(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+def worse_by_ranks(scores: Scores, rivals: Rivals) -> bool:
     """Whether a signed-rank test on the seeds in common finds the trial worse than the best one.
 
     A trial whose mean is not below the best one's goes on whatever the test says.
@@ -92,14 +131,14 @@ def worse_by_ranks(scores: Scores, others: Sequence[Scores], value: Value) -> bo
     """
     from scipy.stats import wilcoxon
 
-    differences = _differences(scores, _best(others, value))
+    differences = _differences(scores, rivals.best)
     if len(differences) < MIN_SEEDS or sum(differences) >= 0:
         return False
     test = wilcoxon(differences, alternative="less", zero_method="zsplit")
     return bool(test.pvalue < P_THRESHOLD)
 
 
-def worse_by_means(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+def worse_by_means(scores: Scores, rivals: Rivals) -> bool:
     """Whether a paired t test on the seeds in common finds the trial worse than the best one.
 
     Source: racing as in Birattari et al. (2002), "A racing algorithm for configuring
@@ -108,7 +147,7 @@ def worse_by_means(scores: Scores, others: Sequence[Scores], value: Value) -> bo
     import numpy as np
     from scipy.stats import t
 
-    differences = np.asarray(_differences(scores, _best(others, value)))
+    differences = np.asarray(_differences(scores, rivals.best))
     if len(differences) < MIN_SEEDS or differences.sum() >= 0:
         return False
     error = differences.std(ddof=1) / np.sqrt(len(differences))
@@ -117,30 +156,30 @@ def worse_by_means(scores: Scores, others: Sequence[Scores], value: Value) -> bo
     return bool(t.cdf(differences.mean() / error, len(differences) - 1) < P_THRESHOLD)
 
 
-def cannot_win(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+def cannot_win(scores: Scores, rivals: Rivals) -> bool:
     """Whether the trial stays below the best one even if all that is left goes perfectly.
 
-    Perfect is the highest score that any trial has had. The only rule that ends no trial that would
-    have been chosen, as far as that holds.
+    Perfect is the highest score that there can be, or else that any trial has had. The only rule
+    that ends no trial that would have been chosen, as far as that holds.
     """
-    best = _best(others, value)
-    if len(best) <= len(scores):
+    best, missing = rivals.best, rivals.n_seeds - len(scores)
+    if not best or missing <= 0:
         return False
-    perfect = max(max(each.values()) for each in (*others, scores) if each)
-    at_most = value([*scores.values()] + [perfect] * (len(best) - len(scores)))
-    to_beat = value([*best.values()])
+    seen = (max(each.values()) for each in (*rivals.others, scores) if each)
+    perfect = max(rivals.ceiling, *seen)
+    at_most = rivals.value([*scores.values()] + [perfect] * missing)
+    to_beat = rivals.value([*best.values()])
     return at_most < to_beat - 1e-9 * max(1.0, abs(to_beat))
 
 
-def no_chance(scores: Scores, others: Sequence[Scores], value: Value) -> bool:
+def no_chance(scores: Scores, rivals: Rivals) -> bool:
     """Whether the trial cannot win, or has many seeds to come and loses by ranks."""
-    if cannot_win(scores, others, value):
+    if cannot_win(scores, rivals):
         return True
-    has_many = len(_best(others, value)) >= SEEDS_FOR_RANKS
-    return has_many and worse_by_ranks(scores, others, value)
+    return rivals.n_seeds >= SEEDS_FOR_RANKS and worse_by_ranks(scores, rivals)
 
 
-PRUNERS: Mapping[str, Callable[[Scores, Sequence[Scores], Value], bool]] = {
+PRUNERS: Mapping[str, Callable[[Scores, Rivals], bool]] = {
     "auto": no_chance,
     "none": never,
     "bound": cannot_win,
@@ -149,18 +188,6 @@ PRUNERS: Mapping[str, Callable[[Scores, Sequence[Scores], Value], bool]] = {
     "racing": worse_by_means,
     "wilcoxon": worse_by_ranks,
 }
-
-
-def _values(others: Sequence[Scores], seeds: Scores, value: Value) -> list[float]:
-    """On these seeds, of those trials that have them all."""
-    return [value([each[seed] for seed in seeds]) for each in others if seeds.keys() <= each.keys()]
-
-
-def _best(others: Sequence[Scores], value: Value) -> Scores:
-    """The best trial among those with the most seeds."""
-    longest = max((len(each) for each in others), default=0)
-    whole = [each for each in others if len(each) == longest > 0]
-    return max(whole, key=lambda each: value([*each.values()]), default={})
 
 
 def _differences(scores: Scores, best: Scores) -> list[float]:

@@ -181,7 +181,7 @@ def turn(root: Path) -> Iterator[None]:
             try:
                 stack.enter_context(folder_lock(root, _nobody, _nobody))
                 break
-            except FolderInUseError:
+            except (FolderInUseError, FileNotFoundError):  # another removed it, as it was empty
                 time.sleep(_SECONDS_BETWEEN_TRIES)
         yield
 

@@ -61,7 +61,8 @@ def _render(
         "parallel": {**parallel(trials, shares), "winner": winner and winner["number"]},
         "importances": {"names": [*shares], "shares": [*shares.values()]},
     }
-    scripts = [text for name in SHARED if (text := template_file(name)) is not None]
+    shared = [template_file(name) or "" for name in SHARED]
+    own = [_SCRIPT.read_text(encoding="utf-8"), template_file("paper.js") or ""]
     return environment.get_template("tuning.html").render(
         title=f"{asked.get('algo', 'an agent')} on {asked.get('env', 'an environment')}",
         record=record,
@@ -76,5 +77,5 @@ def _render(
         rows=rows(trials),
         shares=shares,
         data={name: packed(as_json(item)) for name, item in data.items()},
-        **frame("\n".join([*scripts, _SCRIPT.read_text(encoding="utf-8")])),
+        **frame("\n".join([*shared, *own])),
     )

@@ -45,10 +45,23 @@ def test_the_bound_counts_what_is_left_as_perfect(scores, hopeless):
     assert is_hopeless(scored(*scores), others, "bound") is hopeless
 
 
+def test_a_trial_under_way_is_no_measure():
+    assert is_hopeless(scored(0.1), [scored(0.9, 0.9)], "bound")
+    assert not is_hopeless(scored(0.1), [scored(0.9, 0.9)], "bound", n_seeds=3)
+    assert is_hopeless(scored(0.1), [scored(0.9, 0.9), scored(0.8, 0.8, 0.8)], "bound", n_seeds=3)
+
+
 def test_perfect_is_the_highest_score_that_any_trial_has_had():
     best = scored(-110.0, -110.0)
     assert not is_hopeless(scored(-115.0), [best, scored(-100.0, -200.0)], "bound")
     assert is_hopeless(scored(-115.0), [best, scored(-108.0, -200.0)], "bound")
+
+
+def test_where_the_optimum_is_known_nothing_less_is_perfect():
+    others = [scored(0.7, 0.7, 0.7)]
+    assert is_hopeless(scored(0.6), others, "bound")
+    assert not is_hopeless(scored(0.6), others, "bound", ceiling=1.0)
+    assert is_hopeless(scored(0.05), others, "bound", ceiling=1.0)
 
 
 def test_the_bound_holds_for_whatever_a_setting_is_judged_by():

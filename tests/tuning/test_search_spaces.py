@@ -1,6 +1,7 @@
 """Search spaces: read strictly, asked by Optuna, and back from settings."""
 
 import math
+from functools import cache
 
 import gymnasium as gym
 import optuna
@@ -9,6 +10,7 @@ from optuna.trial import FixedTrial
 
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError
+from pipeline.settings import hyperparam_entries
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
 from pipeline.settings.components import wrapper_factory
 from pipeline.settings.hyperparam_entries import entry_names, read_hyperparams
@@ -55,6 +57,15 @@ class Masked(gym.Env):
 
     def step(self, action):
         return 1, 0.0, True, False, {}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def files_read_once():
+    """They hold a dozen entries each, and reading them is most of what these tests take."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (search_spaces, hyperparam_entries):
+            patch.setattr(module, "read_yaml", cache(read_yaml))
+        yield
 
 
 @pytest.fixture
@@ -110,20 +121,27 @@ def test_shipped_settings_are_a_trial_and_come_back(algo):
 
 @pytest.mark.parametrize("algo", SEARCHED)
 def test_an_agent_takes_every_end_and_every_choice(algo):
-    algorithm = load_algorithm(algo)
+    """What entries of environments change is held against the agent where they are read."""
+    algorithm, entry = load_algorithm(algo), read_hyperparams(algo, "Unknown-v0")
     env = environment_for(algo)
-    for env_id in [*read_yaml(FOLDER / f"{algo}.yml"), "Unknown-v0"]:
-        entry = read_hyperparams(algo, env_id)
-        space = read_search_space(algo, env_id)
-        for number, settings in enumerate(corners(space)):
-            read = split(space.merged(entry, settings))
-            for key in ("env_wrapper", "train_env_wrapper"):
-                wrapper_factory(getattr(read, key), where=key)
-            given = {"policy": default_policy(algorithm, is_dict=False), **read.algorithm}
-            kwargs = build_algorithm_kwargs(algorithm, given, algo)
-            if number < 2 and env_id == "Unknown-v0":
-                algorithm(env=env, **{**kwargs, **one_transition(kwargs)})
+    space = read_search_space(algo, "Unknown-v0")
+    for number, settings in enumerate(corners(space)):
+        read = split(space.merged(entry, settings))
+        given = {"policy": default_policy(algorithm, is_dict=False), **read.algorithm}
+        kwargs = build_algorithm_kwargs(algorithm, given, algo)
+        if number < 2:
+            algorithm(env=env, **{**kwargs, **one_transition(kwargs)})
     env.close()
+
+
+@pytest.mark.parametrize("algo", SEARCHED)
+def test_every_wrapper_is_there_and_takes_its_arguments(algo):
+    for env_id in read_yaml(FOLDER / f"{algo}.yml"):
+        for entry in read_search_space(algo, env_id).entries.values():
+            for option in getattr(entry.dimension, "options", {}).values():
+                for key, value in option.items():
+                    if key in {"env_wrapper", "train_env_wrapper"}:
+                        wrapper_factory(value, where=key)
 
 
 def one_transition(kwargs):

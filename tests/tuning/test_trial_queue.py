@@ -106,3 +106,11 @@ def test_more_trials_are_added_to_those_that_are_there(toy, tmp_path):
 def test_figures_that_are_none_are_not_believed(said):
     assert trial_queue.figures_of({"figures": said}) == {}
     assert trial_queue.seconds_of({"seconds": said}) == 0.0 or said == 3
+
+
+def test_places_beyond_those_that_were_asked_for_are_left_alone(toy, tmp_path):
+    more, fewer = (toy.opened(toy.tuning(n_trials=n), tmp_path).queue for n in (6, 4))
+    for queue in (more, fewer):
+        queue._add_places()
+    assert [fewer.claim(lambda _: {}) is None for _ in range(5)] == [False] * 4 + [True]
+    assert len(more.trials()) == 6
