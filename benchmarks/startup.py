@@ -38,7 +38,7 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     f"train.py {' '.join(TRAINING)}": ("train.py", *TRAINING),
 }
 # Of the last one, the limit stands for what it takes beyond the import.
-LIMITS = dict(zip(COMMANDS, ("0.3", "0.3", "0.3", "0.3", None, "1.5 beyond"), strict=True))
+LIMITS = dict(zip(COMMANDS, ("0.3", "0.3", "0.3", "0.3", None, "1.0 beyond"), strict=True))
 
 # A line of `-X importtime`: microseconds of the module alone, of all that it imports, its name.
 IMPORTED = re.compile(r"import time: +(\d+) \| +\d+ \| +([\w.]+)")

@@ -16,7 +16,7 @@ from experiments.analysis import analyse
 from experiments.run_curves import CURVE_COLUMNS
 from experiments.seed_values import curves_by_agent, mean_curve, values_over_seeds
 from experiments.study_plan import plan
-from experiments.study_results import RUN_COLUMNS, read_results
+from experiments.study_results import RUN_COLUMNS, EarlyResults, read_results
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
 from report.conclusions import conclusion, places_without_a_run
@@ -175,6 +175,25 @@ def test_learning_curves_by_step_episode_and_time(tmp_path):
     training = curves[curves["kind"] == "training"]
     assert training["step"].tolist() == [10, 20, 30, 40, 50, 60]
     assert training["value"].tolist() == [0, 1, 2, 3, 4, 5]
+
+
+def test_runs_that_were_read_early_are_not_read_again(tmp_path):
+    study = study_of(n_seeds=2, agents=("qlearning",))
+    first, second = plan(study, tmp_path)
+    write_run(first, [(20, 10.0)], [(10, 1.0)])
+    early = EarlyResults(study)
+    early.read(first)
+    early.read(second)  # it is not there
+    write_run(second, [(20, 12.0)], [(10, 1.0)])
+    expected = read_results(study, [first, second], tmp_path)
+    (first.path / "evaluations.npz").write_bytes(b"damaged since")
+    found = read_results(study, [first, second], tmp_path, early=early)
+    pd.testing.assert_frame_equal(found.summary, expected.summary)
+    pd.testing.assert_frame_equal(found.curves, expected.curves)
+    damaged = EarlyResults(study)
+    damaged.read(first)  # that is said at the end
+    left_out = read_results(study, [first, second], tmp_path, early=damaged).left_out
+    assert [one.planned for one in left_out] == [first]
 
 
 def test_training_is_summed_up_in_blocks_of_episodes(tmp_path):

@@ -18,6 +18,7 @@ from mdp import (
     limited_episodes,
     optimum_far_from_limit,
     policy_return,
+    state_values,
     value_iteration,
 )
 from mdp.far_limit import Drift, _chance_of_losing, _drift
@@ -62,14 +63,16 @@ def test_all_ways_come_to_the_same(
     rng = np.random.default_rng(seed)
     matrix = rng.dirichlet(np.ones(model.n_actions), model.n_states)
     policy = matrix if is_random else matrix.argmax(axis=1)
-    found = figures(model, policy, horizon, discount)
+    found, values = figures(model, policy, horizon, discount), state_values(model, policy, horizon)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(LimitedEpisodes, "_along_ways", lambda *_: None)
+        patch.setattr(LimitedEpisodes, "along_ways", lambda *_: None)
         backwards = figures(model, policy, horizon, discount)
+        values_backwards = state_values(model, policy, horizon)
         patch.setattr(limited_episodes, "MOST_BACKWARDS", 0)
         forwards = figures(model, policy, horizon, discount)
     np.testing.assert_allclose(found, backwards, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(forwards, backwards, rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(values, values_backwards, rtol=1e-10, atol=1e-10)
 
 
 def test_a_way_that_goes_round_for_a_million_steps() -> None:
