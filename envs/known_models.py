@@ -93,7 +93,7 @@ def transition_model(env: Env) -> TransitionModel | None:
         elif isinstance(wrapper, ClipReward):
             if variance is not None:
                 return None
-            reward = np.asarray(wrapper.func(reward), dtype=np.float64)  # type: ignore[arg-type]
+            reward = np.asarray(wrapper.func(reward), dtype=np.float64)
     if reward is model.reward:
         return model
     return replace(model, reward=reward, reward_variance=variance)
