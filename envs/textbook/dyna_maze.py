@@ -145,8 +145,8 @@ class DynaMazeEnv(GridWorld):
 
     def step(self, action: int) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         result = super().step(action)
-        self.steps_done += 1
         if self._becomes is not None and self.change_after_steps is not None:
+            self.steps_done += 1
             letter = "".join(self._becomes)[self.s]
             if self.steps_done >= self.change_after_steps and letter != "#":
                 self._change(self._becomes)
