@@ -29,6 +29,13 @@ class TextConsole(Console):
             options.setdefault("soft_wrap", True)
         super().print(*objects, **options)
 
+    def on_broken_pipe(self) -> None:
+        """Leave it to `commands.streams`; Rich would keep silent from then on.
+
+        Where a thread was told that says how far things are, the main thread would not learn of it.
+        """
+        raise BrokenPipeError
+
     def render_str(self, text: str, **options: Any) -> Text:
         """As Rich does, of the text made visible, so that it is measured as it is shown."""
         return super().render_str(visible(text), **options)

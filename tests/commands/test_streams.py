@@ -16,6 +16,7 @@ import train
 from commands import streams
 from commands.parsing import run_command
 from commands.streams import Output, go_on_unread
+from commands.terminal import TextConsole
 from pipeline.errors import UserError
 from pipeline.signs_of_life import Heartbeat
 
@@ -77,22 +78,25 @@ def test_a_command_that_is_read_to_its_end_is_left_alone(run):
 
 
 def test_a_thread_that_says_how_far_it_is_ends_without_a_word(run):
-    """Its traceback stood on stderr, where libraries took five seconds to load."""
-    said = threading.Event()
+    """Where libraries took five seconds to load, `enjoy.py | head -1` played on for nobody."""
+    said, consoles, work = threading.Event(), [], []
 
     def say():
         said.set()
-        sys.stdout.write("loading\n")
+        consoles[0].print("loading")
 
     def main():
+        consoles.append(TextConsole())
         heart = Heartbeat(say, 0.01)
         heart.start()
         assert said.wait(10)
         heart.stop()
-        sys.stdout.write("loaded\n")
+        consoles[0].print("loaded")
+        work.append("played")
         return 1
 
     assert run(main, errno.EPIPE, 0) == (0, "", "")
+    assert work == []
 
 
 def test_where_the_output_is_the_work_it_ends_with_its_reader(run):
