@@ -17,7 +17,7 @@ from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.policy_updates import RolloutMinibatch, learn_from_rollout_minibatch
 from agents.networks.references import call
-from agents.networks.rollouts import Rollout, pick_steps, shuffle
+from agents.networks.rollouts import Rollout, shuffle
 from mdp.array_types import Ints
 from mdp.machine_code import inlined, kernel
 
@@ -71,7 +71,9 @@ class PolicyLearner(NamedTuple):
         flat: the parameters of both.
         gradient: for work, as long.
         optimizer: what moves the parameters.
-        rollout: what has been done and seen.
+        rollout: what has been done, and come of it.
+        pick: the address of `pick_steps`, which goes by the type of observations.
+        memory: that of what it takes steps from.
         starts: whether the present observations begin episodes, shape (E,).
         last_values: values of what the rollout ends with, shape (E,).
         order: numbers of the rollout's steps, to be shuffled, shape (T * E,).
@@ -93,6 +95,8 @@ class PolicyLearner(NamedTuple):
     gradient: Singles
     optimizer: Optimizer
     rollout: Rollout
+    pick: np.uintp
+    memory: np.uintp
     starts: Singles
     last_values: Singles
     order: Ints
@@ -172,7 +176,7 @@ def learn_for_an_epoch(
     place.kl, n_batches, goes_on = 0.0, 0, True
     for begin in range(0, n_steps, size):
         n = min(size, n_steps - begin)
-        pick_steps(learner, learner.order[begin : begin + n])
+        call(learner.pick, learner.memory, float(begin), float(n))
         goes_on = learn_from_rollout_minibatch(learner, n, learning_rate, clip_range, clip_range_vf)
         place.policy_gradient += losses.policy_gradient
         place.value += losses.value
@@ -191,6 +195,7 @@ class PolicyAgent(NamedTuple):
 
     Attributes:
         learner: a reference to a `PolicyLearner`.
+        memory: one to the `RolloutMemory` that it learns from.
         seen: how observations are read, of `agents.networks.observations`.
         choose: the address of `choose_randomly`.
         evaluate: that of `evaluate`.
@@ -199,6 +204,7 @@ class PolicyAgent(NamedTuple):
     """
 
     learner: Any
+    memory: Any
     seen: Any
     choose: np.uintp
     evaluate: np.uintp
@@ -243,7 +249,7 @@ def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
     """Write down the step of environment ``i``."""
     learner = agent.learner
     rollout, step = learner.rollout, learner.place[0].step
-    observe(agent.seen, env, BEFORE, rollout.observations[step, i])
+    observe(agent.seen, env, BEFORE, agent.memory.observations[step, i])
     rollout.actions[step, i, 0] = np.float32(env.action)
     rollout.values[step, i] = np.float32(env.value)
     rollout.log_probs[step, i] = np.float32(env.log_probability)
@@ -259,7 +265,7 @@ def note_step(agent: PolicyAgent, env: Any, i: int) -> None:
 
 @kernel
 def act_on_rows(learner: Any, shown: Any, actions: Ints) -> None:
-    """Choose actions, shape (E,), for observations of shape (E, d), and write them down."""
+    """Choose actions, shape (E,), for observations of shape (E, d), and note their likelihood."""
     rollout, place = learner.rollout, learner.place[0]
     step = place.step
     for i in range(len(actions)):
@@ -269,8 +275,6 @@ def act_on_rows(learner: Any, shown: Any, actions: Ints) -> None:
         rollout.log_probs[step, i] = np.float32(place.log_probability)
         rollout.actions[step, i, 0] = np.float32(actions[i])
         rollout.episode_starts[step, i] = learner.starts[i]
-        for j in range(shown.shape[1]):
-            rollout.observations[step, i, j] = np.float32(shown[i, j])
 
 
 @kernel

@@ -29,8 +29,8 @@ from agents.networks.policy_learner import (
     train,
 )
 from agents.networks.policy_updates import LOSSES, RolloutMinibatch
-from agents.networks.references import address_of
-from agents.networks.rollouts import Rollout, estimate_advantages
+from agents.networks.references import Reference, address_of
+from agents.networks.rollouts import Rollout, RolloutMemory, estimate_advantages, pick_steps
 from agents.networks.shared_tensors import shared_tensors
 
 # How far a number may move that nothing bounds.
@@ -77,6 +77,15 @@ class PolicyTraining(NetworkTraining):
         rows = max(size, agent.n_envs)
         flat = tensors.trained.vector
         self.recorded, self.place = 0, record_of(PLACE)
+        batch = RolloutMinibatch(
+            make_inputs(actor, size),
+            np.zeros(size, np.int64),
+            *(np.zeros(size, np.float32) for _ in range(4)),
+        )
+        rollout, order = self._rollout(), np.arange(n_steps)
+        observations = agent.rollout_buffer.observations
+        observations = observations.reshape(*observations.shape[:2], -1)
+        self.memory = Reference(RolloutMemory(observations, rollout, order, batch, actor.one_hot))
         return PolicyLearner(
             self._rules(self._bound_now),
             self.place,
@@ -86,15 +95,13 @@ class PolicyTraining(NetworkTraining):
             flat,
             np.zeros_like(flat),
             tensors.take_over(),
-            self._rollout(),
+            rollout,
+            address_of(pick_steps, self.memory),
+            np.uintp(self.memory.address),
             np.zeros(agent.n_envs, np.float32),
             np.zeros(agent.n_envs, np.float32),
-            np.arange(n_steps),
-            RolloutMinibatch(
-                make_inputs(actor, size),
-                np.zeros(size, np.int64),
-                *(np.zeros(size, np.float32) for _ in range(4)),
-            ),
+            order,
+            batch,
             make_outputs(actor, rows),
             make_outputs(actor, size),
             make_outputs(critic, rows),
@@ -138,9 +145,7 @@ class PolicyTraining(NetworkTraining):
         if buffer.generator_ready:
             # The library has flattened it for its own minibatches.
             buffer.reset()
-        n_steps, n_envs = buffer.rewards.shape
         return Rollout(
-            buffer.observations.reshape(n_steps, n_envs, -1),
             buffer.actions,
             buffer.rewards,
             buffer.episode_starts,
@@ -153,7 +158,7 @@ class PolicyTraining(NetworkTraining):
     def in_loop(self) -> PolicyAgent:
         functions = (choose_randomly, evaluate, estimate_advantages, train)
         addresses = (address_of(function, self.learner) for function in functions)
-        return PolicyAgent(self.learner, self.seen, *addresses)
+        return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
 
     def schedules(self) -> dict[str, Schedule]:
         return {"learning_rate": self.agent.lr_schedule}

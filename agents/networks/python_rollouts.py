@@ -54,6 +54,7 @@ def _act(training: PolicyTraining, step: int) -> Any:
     training.tensors.trained.take_over()
     training.show(training.agent._last_obs)
     act_on_rows(training.learner, training.shown, actions)
+    training.memory.held.observations[step] = training.shown
     return actions
 
 

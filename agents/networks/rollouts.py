@@ -10,14 +10,13 @@ from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
 from agents.networks.observations import show
 from mdp.array_types import Ints
-from mdp.machine_code import called, inlined, kernel
+from mdp.machine_code import inlined, kernel
 
 
 class Rollout(NamedTuple):
-    """The library's rollout buffer: T steps of E environments.
+    """The library's rollout buffer but for observations: T steps of E environments.
 
     Attributes:
-        observations: shape (T, E, d); numbers of states have d = 1.
         actions: shape (T, E, 1).
         rewards: shape (T, E).
         episode_starts: 1 where an episode began with the observation, shape (T, E).
@@ -27,14 +26,31 @@ class Rollout(NamedTuple):
         returns: what the values are to be, shape (T, E).
     """
 
-    observations: Singles
-    actions: Singles
+    actions: Ints
     rewards: Singles
     episode_starts: Singles
     values: Singles
     log_probs: Singles
     advantages: Singles
     returns: Singles
+
+
+class RolloutMemory(NamedTuple):
+    """What minibatches are taken from, by reference.
+
+    Attributes:
+        observations: shape (T, E, d); numbers of states have d = 1.
+        rollout: the rest of the buffer.
+        order: numbers of the rollout's steps, shuffled, shape (T * E,).
+        batch: what is filled, a `RolloutMinibatch`.
+        one_hot: whether observations are numbers of states.
+    """
+
+    observations: Any
+    rollout: Rollout
+    order: Ints
+    batch: Any
+    one_hot: int
 
 
 @kernel
@@ -66,16 +82,18 @@ def shuffle(numbers: Ints, handle: Any) -> None:
         numbers[i], numbers[j] = numbers[j], numbers[i]
 
 
-@called
-def pick_steps(learner: Any, numbers: Ints) -> None:
-    """Copy these steps of the rollout into the minibatch."""
-    rollout, batch = learner.rollout, learner.batch
+@kernel
+def pick_steps(memory: Any, begin: float, n: float) -> int:
+    """Copy ``n`` steps of the rollout into the minibatch, in its order from ``begin`` on."""
+    rollout, batch, first = memory.rollout, memory.batch, int(begin)
     n_envs = rollout.rewards.shape[1]
-    for k in range(len(numbers)):
-        step, i = numbers[k] // n_envs, numbers[k] % n_envs
-        show(batch.states, k, rollout.observations[step, i], learner.policy.one_hot)
+    for k in range(int(n)):
+        number = memory.order[first + k]
+        step, i = number // n_envs, number % n_envs
+        show(batch.states, k, memory.observations[step, i], memory.one_hot)
         batch.actions[k] = int(rollout.actions[step, i, 0])
         batch.log_probs[k] = rollout.log_probs[step, i]
         batch.advantages[k] = rollout.advantages[step, i]
         batch.returns[k] = rollout.returns[step, i]
         batch.values[k] = rollout.values[step, i]
+    return int(n)
