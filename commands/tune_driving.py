@@ -49,6 +49,8 @@ def drive(console: Console, place: OpenTuning, how: How) -> int:
     with place.queue:
         print_opened(console, place, how.place(place.root).words)
         _search(console, place, how)
+        if place.queue.is_done:
+            remove_dead_drafts(place.root)  # of runs that nobody asks for any more
     print_search(console, place)
     try:
         return _judge(console, place, how)
@@ -77,8 +79,6 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
             progress,
             how.deadline,
         ).run()
-    if queue.is_done:
-        remove_dead_drafts(place.root)  # of runs that nobody asks for any more
 
 
 def _judge(console: Console, place: OpenTuning, how: How) -> int:
