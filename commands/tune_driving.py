@@ -62,7 +62,7 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
         return {t.number: t.value if t.state.name == "COMPLETE" else None for t in trials}
 
     tuning, queue = place.tuning, place.queue
-    if queue.is_done:
+    if queue.is_done():
         return
     progress = TuningProgress(console, queue.n_trials, ended, is_cost=tuning.is_cost)
     with progress, how.place(place.root).launchers() as launcher:
@@ -76,7 +76,7 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
             progress,
             how.deadline,
         ).run()
-    if queue.is_done:
+    if queue.is_done():
         remove_dead_drafts(place.root)  # of runs that nobody asks for any more
 
 

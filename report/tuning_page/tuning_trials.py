@@ -99,7 +99,8 @@ def importances(trials: Trials) -> dict[str, float]:
     judged = trials.judged
     if len({trial["value"] for trial in judged}) < 2 or not ranges:
         return {}
-    direction = "minimize" if trials.is_cost else "maximize"
+    directions = optuna.study.StudyDirection
+    direction = directions.MINIMIZE if trials.is_cost else directions.MAXIMIZE
     study = optuna.create_study(direction=direction, sampler=optuna.samplers.RandomSampler(0))
     for trial in judged:
         params = {name: value for name, value in trial["params"].items() if name in ranges}
