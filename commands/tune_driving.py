@@ -24,7 +24,6 @@ from commands.tune_progress import TuningProgress
 from experiments.child_processes import stop_all
 from experiments.drafts import remove_dead_drafts
 from experiments.study_plan import plan
-from experiments.study_results import EarlyResults
 from pipeline.folder_lock import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning
@@ -49,8 +48,6 @@ def drive(console: Console, place: OpenTuning, how: How) -> int:
     with place.queue:
         print_opened(console, place, how.place(place.root).words)
         _search(console, place, how)
-        if place.queue.is_done:
-            remove_dead_drafts(place.root)  # of runs that nobody asks for any more
     print_search(console, place)
     try:
         return _judge(console, place, how)
@@ -65,7 +62,7 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
         return {t.number: t.value if t.state.name == "COMPLETE" else None for t in trials}
 
     tuning, queue = place.tuning, place.queue
-    if queue.is_done:
+    if queue.is_done():
         return
     progress = TuningProgress(console, queue.n_trials, ended, is_cost=tuning.is_cost)
     with progress, how.place(place.root).launchers() as launcher:
@@ -79,6 +76,8 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
             progress,
             how.deadline,
         ).run()
+    if queue.is_done():
+        remove_dead_drafts(place.root)  # of runs that nobody asks for any more
 
 
 def _judge(console: Console, place: OpenTuning, how: How) -> int:
@@ -151,9 +150,8 @@ def _retested(
     study = retest_study(place.tuning, place.root, candidates)
     planned = plan(study, root)
     how.place(root).get_ready(planned)
-    early = EarlyResults(study)
-    failures = do_missing(console, planned, root, how.place(root), early)
-    results = read(console, study, planned, root, early)
+    failures = do_missing(console, planned, root, how.place(root))
+    results = read(console, study, planned, root)
     code = conclude(console, results, failures, how.command, with_page=how.with_page)
     with doing(console, "judging the winner") as activity:
         analysis = analyse(results, activity.at, take_looks(results))

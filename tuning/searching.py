@@ -124,7 +124,7 @@ class Search:
         return time.monotonic() > self.deadline
 
     def _is_at_end(self) -> bool:
-        return not self._runs and (self._is_late or (not self._trials and self.queue.is_done))
+        return not self._runs and (self._is_late or (not self._trials and self.queue.is_done()))
 
     def _hand_out(self) -> None:
         """Give every worker something to do, as far as there is anything."""

@@ -65,7 +65,6 @@ class TrialQueue:
         found = self.storage.get_all_trials(self.study_id, deepcopy=False)
         return sorted(found, key=lambda trial: trial.number)[: self.n_trials]
 
-    @property
     def is_done(self) -> bool:
         """Whether every trial has ended."""
         trials = self.trials()

@@ -26,7 +26,7 @@ def test_no_two_drivers_take_the_same_trial_and_none_takes_more_than_there_are(t
     taken = [driver.claim(lambda _: {}) for _ in range(2) for driver in drivers]
     assert sorted(trial.number for trial in taken if trial is not None) == list(range(4))
     assert len(drivers[0].study.trials) == 4
-    assert not drivers[0].is_done
+    assert not drivers[0].is_done()
 
 
 @pytest.mark.parametrize("kind", STORAGES)
