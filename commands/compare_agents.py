@@ -6,14 +6,14 @@ import _thread
 import argparse
 import signal
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from commands.flag_values import (
     COUNT,
     COUNT_OR_NONE,
-    JOBS,
     RUN_MEMORY,
     RUN_TIMEOUT,
     filled,
@@ -22,6 +22,7 @@ from commands.flag_values import (
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
+from commands.places import Place, add_place_flags, held, place_of
 from commands.streams import go_on_unread
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
@@ -31,7 +32,6 @@ from pipeline.stopping import stops_noticed
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from experiments.launching import Launchers
     from experiments.planned_runs import PlannedRun
     from experiments.study_spec import StudySpec
 
@@ -122,8 +122,9 @@ def _add_log_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_run_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("runs").add_argument
-    add("-j", "--jobs", type=JOBS, default=0, metavar="N", help="runs at once (default: all cores)")
+    group = parser.add_argument_group("runs")
+    add_place_flags(group)
+    add = group.add_argument
     add("--run-timeout", type=RUN_TIMEOUT, metavar="TIME", help="end a run after, say, 10m")
     add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes, say, 4GB")
     add("--repair", action="store_true", help="do damaged runs again; their folders are kept")
@@ -174,16 +175,19 @@ def _compare(args: argparse.Namespace) -> int:
     study = study_spec(args)
     from commands.terminal import table_console
     from experiments.child_processes import end_server, stop_all
+    from experiments.run_limits import RunLimits
     from experiments.study_plan import plan
     from pipeline.folder_lock import folder_lock
 
     go_on_unread()
     root = Path(args.log_folder) / study.name
-    how = _how(args, study, root)
-    planned = plan(study, root)
     console = table_console()
-    console.print(study.title, style="bold", markup=False, highlight=False)
     say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    place = place_of(
+        args, root, command_line(), RunLimits(study.run_timeout, study.run_memory), say
+    )
+    planned = plan(study, root)
+    console.print(study.title, style="bold", markup=False, highlight=False)
 
     def stop() -> None:
         say(f"{root}: another driver has taken this one for dead; this one stops")
@@ -193,8 +197,8 @@ def _compare(args: argparse.Namespace) -> int:
     with folder_lock(root, stop, say):
         try:
             if args.until_decided:
-                return _grow_study(args, study, root, console, how)
-            return _do_study(args, study, planned, root, console, how)
+                return _grow_study(args, study, root, console, place)
+            return _do_study(args, study, planned, root, console, place)
         except KeyboardInterrupt:
             end_server()
             raise
@@ -206,16 +210,17 @@ def _do_study(
     planned: Sequence[PlannedRun],
     root: Path,
     console: Console,
-    how: dict[str, Any],
+    place: Place,
 ) -> int:
     """Do a study with the seeds that it has, once it is known how often it was looked at."""
     from experiments.looks_file import read_looks
 
     read_looks(root)
-    _prepare(args, study, planned, root, console)
+    _prepare(args, study, planned, root, console, place)
     from commands.study_output import run_study
 
-    return run_study(console, study, planned, root, command_line(), **how)
+    page = not args.no_report
+    return run_study(console, study, planned, root, command_line(), place, with_page=page)
 
 
 def _grow_study(
@@ -223,7 +228,7 @@ def _grow_study(
     study: StudySpec,
     root: Path,
     console: Console,
-    how: dict[str, Any],
+    place: Place,
 ) -> int:
     """Do a study with more and more seeds, as was settled before the first look."""
     from experiments.growing import counts_of, grown, settle, settled_looks
@@ -232,22 +237,14 @@ def _grow_study(
     looks = settled_looks(study, root, args.max_seeds)
     counts = counts_of(study, looks)
     planned = plan(grown(study, counts), root, counts)
-    _prepare(args, grown(study, counts), planned, root, console)
+    _prepare(args, grown(study, counts), planned, root, console, place)
     settle(root, looks)
     from commands.growing_output import grow_study
 
-    return grow_study(console, study, counts, root, command_line(), **how)
-
-
-def _how(args: argparse.Namespace, study: StudySpec, root: Path) -> dict[str, Any]:
-    from experiments.launching import available_cores, local_launcher
-    from experiments.run_limits import RunLimits
-
-    n_workers = max(args.jobs, 0) or available_cores()
-    limits = RunLimits(study.run_timeout, study.run_memory)
-    launchers: Launchers = partial(local_launcher, root, command_line(), n_workers, limits)
-    where = f"{n_workers} at once"
-    return {"launchers": launchers, "where": where, "with_page": not args.no_report}
+    page = not args.no_report
+    with held(place.launchers) as launchers:  # from one look to the next
+        place = replace(place, launchers=launchers)
+        return grow_study(console, study, counts, root, command_line(), place, with_page=page)
 
 
 def _prepare(
@@ -256,6 +253,7 @@ def _prepare(
     planned: Sequence[PlannedRun],
     root: Path,
     console: Console,
+    place: Place,
 ) -> None:
     """Make sure that the runs can be done, before any is; and load the libraries for them."""
     if args.repair:
@@ -263,24 +261,14 @@ def _prepare(
 
         repair(console, study, planned)
     with doing(console, "looking for runs that are there") as activity, loading_libraries():
-        from experiments.child_processes import start_server
         from experiments.replaced_runs import check_settings_kept
         from experiments.study_plan import check_settings
 
         if not args.replace:
             check_settings_kept(planned, root)
         if any(run.is_to_do for run in planned):
-            start_server(_warm_ups(planned))  # it imports the libraries while this process does
+            place.get_ready(planned)
         activity.now("loading the libraries")
         import commands.study_output  # noqa: F401  # what it imports takes long
 
         check_settings(study, planned)
-
-
-def _warm_ups(planned: Sequence[PlannedRun]) -> str:
-    """What the server is to compile once for all runs: only of users' own modules."""
-    if not any(run.spec.user_modules for run in planned):
-        return "[]"
-    from experiments.warm_ups import warm_ups
-
-    return warm_ups(planned)

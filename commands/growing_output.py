@@ -7,9 +7,10 @@ from pathlib import Path
 
 from rich.console import Console
 
+from commands.places import Place
 from commands.study_output import conclude, do_missing, read, say
 from experiments.growing import Counts, Step, counts_after, grown, take_planned_looks
-from experiments.launching import Launchers, RunFailure
+from experiments.launching import RunFailure
 from experiments.study_plan import plan
 from experiments.study_results import EarlyResults
 from experiments.study_spec import StudySpec
@@ -22,9 +23,8 @@ def grow_study(
     counts: Counts,
     root: Path,
     command: str,
+    place: Place,
     *,
-    launchers: Launchers,
-    where: str,
     with_page: bool = True,
 ) -> int:
     """Do a study with more and more seeds until every pair is decided, and judge it at the end.
@@ -35,8 +35,7 @@ def grow_study(
         counts: how many seeds the agents are to have now.
         root: its folder, where the looks have been settled.
         command: the command that asked for it.
-        launchers: where runs are done.
-        where: the same, in words.
+        place: where runs are done.
         with_page: draw the figures and write the page, beside the tables.
 
     Returns:
@@ -49,7 +48,7 @@ def grow_study(
         planned = plan(now, root, counts)
         given_up = {failure.planned.path for failure in failures}
         early = EarlyResults(now)
-        failures += do_missing(console, planned, root, launchers, where, early, given_up)
+        failures += do_missing(console, planned, root, place, early, given_up)
         results = read(console, now, planned, root, early)
         steps = take_planned_looks(results)
         for step in steps:

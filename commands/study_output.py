@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 from rich.console import Console
 
+from commands.places import Place
 from commands.study_progress import StudyProgress
 from experiments.execution import execute
-from experiments.launching import Launchers, RunFailure
+from experiments.launching import RunFailure
 from experiments.looks import Standing
 from experiments.planned_runs import PlannedRun
 from experiments.repair import move_damaged_aside
@@ -31,9 +32,8 @@ def run_study(
     planned: Sequence[PlannedRun],
     root: Path,
     command: str,
+    place: Place,
     *,
-    launchers: Launchers,
-    where: str,
     with_page: bool = True,
 ) -> int:
     """Do a study as planned, print the judgement, and write tables, figures and page.
@@ -44,15 +44,14 @@ def run_study(
         planned: its runs, whose settings have been checked.
         root: its folder.
         command: the command that asked for it.
-        launchers: where runs are done.
-        where: the same, in words.
+        place: where runs are done.
         with_page: draw the figures and write the page, beside the tables.
 
     Returns:
         The exit code: 0 if all runs are there and sound, else 1.
     """
     early = EarlyResults(study)
-    failures = do_missing(console, planned, root, launchers, where, early)
+    failures = do_missing(console, planned, root, place, early)
     results = read(console, study, planned, root, early)
     return conclude(console, results, failures, command, with_page=with_page)
 
@@ -167,8 +166,7 @@ def do_missing(
     console: Console,
     planned: Sequence[PlannedRun],
     root: Path,
-    launchers: Launchers,
-    where: str,
+    place: Place,
     early: EarlyResults,
     given_up: Collection[Path] = (),
 ) -> list[RunFailure]:
@@ -180,7 +178,7 @@ def do_missing(
     missing = [run for run in planned if run.is_to_do and run.path not in given_up]
     done = [run for run in planned if run.is_finished]
     console.print(
-        f"{len(planned)} runs, {len(done)} of them there already; {where}, in {root}",
+        f"{len(planned)} runs, {len(done)} of them there already; {place.words}, in {root}",
         markup=False,
         highlight=False,
     )
@@ -193,7 +191,7 @@ def do_missing(
             if failure is None:
                 early.read(planned)
 
-        return execute(missing, root, launchers, note)
+        return execute(missing, root, progress.watching(place.launchers), note)
 
 
 def _judge(

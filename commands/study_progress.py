@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from types import TracebackType
 
 from rich.console import Console
@@ -13,7 +14,7 @@ from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
-from experiments.launching import RunFailure
+from experiments.launching import Launcher, Launchers, RunFailure
 from experiments.planned_runs import PlannedRun
 from pipeline.signs_of_life import (
     SECONDS_BETWEEN_LINES,
@@ -47,6 +48,7 @@ class StudyProgress:
         self.silence = Silence(SECONDS_BETWEEN_LINES)
         self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
         self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
+        self._launcher: Launcher | None = None
 
     def __enter__(self) -> StudyProgress:
         if self.live is not None:
@@ -67,6 +69,17 @@ class StudyProgress:
             self.live.stop()
         if isinstance(error, KeyboardInterrupt):
             self.console.print(f"{self._figures()}; the same command goes on", highlight=False)
+
+    def watching(self, launchers: Launchers) -> Launchers:
+        """The same launchers, of which is shown what there is to say while one is open."""
+
+        @contextlib.contextmanager
+        def watched() -> Iterator[Launcher]:
+            with launchers() as self._launcher:
+                yield self._launcher
+            self._launcher = None
+
+        return watched
 
     def note(self, run: PlannedRun, failure: RunFailure | None) -> None:
         """Count a run that has ended now."""
@@ -120,7 +133,10 @@ class StudyProgress:
         if 0 < self.n_ended < self.n_missing:
             left = seconds / self.n_ended * (self.n_missing - self.n_ended)
             text += f", about {_duration(left)} left"
-        return text
+        words = self._launcher.words if self._launcher is not None else ""
+        text += f", {words}" if words else ""
+        n_failed = self.failed.total()
+        return f"{text}, {n_failed} failed" if n_failed else text
 
     def _table(self) -> Table:
         table = Table(box=None, pad_edge=False, caption=self._figures(), caption_justify="left")

@@ -210,8 +210,7 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
     Args:
         n_workers: processes that work at once.
     """
-    start_server()
-    _stopping.clear()
+    be_ready()
     executor = ThreadPoolExecutor(n_workers)
     try:
         yield executor
@@ -223,6 +222,12 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
         raise
     executor.shutdown(cancel_futures=True)
     _end_idle()
+
+
+def be_ready(warm_ups: str = "[]") -> None:
+    """Start what children begin from, and let them be started, also after `stop_all`."""
+    start_server(warm_ups)
+    _stopping.clear()
 
 
 def start_server(warm_ups: str = "[]") -> None:

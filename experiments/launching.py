@@ -26,7 +26,6 @@ from experiments.child_processes import (
 )
 from experiments.drafts import leave_drafts, make_folder, run_name
 from experiments.planned_runs import PlannedRun
-from experiments.run_in_child import do_planned_run
 from experiments.run_limits import RunLimits
 from experiments.study_spec import file_name
 from pipeline.errors import one_line
@@ -55,6 +54,10 @@ class Launcher(Protocol):
     @property
     def n_workers(self) -> int:
         """How many runs it does at once, now."""
+
+    @property
+    def words(self) -> str:
+        """What is to be said of it while runs are done; mostly nothing."""
 
     def submit(self, planned: PlannedRun) -> Future[RunFailure | None]:
         """Have a run done.
@@ -102,6 +105,7 @@ class _LocalLauncher:
     root: Path
     command: str
     limits: RunLimits
+    words: str = ""
 
     def submit(self, planned: PlannedRun) -> Future[RunFailure | None]:
         return self.executor.submit(_supervised, planned, self.root, self.command, self.limits)
@@ -120,8 +124,17 @@ def _supervised(
     return None
 
 
-def do_supervised(planned: PlannedRun, root: Path, command: str, limits: RunLimits) -> None:
+def do_supervised(
+    planned: PlannedRun, root: Path, command: str, limits: RunLimits, home: Path = Path()
+) -> None:
     """Do a run in a child process of this one, with two tries if it dies.
+
+    Args:
+        planned: the run.
+        root: the study's folder.
+        command: the command that asked for it.
+        limits: what it may take.
+        home: the folder that relative paths begin at, those of the run and of the study too.
 
     Raises:
         TaskFailedError: if the run failed, or no process could be started for it.
@@ -129,17 +142,27 @@ def do_supervised(planned: PlannedRun, root: Path, command: str, limits: RunLimi
     """
     try:
         supervise(
-            do_planned_run,
+            _do_planned_run,
             planned,
             root,
             command,
-            clean_up=partial(leave_drafts, root, run_name(planned)),
+            home,
+            clean_up=partial(leave_drafts, home / root, run_name(planned)),
             limits=limits,
             shares_process=is_plain(planned.spec) and not planned.is_batch,
         )
     except (OSError, EOFError, RuntimeError) as error:  # no room, process, thread or file left
         reason = f"its process could not be started: {one_line(error)}"
         raise TaskFailedError(reason, traceback.format_exc()) from error
+
+
+def _do_planned_run(planned: PlannedRun, root: Path, command: str, home: Path) -> None:
+    # Imported where runs are done: it takes seconds, and a supervisor needs nothing of it.
+    from experiments.run_in_child import do_planned_run
+
+    if home.parts:
+        os.chdir(home)
+    do_planned_run(planned, root, command)
 
 
 def failed(planned: PlannedRun, root: Path, reason: str, details: str) -> RunFailure:

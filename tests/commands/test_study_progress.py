@@ -2,6 +2,7 @@
 
 import io
 import re
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -99,6 +100,24 @@ def test_failures_are_told_at_once_and_to_the_letter(clock):
     with StudyProgress(console, runs, []) as progress:
         progress.note(runs[2], failure_of(runs[2]))
     assert file.getvalue() == "failed: [b]one[/b] on lake, seed 1: too [hot]\n"
+
+
+def test_of_a_cluster_the_line_says_how_many_workers_there_are(clock):
+    runs = planned_runs()
+    file, console = console_of(force_terminal=False)
+    with StudyProgress(console, runs, []) as progress:
+        cluster = SimpleNamespace(words="3 workers")
+        with progress.watching(lambda: nullcontext(cluster))() as launcher:
+            assert launcher is cluster
+            progress.note(runs[2], failure_of(runs[2]))
+            clock.now += 11
+            progress.look()
+        clock.now += 11
+        progress.look()
+    assert file.getvalue().splitlines()[1:] == [
+        "1 of 8 runs in 11 s, about 1 min 17 s left, 3 workers, 1 failed",
+        "1 of 8 runs in 22 s, about 2 min 34 s left, 1 failed",
+    ]
 
 
 def test_a_study_that_is_interrupted_says_how_to_go_on(clock):

@@ -13,6 +13,7 @@ import pytest
 from rich.console import Console
 
 import compare
+from commands.places import Place
 from commands.study_output import repair, run_study
 from experiments.bandit_batches import STATISTICS_FILE
 from experiments.drafts import draft_path
@@ -224,10 +225,8 @@ def compare_again(capsys):
 
     def again(study, planned, root):
         console = Console(width=400)
-        launchers = partial(local_launcher, root, "c", 1)
-        code = run_study(
-            console, study, planned, root, "c", launchers=launchers, where="here", with_page=False
-        )
+        place = Place(partial(local_launcher, root, "c", 1), "here", lambda _: None)
+        code = run_study(console, study, planned, root, "c", place, with_page=False)
         return code, capsys.readouterr().out
 
     return again

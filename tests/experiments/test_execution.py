@@ -5,6 +5,7 @@ import errno
 import json
 import os
 from concurrent.futures import Future
+from pathlib import Path
 
 import pytest
 import yaml
@@ -14,7 +15,7 @@ from experiments.child_processes import NO_LIMITS, StoppedError, TaskFailedError
 from experiments.drafts import draft_path, leave_drafts, run_name
 from experiments.execution import WINDOW, execute
 from experiments.launching import available_cores, failure_log
-from experiments.run_in_child import do_planned_run, do_run
+from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
@@ -128,9 +129,10 @@ def test_every_run_is_told_of_and_failures_are_kept(tmp_path, monkeypatch):
     log.parent.mkdir()
     log.write_text("of an earlier try")
 
-    def supervise(work, run, root, command, *, clean_up, limits, shares_process):
+    def supervise(work, run, *where, clean_up, limits, shares_process):
         assert shares_process
-        assert (work, root, command, limits) == (do_planned_run, tmp_path, "c", RunLimits(9))
+        assert (work, limits) == (launching._do_planned_run, RunLimits(9))
+        assert where == (tmp_path, "c", Path())
         if run is bad:
             raise TaskFailedError("thin ice", "Traceback: thin ice\n")
         if run is stopped:

@@ -1,0 +1,159 @@
+"""Where runs are done, as the command line says it: on this machine, or on a cluster."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib.util
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from commands.flag_values import JOBS, filled
+from pipeline.errors import UserError
+
+if TYPE_CHECKING:
+    from experiments.cluster.addresses import Cluster
+    from experiments.launching import Launcher, Launchers
+    from experiments.planned_runs import PlannedRun
+    from experiments.run_limits import RunLimits
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where runs are done.
+
+    Attributes:
+        launchers: opens it.
+        words: what it is, in words.
+        get_ready: called with the runs that are planned, before it is opened: what they compile is
+            compiled once.
+    """
+
+    launchers: Launchers
+    words: str
+    get_ready: Callable[[Sequence[PlannedRun]], None]
+
+
+def add_place_flags(group: argparse._ArgumentGroup) -> None:
+    """The flags that say where."""
+    add = group.add_argument
+    add("-j", "--jobs", type=JOBS, default=0, metavar="N", help="runs at once (default: all cores)")
+    add(
+        "--cluster",
+        type=filled,
+        metavar="WHERE",
+        help="do runs on a cluster: a Dask scheduler's address or file, a YAML of dask-jobqueue, "
+        "or local:N",
+    )
+    add(
+        "--insecure-cluster",
+        action="store_true",
+        help="also on one that is open to its network without TLS: whoever reaches it can run code",
+    )
+
+
+def place_of(
+    args: argparse.Namespace,
+    root: Path,
+    command: str,
+    limits: RunLimits,
+    say: Callable[[str], object],
+) -> Place:
+    """The place that the flags ask for.
+
+    Args:
+        args: with those of `add_place_flags`.
+        root: the folder of what is done there.
+        command: the command, as runs note it.
+        limits: what each run may take.
+        say: told in a line what there is to know.
+
+    Raises:
+        UserError: if there is no such place, or it is open to others.
+    """
+    if args.cluster is not None:
+        return _cluster(args, root, command, limits, say)
+    if args.insecure_cluster:
+        raise UserError("--insecure-cluster says something of a cluster: give --cluster too")
+    from experiments.launching import available_cores, local_launcher
+
+    n_workers = max(args.jobs, 0) or available_cores()
+    launchers = partial(local_launcher, root, command, n_workers, limits)
+    return Place(launchers, f"{n_workers} at once", _start_server)
+
+
+def _start_server(planned: Sequence[PlannedRun]) -> None:
+    from experiments.child_processes import start_server
+
+    wanted = "[]"
+    if any(run.spec.user_modules for run in planned):  # else nothing of theirs is compiled
+        from experiments.warm_ups import warm_ups
+
+        wanted = warm_ups(planned)
+    start_server(wanted)  # it imports the libraries while this process does
+
+
+def _cluster(
+    args: argparse.Namespace,
+    root: Path,
+    command: str,
+    limits: RunLimits,
+    say: Callable[[str], object],
+) -> Place:
+    for library in ("distributed", "cryptography", "dask_jobqueue"):
+        if importlib.util.find_spec(library) is None:
+            raise UserError("--cluster takes Dask: pip install 'rl-yardstick[cluster]'")
+    from experiments.cluster.clusters import checked_cluster
+
+    cluster = checked_cluster(args.cluster, args.insecure_cluster)
+    _check_jobs(cluster, args.jobs)
+    compiled = ["[]"]
+
+    def launchers() -> contextlib.AbstractContextManager[Launcher]:
+        from experiments.cluster.cluster_launcher import cluster_launcher
+
+        return cluster_launcher(
+            cluster,
+            root,
+            command,
+            limits,
+            n_runs=args.jobs,
+            is_told=args.insecure_cluster,
+            warm_ups=compiled[0],
+            tell=say,
+        )
+
+    def get_ready(planned: Sequence[PlannedRun]) -> None:
+        from experiments.warm_ups import warm_ups
+
+        compiled[0] = warm_ups(planned)
+
+    return Place(launchers, f"on the cluster {args.cluster}", get_ready)
+
+
+def _check_jobs(cluster: Cluster, n_jobs: int) -> None:
+    from experiments.cluster.addresses import JobQueue
+
+    if isinstance(cluster, JobQueue):
+        if n_jobs < 1:
+            raise UserError(f"{cluster.file}: say how many runs are to go at once: --jobs N")
+    elif n_jobs > 0:
+        raise UserError("--jobs is for this machine or a queue of jobs; a cluster has its workers")
+
+
+@contextlib.contextmanager
+def held(launchers: Launchers) -> Iterator[Launchers]:
+    """Launchers that open the place once, and leave it when the ``with`` statement ends."""
+    with contextlib.ExitStack() as stack:
+        there: list[Launcher] = []
+
+        @contextlib.contextmanager
+        def again() -> Iterator[Launcher]:
+            if not there:
+                there.append(stack.enter_context(launchers()))
+            yield there[0]
+
+        yield again

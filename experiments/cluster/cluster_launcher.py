@@ -1,0 +1,298 @@
+"""Runs on a cluster, each caught by itself: what is lost on the way is tried again."""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from distributed import Client
+from distributed import Future as DaskFuture
+from distributed.scheduler import KilledWorker
+
+from experiments.child_processes import NO_LIMITS
+from experiments.cluster.addresses import Cluster, JobQueue, LocalWorkers
+from experiments.cluster.answers import FAILED, STOPPED, UNFIT, RefusedAnswerError, unpacked
+from experiments.cluster.clusters import opened
+from experiments.cluster.connections import Connection
+from experiments.cluster.orders import LEAVING, Probe, RunOrder, probing, version
+from experiments.cluster.receiving import check_in_place, receive
+from experiments.cluster.sent_runs import SentRun
+from experiments.cluster.tasks import do_order
+from experiments.cluster.working import Supervisors
+from experiments.drafts import run_name
+from experiments.launching import Launcher, RunFailure, failed, failure_log
+from experiments.planned_runs import PlannedRun
+from experiments.run_limits import RunLimits
+from pipeline.errors import UserError, one_line
+from pipeline.signs_of_life import Heartbeat
+
+SECONDS_TO_GATHER = 60.0
+SECONDS_BETWEEN_LOOKS = 1.0
+SECONDS_BETWEEN_REPLACEMENTS = 15.0
+# Answers that are looked at and put in place at once: so many are in memory.
+N_RECEIVERS = 4
+
+
+@contextlib.contextmanager
+def cluster_launcher(
+    cluster: Cluster,
+    root: Path,
+    command: str,
+    limits: RunLimits = NO_LIMITS,
+    *,
+    n_runs: int = 0,
+    is_told: bool = False,
+    warm_ups: str = "[]",
+    tell: Callable[[str], object] = str,
+) -> Iterator[Launcher]:
+    """Do runs on a cluster.
+
+    Args:
+        cluster: which.
+        root: the study's folder.
+        command: the command that asked for it, noted in every run folder.
+        limits: what each run may take.
+        n_runs: for how many runs at once jobs are to be started, in a queue.
+        is_told: whether the user has said that a scheduler open to the network will do.
+        warm_ups: what workers are to compile once, see `experiments.warm_ups`.
+        tell: told where the dashboard is.
+
+    Raises:
+        UserError: if there is no such cluster.
+    """
+    plugin, wanted = Supervisors(warm_ups), n_runs if isinstance(cluster, JobQueue) else 0
+    wanted = cluster.n_workers if isinstance(cluster, LocalWorkers) else wanted
+    with probing(root) as probe, opened(cluster, n_runs, is_told) as (connect, replace_jobs):
+        launcher = ClusterLauncher(probe, command, limits, wanted)
+        prepare = partial(launcher.prepare, plugin)
+        launcher.connection = connection = Connection(connect, prepare, is_told)
+        connection.open()
+        tell(f"dashboard: {connection.client().dashboard_link}")
+        heart = Heartbeat(partial(launcher.look, replace_jobs), SECONDS_BETWEEN_LOOKS)
+        heart.start()
+        try:
+            yield launcher
+        finally:
+            launcher.close()
+            heart.stop()
+
+
+class ClusterLauncher:
+    """The driver's side of a cluster.
+
+    Args:
+        probe: lies in the study's folder.
+        command: the command that asked for the study.
+        limits: what each run may take.
+        n_wanted: how many workers there will be at least.
+    """
+
+    connection: Connection
+
+    def __init__(self, probe: Probe, command: str, limits: RunLimits, n_wanted: int) -> None:
+        self._probe, self._command, self._limits = probe, command, limits
+        self._topic = f"yardstick-{secrets.token_hex(8)}"
+        self._sent: dict[str, SentRun] = {}  # by key
+        self._left: set[str] = set()  # workers
+        self._lock = threading.RLock()
+        self._receivers = ThreadPoolExecutor(N_RECEIVERS)
+        self._n_wanted = n_wanted
+        self._workers: Mapping[str, int] = {}  # with how many runs each does at once
+        self._replaced = time.monotonic()
+        self._end: UserError | None = None
+
+    @property
+    def n_workers(self) -> int:
+        """How many runs the cluster does at once."""
+        return max(sum(self._workers.values()), self._n_wanted)
+
+    @property
+    def words(self) -> str:
+        """How many workers there are, now."""
+        n, n_runs = len(self._workers), sum(self._workers.values())
+        text = "1 worker" if n == 1 else f"{n:,} workers"
+        return text if n == n_runs else f"{text} for {n_runs:,} runs at once"
+
+    def prepare(self, plugin: Supervisors, client: Client) -> None:
+        """Make a scheduler's workers able to do runs, and listen to them."""
+        for topic, handler in ((LEAVING, self._on_leaving), (self._topic, self._on_begun)):
+            client.subscribe_topic(topic, handler)
+        try:
+            client.register_plugin(plugin)
+        except Exception as error:
+            raise UserError(f"--cluster: its workers can do no runs: {one_line(error)}") from error
+
+    def submit(self, planned: PlannedRun) -> Future[RunFailure | None]:
+        """See `experiments.launching.Launcher`."""
+        sent = SentRun(planned)
+        sent.future.set_running_or_notify_cancel()
+        self._receivers.submit(self._guarded, sent, self._send)
+        return sent.future
+
+    def look(self, replace_jobs: Callable[[], object]) -> None:
+        """Count the workers, and see to it that there is a scheduler."""
+        try:
+            self._workers = self.connection.n_threads()
+            if time.monotonic() > self._replaced + SECONDS_BETWEEN_REPLACEMENTS:
+                self._replaced = time.monotonic()
+                replace_jobs()
+        except UserError as error:
+            self._end_all(error)
+        except Exception:  # noqa: BLE001  # of the library, gone just now: the next look knows more
+            self._workers = {}
+
+    def close(self) -> None:
+        """Leave the cluster; runs that are under way there end, and keep their states."""
+        self._end_all(UserError("the cluster was left"))
+        self.connection.close()
+        self._receivers.shutdown(cancel_futures=True)
+
+    def _end_all(self, error: UserError) -> None:
+        with self._lock:
+            self._end = self._end or error
+            sent, self._sent = list(self._sent.values()), {}
+        for each in sent:
+            _set_error(each.future, error)
+
+    def _guarded(self, sent: SentRun, function: Callable[..., object], *args: Any) -> None:
+        """Let nothing that goes wrong leave a future waiting."""
+        try:
+            if self._end is not None:
+                raise self._end
+            function(sent, *args)
+        except UserError as error:  # of the cluster as a whole
+            _set_error(sent.future, error)
+            self._end_all(error)
+        except Exception as error:  # noqa: BLE001  # whoever waits for it has to know
+            _set_error(sent.future, error)
+
+    def _send(self, sent: SentRun) -> None:
+        """Hand a run to the scheduler, if it has not been tried often enough."""
+        with self._lock:
+            self._sent.pop(sent.key, None)
+            if sent.is_given_up:
+                self._settle(sent, sent.reason)
+                return
+            sent.n_sent += 1
+            sent.key = f"{run_name(sent.planned)}-{secrets.token_hex(8)}"
+            self._sent[sent.key] = sent
+        order = RunOrder(
+            sent.planned, self._command, self._limits, self._probe, self._topic, version()
+        )
+        client = self.connection.client()
+        try:
+            sent.task = client.submit(do_order, pickle.dumps(order), key=sent.key, pure=False)
+        except (OSError, RuntimeError):  # the client has lost its scheduler since then
+            self.connection.lose(client)
+            self._receivers.submit(self._guarded, sent, self._send)
+            return
+        sent.task.add_done_callback(partial(self._on_done, sent))
+
+    def _on_done(self, sent: SentRun, task: DaskFuture[Any]) -> None:
+        with contextlib.suppress(RuntimeError):  # closed
+            self._receivers.submit(self._guarded, sent, self._take, task)
+
+    def _take(self, sent: SentRun, task: DaskFuture[Any]) -> None:
+        """See what has become of a run, and send it again where it has not come back."""
+        if sent.future.done() or sent.task is not task:
+            return
+        if task.status == "finished":
+            try:
+                content = task.result(timeout=SECONDS_TO_GATHER)
+            except TimeoutError:  # its worker has died since, and it is done again
+                task.add_done_callback(partial(self._on_done, sent))
+                return
+            except Exception:  # noqa: BLE001  # of whatever kind, from the scheduler: it is lost
+                sent.worker = None
+            else:
+                if self._is_settled(sent, content):
+                    return
+        elif task.status == "error":
+            error = task.exception()
+            if isinstance(error, KilledWorker):
+                sent.lose(sent.worker in self._left)
+            else:
+                sent.refuse(one_line(error))
+        else:
+            sent.worker = None
+            self._workers = {}
+            self.connection.lose(task.client)
+        self._send(sent)
+
+    def _is_settled(self, sent: SentRun, content: object) -> bool:
+        """Whether an answer is the end of a run; what it leaves is in its place then."""
+        try:
+            answer = unpacked(content)
+            if answer.kind == FAILED:
+                self._settle(sent, answer.reason, answer.details)
+                return True
+            if answer.kind == UNFIT:
+                raise UserError(f"--cluster: {answer.reason}: start it anew, from the same folder")
+            if answer.kind == STOPPED:
+                sent.worker = None
+                return False
+            if answer.files is None:
+                check_in_place(sent.planned)
+            else:
+                receive(sent.planned, self._probe.root, answer.files)
+        except RefusedAnswerError as error:
+            sent.refuse(one_line(error))
+            return False
+        except OSError as error:  # the disk is full
+            self._settle(sent, one_line(error))
+            return True
+        self._settle(sent)
+        return True
+
+    def _settle(self, sent: SentRun, reason: str = "", details: str = "") -> None:
+        """Tell whoever waits for a run that it is done, or how it failed."""
+        with self._lock:
+            self._sent.pop(sent.key, None)
+        root, failure = self._probe.root, None
+        if reason:
+            failure = failed(sent.planned, root, reason, details or f"{reason}\n")
+        else:
+            failure_log(root, sent.planned).unlink(missing_ok=True)
+        with contextlib.suppress(Exception):
+            sent.task.release()
+        if not sent.future.done():
+            sent.future.set_result(failure)
+
+    def _on_begun(self, event: Any) -> None:
+        """Note who has begun a run; called by the client, and with anything."""
+        match event:
+            case [_, {"run": str(key), "at": str(worker)}]:
+                pass
+            case _:
+                return
+        with self._lock:
+            sent = self._sent.get(key)
+            if sent is not None:
+                sent.begin(worker, sent.worker in self._left)
+                self._left.discard(worker)
+                if sent.is_given_up:
+                    self._receivers.submit(self._guarded, sent, self._give_up)
+
+    def _give_up(self, sent: SentRun) -> None:
+        self._settle(sent, sent.reason)
+        with contextlib.suppress(Exception):
+            sent.task.cancel()
+
+    def _on_leaving(self, event: Any) -> None:
+        match event:
+            case [_, {"at": str(worker)}]:
+                with self._lock:
+                    self._left.add(worker)
+
+
+def _set_error(future: Future[RunFailure | None], error: Exception) -> None:
+    if not future.done():
+        future.set_exception(error)

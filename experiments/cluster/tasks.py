@@ -1,0 +1,20 @@
+"""The one function that Dask is told to call, on workers alone.
+
+The scheduler has to import it, and so it imports nothing: what a run is, only workers know.
+"""
+
+from __future__ import annotations
+
+
+def do_order(order: bytes) -> bytes:
+    """Do a run on the worker that calls this.
+
+    Args:
+        order: see `experiments.cluster.orders`.
+
+    Returns:
+        See `experiments.cluster.answers`.
+    """
+    from experiments.cluster.working import answer_to
+
+    return answer_to(order)

@@ -1,0 +1,172 @@
+"""Runs on a cluster of two workers on this machine: killed, sent, refused."""
+
+import contextlib
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+from distributed import LocalCluster
+
+import compare
+from experiments.cluster import cluster_launcher as launching_there
+from experiments.cluster import connections
+from experiments.cluster.addresses import SchedulerAddress
+from experiments.cluster.cluster_launcher import cluster_launcher
+from experiments.cluster.orders import Probe
+from experiments.drafts import draft_path
+from experiments.execution import execute
+from experiments.run_in_child import do_run
+from experiments.study_plan import plan
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.errors import UserError
+from pipeline.user_modules import import_typed
+
+ROOT = Path(compare.__file__).parent
+DEADLY = """
+import multiprocessing, os, pathlib, signal
+import gymnasium as gym
+from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
+
+class Deadly(FrozenLakeEnv):
+    def __init__(self, mark, **kwargs):
+        super().__init__(**kwargs)
+        self.mark = pathlib.Path(mark)
+
+    def reset(self, **kwargs):
+        parent = multiprocessing.parent_process()
+        if parent is not None and self.mark.suffix == ".each":
+            os.kill(os.getpid(), signal.SIGKILL)
+        if parent is not None and not self.mark.exists():
+            self.mark.touch()
+            os.kill(parent.pid, signal.SIGKILL)
+        return super().reset(**kwargs)
+
+gym.register("Deadly-v0", Deadly, max_episode_steps=20)
+"""
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    with LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0", memory_limit=0
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def there(scheduler):
+    """Launchers on the cluster, by the study's folder."""
+    return lambda root: partial(cluster_launcher, SchedulerAddress(scheduler), root, "c")
+
+
+def runs_of(root, modules=(), **more):
+    environments = [EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 500})]
+    for label, mark in more.items():
+        settings = {"n_timesteps": 40, "env_kwargs": {"mark": str(mark)}}
+        environments.append(EnvironmentSpec(label, "Deadly-v0", settings))
+    agents = (AgentSpec("mine", "qlearning", tuned=False),)
+    names = tuple(module.name for module in modules)
+    study = StudySpec(
+        "s", "S", agents, tuple(environments), 2, gym_packages=names, user_modules=modules
+    )
+    return plan(study, root)
+
+
+def left_in(root):
+    sys.path.insert(0, str(ROOT / "benchmarks"))
+    try:
+        from _run_contents import contents
+    finally:
+        sys.path.pop(0)
+    return contents(root / "runs")
+
+
+def done(root, launchers, runs):
+    """What runs leave, by name; and the failures, by environment."""
+    root.mkdir()
+    failures = execute(runs, root, launchers, lambda *_: None)
+    assert sorted({path.name for path in root.iterdir()} - {"failures"}) == ["runs"]
+    by_run = {(each.planned.environment, each.planned.seed): each for each in failures}
+    return left_in(root), by_run
+
+
+def check_what_dies(there, folder, here):
+    """A run that kills its worker is tried again; one that dies each time fails alone."""
+    (folder / "deadly_lake.py").write_text(DEADLY)
+    modules = import_typed([str(folder / "deadly_lake.py")])
+    marks = {"once": folder / "once", "poison": folder / "x.each"}
+    root = folder / "shared"
+    found, failures = done(root, there(root), runs_of(root, modules, **marks))
+    assert (folder / "once").exists()
+    assert failures.keys() == {("poison", 0), ("poison", 1)}
+    assert failures["poison", 0].reason == "its process died 2 times (SIGKILL)"
+    assert failures["poison", 0].log.read_text()
+    # Beside the copies of the module.
+    assert {name: found.get(name) for name in here} == here
+    assert len({name for name in found if "once_" in name and "run.json" in name}) == 2
+
+
+def check_what_is_sent(there, folder, here, monkeypatch):
+    """Where no folder is shared, files come back."""
+
+    @contextlib.contextmanager
+    def elsewhere(root):
+        yield Probe(Path("/nowhere"), root, ".probe", "x")
+
+    monkeypatch.setattr(launching_there, "probing", elsewhere)
+    root = folder / "apart"
+    assert done(root, there(root), runs_of(root)) == (here, {})
+
+
+def check_what_is_refused(there, folder, monkeypatch):
+    """It is tried again, and then told."""
+
+    def lying(planned, root, files):
+        raise launching_there.RefusedAnswerError("a stray file")
+
+    monkeypatch.setattr(launching_there, "receive", lying)
+    root = folder / "refused"
+    root.mkdir()
+    (failure,) = execute(runs_of(root)[:1], root, there(root), lambda *_: None)
+    assert failure.reason == "3 times it did not come back as a run: a stray file"
+    assert [path.name for path in root.rglob("*") if path.is_file()] == ["mine@lake_1.txt"]
+
+
+def test_a_cluster_does_what_this_machine_does_whatever_dies(there, tmp_path, monkeypatch):
+    """All in one: several processes of the suite would start a cluster each."""
+    root = tmp_path / "here"
+    for run in runs_of(root):
+        do_run(run, draft_path(root, run), "c")
+    here = left_in(root)
+    assert here
+    check_what_dies(there, tmp_path, here)
+    check_what_is_sent(there, tmp_path, here, monkeypatch)
+    check_what_is_refused(there, tmp_path, monkeypatch)
+
+
+def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr("experiments.cluster.clusters.SECONDS_TO_CONNECT", 0.2)
+    nowhere = partial(cluster_launcher, SchedulerAddress("127.0.0.1:1"), tmp_path, "c")
+    with pytest.raises(UserError, match="there is no scheduler"), nowhere():
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("address", ["tcp://10.0.0.1:8786", "tcp://0.0.0.0:8786"])
+def test_one_that_says_itself_that_it_is_open_is_refused(address):
+    connection = connections.Connection(pytest.fail, pytest.fail, is_told=False)
+    with pytest.raises(UserError, match="without TLS"):
+        connection._check_open(["tls://10.0.0.2:1", "tcp://127.0.0.1:2", address])
+    connections.Connection(pytest.fail, pytest.fail, is_told=True)._check_open([address])
+
+
+def test_without_a_cluster_nothing_of_dask_is_loaded():
+    code = (
+        "import sys, experiments.launching, commands.compare_agents, commands.places\n"
+        "print([name for name in sys.modules if name.startswith(('dask', 'distributed'))])"
+    )
+    words = [sys.executable, "-c", code]
+    out = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert out.stdout == "[]\n"
