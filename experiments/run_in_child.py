@@ -34,12 +34,12 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
             do_or_go_on(planned, draft, command)
     finally:
         heart.stop()
-    settle(draft)
     put_run_in_place(planned, draft)
 
 
 def put_run_in_place(planned: PlannedRun, draft: Path) -> None:
     """Rename a draft that is whole; another's result that is there stays, and others give way."""
+    settle(draft)
     try:
         planned.check_record()
     except DamagedFileError:
