@@ -184,7 +184,8 @@ def test_a_training_goes_on_after_its_reader_has_gone_and_playing_ends(
     # Where a film is wanted, that is what the work is for.
     monkeypatch.chdir(tmp_path)
     film = ["--n-episodes", "1", "--record", "film.gif", "--reward-log", "returns"]
-    assert run(enjoy.main, errno.EPIPE, argv=["enjoy.py", str(model), *film])[::2] == (0, "")
+    argv = ["enjoy.py", str(model), *film]
+    assert run(enjoy.main, errno.EPIPE, n_texts=1, argv=argv)[::2] == (0, "")
     assert (tmp_path / "film.gif").stat().st_size > 0
 
 
