@@ -24,6 +24,7 @@ from commands.tune_progress import TuningProgress
 from experiments.child_processes import stop_all
 from experiments.drafts import remove_dead_drafts
 from experiments.study_plan import plan
+from experiments.study_results import EarlyResults
 from pipeline.folder_lock import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning
@@ -150,8 +151,9 @@ def _retested(
     study = retest_study(place.tuning, place.root, candidates)
     planned = plan(study, root)
     how.place(root).get_ready(planned)
-    failures = do_missing(console, planned, root, how.place(root))
-    results = read(console, study, planned, root)
+    early = EarlyResults(study)
+    failures = do_missing(console, planned, root, how.place(root), early)
+    results = read(console, study, planned, root, early)
     code = conclude(console, results, failures, how.command, with_page=how.with_page)
     with doing(console, "judging the winner") as activity:
         analysis = analyse(results, activity.at, take_looks(results))
