@@ -26,6 +26,8 @@ from experiments.study_spec import QuickSpec
 from mdp import value_iteration
 from pipeline.models.model_loading import load_model
 from pipeline.preparation import algorithm_kwargs
+from pipeline.settings.hyperparam_entries import read_hyperparams
+from tuning.search_spaces import read_search_space
 
 ROOT = Path(compare.__file__).parent
 # Bandits have a guide of their own.
@@ -99,6 +101,16 @@ def test_the_guide_gives_the_command_of_each_study(path):
 def test_the_guide_names_no_study_that_is_not_there():
     named = set(re.findall(r"studies/([\w-]+\.yml)", GUIDE))
     assert named == {path.name for path in STUDIES}
+
+
+def test_the_course_s_search_begins_inside_its_space():
+    folder = ROOT / "studies" / "search"
+    begun = read_hyperparams("qlearning", "Warehouse-v0", folder / "as-printed.yml")
+    space = read_search_space("qlearning", "Warehouse-v0", folder / "warehouse.yml")
+    assert space.including(begun) == space
+    # Three values of three settings, and what it begins with.
+    assert math.prod(map(len, space.grid(3).values())) + 1 == 28
+    assert GUIDE.count("--trials 28") == 2
 
 
 @pytest.fixture(scope="module")
