@@ -61,6 +61,8 @@ def optimum_far_from_limit(model: TransitionModel, horizon: int) -> float | None
         error bound of planning included. None where that cannot be shown, as where the limit is
         near, or steps cost nothing.
     """
+    if not (model.terminated & (model.prob > 0)).any():
+        return None  # a task that never ends: to find out what it earns for ever takes longest
     try:
         plan = value_iteration(model, 1.0)
     except ValueError:

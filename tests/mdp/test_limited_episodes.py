@@ -1,6 +1,7 @@
 """The three ways of evaluating a policy under a time limit, and the optimum of a limit far away."""
 
 import itertools
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -14,6 +15,7 @@ from mdp import (
     TransitionModel,
     baseline_policies,
     baseline_return,
+    far_limit,
     finite_horizon_optimum,
     limited_episodes,
     optimum_far_from_limit,
@@ -199,3 +201,12 @@ def test_how_values_change_on_the_way() -> None:
     assert bound == pytest.approx(np.exp(-100 / (150 + 10)))
     assert _chance_of_losing(-1.0, Drift(1.0, fall=1.5, variance=0.75), 0.0, 100) == 1.0
     assert _chance_of_losing(1.0, Drift(1.0, fall=0.0, variance=0.0), 0.0, 100) == 0.0
+
+
+def test_a_task_that_never_ends_is_not_planned_without_a_limit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    model = far_goal(10)
+    endless = replace(model, terminated=np.zeros_like(model.terminated))
+    monkeypatch.setattr(far_limit, "value_iteration", lambda *args: pytest.fail("planned"))
+    assert optimum_far_from_limit(endless, 200) is None
