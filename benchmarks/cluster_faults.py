@@ -113,6 +113,9 @@ def disturb(processes: Processes, study: Path, faults: list[tuple[int, str]], se
     faults = list(faults)
     while processes.running["driver"].poll() is None and time.monotonic() < until:
         time.sleep(0.1)
+        for name in ("node 0", "node 1"):  # which mostly end when their scheduler is killed
+            if processes.running[name].poll() is not None:
+                processes.start(name)
         if faults and n_done(study) >= faults[0][0]:
             count, victim = faults.pop(0)
             print(f"{count:5d} runs: {victim}", flush=True)

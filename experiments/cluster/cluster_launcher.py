@@ -74,7 +74,7 @@ def cluster_launcher(
         launcher = ClusterLauncher(probe, command, limits, wanted)
         prepare = partial(launcher.prepare, plugin)
         launcher.connection = connection = Connection(connect, prepare, is_told)
-        connection.open()
+        connection.begin()
         tell(f"dashboard: {connection.client().dashboard_link}")
         heart = Heartbeat(partial(launcher.look, replace_jobs), SECONDS_BETWEEN_LOOKS)
         heart.start()

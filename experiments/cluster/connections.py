@@ -44,7 +44,7 @@ class Connection:
         self._is_lost = False
         self._identity = ""
 
-    def open(self) -> None:
+    def begin(self) -> None:
         """Connect for the first time.
 
         Raises:
