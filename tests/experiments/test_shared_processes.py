@@ -234,7 +234,7 @@ def test_so_do_runs_of_compiled_networks(tmp_path):
     together = runs_of(tmp_path / "together", 2, NETWORKS, (lake, poles))
     alone = runs_of(tmp_path / "alone", 2, NETWORKS, (lake, poles))[-4:]
     assert all(is_plain(run.spec) for run in together)
-    assert not execute(together, tmp_path / "together", "c", 1, lambda *_: None)
+    assert not execute(together, *one_at_a_time(tmp_path / "together"))
     with local_executor(2) as executor:
         tasks = [
             executor.submit(
