@@ -1,7 +1,7 @@
 """What a cluster takes for each run, and how many workers one scheduler could keep at work.
 
-    python benchmarks/cluster.py                # docs/benchmarks.md: 100, 1,000, 10,000 runs
-    python benchmarks/cluster.py --runs 100
+    python benchmarks/cluster.py --runs 100 1000      # docs/benchmarks.md
+    python benchmarks/cluster.py                      # 10,000 too: an hour and more
 
 Runs are tiny, a few steps of Q-learning, so that what is left is what every run takes: imports are
 over, since the first runs of each worker are not counted. The same runs are done embedded, with as
