@@ -11,7 +11,6 @@ import secrets
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -189,6 +188,8 @@ def sync_together(files: Iterable[Path], folders: Iterable[Path]) -> None:
 
     A disk that is asked for one after the other has to finish each before it hears of the next.
     """
+    from concurrent.futures import ThreadPoolExecutor  # half of what this module would take to load
+
     with ThreadPoolExecutor(SYNCED_AT_ONCE) as pool:
         waits = [pool.submit(sync_file, path) for path in files]
         waits += [pool.submit(sync_folders, folder) for folder in folders]

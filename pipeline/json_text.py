@@ -8,8 +8,6 @@ import secrets
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 # A number in JSON's grammar, beyond what a double holds: read as infinity, by Python's reader and
 # by browsers.
 _INFINITY = "1e999"
@@ -22,8 +20,6 @@ def plain(value: Any) -> Any:
         TypeError: if there is something else in it.
     """
     match value:
-        case np.generic() | np.ndarray():
-            return plain(value.tolist())
         case Mapping():
             return {_key(key): plain(item) for key, item in value.items()}
         case list() | tuple():
@@ -33,7 +29,15 @@ def plain(value: Any) -> Any:
         case None | bool() | int() | str():
             return value
         case _:
-            raise TypeError(f"a {type(value).__name__} has no place in JSON")
+            return plain(_from_numpy(value))
+
+
+def _from_numpy(value: Any) -> Any:
+    import numpy as np  # where there is such a value; `--help` is there without
+
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} has no place in JSON")
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
