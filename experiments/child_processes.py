@@ -193,12 +193,12 @@ def _start(child: BaseProcess) -> None:
     if _context.get_start_method() != "forkserver":
         child.start()
         return
-    for _ in range(3):
+    for _ in range(8):
         _ensure_fork_server()
         with contextlib.suppress(EOFError, OSError):
             child.start()
             return
-        if _stopping.is_set():
+        if _stopping.wait(0.2):  # a server that was killed is deaf some time before it is gone
             raise StoppedError
     child.start()
 
