@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import MISSING, asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from pipeline.settings.hyperparams import Hyperparams
+from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.user_modules import UserModule
+
+_PATHS = ("log_folder", "tensorboard_log", "trained_agent")
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,23 @@ class TrainSpec:
         data = asdict(self)
         del data["hyperparams"]
         data["hyperparams"] = data.pop("saved_hyperparams")
-        for name in ("log_folder", "tensorboard_log", "trained_agent"):
+        for name in _PATHS:
             data[name] = None if data[name] is None else str(data[name])
         return data
+
+    @classmethod
+    def of_data(cls, recorded: Mapping[str, Any]) -> Self:
+        """The spec that was written down as `as_data` says, maybe long ago; see `completed`.
+
+        Raises:
+            UserError: if its hyperparameters are none.
+        """
+        data = completed(recorded)
+        raw = data.pop("hyperparams")
+        paths = {name: None if data[name] is None else Path(data[name]) for name in _PATHS}
+        modules = tuple(UserModule(**module) for module in data["user_modules"])
+        names = {"gym_packages": tuple(data["gym_packages"]), "user_modules": modules}
+        return cls(**{**data, **paths, **names}, hyperparams=split(raw), saved_hyperparams=raw)
 
 
 def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:

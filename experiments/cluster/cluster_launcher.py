@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import pickle
 import secrets
 import threading
 import time
@@ -189,7 +188,7 @@ class ClusterLauncher:
         )
         client = self.connection.client()
         try:
-            sent.task = client.submit(do_order, pickle.dumps(order), key=sent.key, pure=False)
+            sent.task = client.submit(do_order, order.packed(), key=sent.key, pure=False)
         except (OSError, RuntimeError):  # the client has lost its scheduler since then
             self.connection.lose(client)
             self._receivers.submit(self._guarded, sent, self._send)

@@ -8,15 +8,23 @@ import importlib.metadata
 import platform
 import secrets
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import cache
 from pathlib import Path
+from typing import Any, Self
+
+import yaml
 
 from experiments.planned_runs import PlannedRun
 from experiments.run_limits import RunLimits
+from pipeline.train_spec import TrainSpec
 
 # The topics of what workers tell drivers, besides answers: who has begun what, and who leaves.
 LEAVING = "yardstick-leaving"
+
+# As yaml.safe_dump and yaml.safe_load, by the library's faster half where that was built.
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+_Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 _ROOT = Path(__file__).resolve().parents[2]
 _SOURCES = ("safe_files", "snapshots", "mdp", "envs", "agents", "pipeline", "experiments")
@@ -68,6 +76,33 @@ class RunOrder:
     probe: Probe
     topic: str
     version: str
+
+    def packed(self) -> bytes:
+        """The order as YAML: plain data, whose numbers and keys stay what they are."""
+        planned, limits = self.planned, self.limits
+        data = {
+            "planned": {field.name: getattr(planned, field.name) for field in fields(PlannedRun)}
+            | {"spec": planned.spec.as_data(), "path": str(planned.path)},
+            "limits": {"seconds": limits.seconds, "memory": limits.memory},
+            "probe": asdict(self.probe)
+            | {"home": str(self.probe.home), "root": str(self.probe.root)},
+            **{name: getattr(self, name) for name in ("command", "topic", "version")},
+        }
+        return bytes(yaml.dump(data, Dumper=_Dumper, sort_keys=False, encoding="utf-8"))
+
+    @classmethod
+    def unpacked(cls, content: bytes) -> Self:
+        """The order that `packed` has written."""
+        data: dict[str, Any] = yaml.load(content, Loader=_Loader)  # noqa: S506  # the safe ones
+        run, probe = data["planned"], data["probe"]
+        spec, path = TrainSpec.of_data(run["spec"]), Path(run["path"])
+        paths = {name: Path(probe[name]) for name in ("home", "root")}
+        read = {
+            "planned": PlannedRun(**{**run, "spec": spec, "path": path}),
+            "limits": RunLimits(**data["limits"]),
+            "probe": Probe(**{**probe, **paths}),
+        }
+        return cls(**{**data, **read})
 
     def apart(self) -> RunOrder:
         """The same in folders that a relative path can reach, where none is shared."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import pickle
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -70,8 +69,7 @@ def answer_to(content: bytes) -> bytes:
     """Do the run of an order, and say how it ended; see `experiments.cluster.tasks.do_order`."""
     worker = get_worker()
     key = worker.get_current_task()
-    # From the driver of this very cluster, and no more than what Dask itself would unpickle.
-    order: RunOrder = pickle.loads(content)  # noqa: S301
+    order = RunOrder.unpacked(content)
     worker.log_event(order.topic, {"run": key, "at": worker.address})
     if Supervisors.name not in worker.plugins:  # as after a scheduler was started again
         Supervisors("[]").setup(worker)

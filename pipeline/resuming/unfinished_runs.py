@@ -17,7 +17,6 @@ from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_files import environment_name
 from pipeline.run_folder import FINISHED, TENSORBOARD, Run, numbered_runs
 from pipeline.run_record import TRAINED_AGENT, recorded_versions
-from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec, completed
 from pipeline.user_modules import UserModule
 
@@ -86,25 +85,19 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
     missing = [name for name in data["gym_packages"] if name not in {m.name for m in typed}]
     if missing:
         raise UserError(f"the run needs --gym-packages {' '.join(missing)}: type it again")
-    paths = ("tensorboard_log", "trained_agent")
-    given = {name: None if data[name] is None else Path(data[name]) for name in paths}
-    raw = data.pop("hyperparams")
+    raw = data["hyperparams"]
     if not isinstance(raw, dict) or environment_name(str(data["env_id"])) != run.env_name:
         raise UserError(
             f"{run.info_path} is damaged: its hyperparameters or its names are not ours"
         )
-    spec = TrainSpec(
-        **{
-            **data,
-            **given,
-            "hyperparams": split(raw),
-            "saved_hyperparams": raw,
-            "log_folder": run.path.parent.parent,
-            "gym_packages": tuple(module.name for module in typed),
-            "user_modules": typed,
-        }
+    return replace(
+        TrainSpec.of_data({**data, "user_modules": ()}),
+        log_folder=run.path.parent.parent,
+        gym_packages=tuple(module.name for module in typed),
+        user_modules=typed,
+        verbose=1,
+        progress=False,
     )
-    return replace(spec, verbose=1, progress=False)
 
 
 def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> StateKeeping:
