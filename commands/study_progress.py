@@ -6,26 +6,18 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from types import TracebackType
 
 from rich.console import Console
-from rich.live import Live
 from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 
+from commands.live_progress import LiveProgress, duration
 from experiments.launching import Launcher, Launchers, RunFailure
 from experiments.planned_runs import PlannedRun
-from pipeline.signs_of_life import (
-    SECONDS_BETWEEN_LINES,
-    SECONDS_BETWEEN_LOOKS,
-    Heartbeat,
-    Silence,
-    can_move,
-)
 
 
-class StudyProgress:
+class StudyProgress(LiveProgress):
     """How far the runs of a study are, by agent and environment.
 
     Args:
@@ -37,38 +29,14 @@ class StudyProgress:
     def __init__(
         self, console: Console, runs: Sequence[PlannedRun], done: Sequence[PlannedRun]
     ) -> None:
-        self.console = console
+        super().__init__(console)
         self.total = Counter((run.agent, run.environment) for run in runs)
         self.done = Counter((run.agent, run.environment) for run in done)
         self.failed: Counter[tuple[str, str]] = Counter()
         self._refused: set[str] = set()
         self.n_missing = len(runs) - len(done)
         self.n_ended = 0
-        self.started = time.monotonic()
-        self.silence = Silence(SECONDS_BETWEEN_LINES)
-        self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
-        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
         self._launcher: Launcher | None = None
-
-    def __enter__(self) -> StudyProgress:
-        if self.live is not None:
-            self.live.start()
-            self._draw()
-        self.heart.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.heart.stop()
-        if self.live is not None:
-            self._draw()
-            self.live.stop()
-        if isinstance(error, KeyboardInterrupt):
-            self.console.print(f"{self._figures()}; the same command goes on", highlight=False)
 
     def watching(self, launchers: Launchers) -> Launchers:
         """The same launchers, of which is shown what there is to say while one is open."""
@@ -90,13 +58,9 @@ class StudyProgress:
             self.note_refusal(run)
         else:
             self.failed[key] += 1
-            self.console.print(
-                f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}",
-                markup=False,
-                highlight=False,
-            )
-        if self.live is None and self.n_ended == self.n_missing:
-            self._print_line()
+            self.say(f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}")
+        if self.live is None and self.is_over:
+            self.say(self.figures())
         else:
             self.look()
 
@@ -105,29 +69,15 @@ class StudyProgress:
         refusal = run.run.read_info().get("model_refused")
         if isinstance(refusal, str) and run.environment not in self._refused:
             self._refused.add(run.environment)
-            self.console.print(
-                f"{run.environment}: {refusal}; figures are sampled",
-                markup=False,
-                highlight=False,
-                soft_wrap=True,
-            )
+            self.say(f"{run.environment}: {refusal}; figures are sampled")
 
-    def look(self) -> None:
-        """Show how far the study is, also while no run ends."""
-        if self.live is not None:
-            self._draw()
-        elif self.n_ended < self.n_missing and self.silence.is_too_long:
-            self._print_line()
+    @property
+    def is_over(self) -> bool:
+        """Whether all runs have ended."""
+        return self.n_ended >= self.n_missing
 
-    def _draw(self) -> None:
-        if self.live is not None:
-            self.live.update(self._table(), refresh=True)
-
-    def _print_line(self) -> None:
-        self.silence.end()
-        self.console.print(self._figures(), highlight=False)
-
-    def _figures(self) -> str:
+    def figures(self) -> str:
+        """How many runs have ended, and how long the others may take."""
         seconds = time.monotonic() - self.started
         text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
         if 0 < self.n_ended < self.n_missing:
@@ -138,8 +88,9 @@ class StudyProgress:
         n_failed = self.failed.total()
         return f"{text}, {n_failed} failed" if n_failed else text
 
-    def _table(self) -> Table:
-        table = Table(box=None, pad_edge=False, caption=self._figures(), caption_justify="left")
+    def picture(self) -> Table:
+        """The same by agent and environment."""
+        table = Table(box=None, pad_edge=False, caption=self.figures(), caption_justify="left")
         for heading in ("agent", "environment", "runs", "", "failed"):
             table.add_column(heading)
         for key, total in self.total.items():
@@ -151,12 +102,3 @@ class StudyProgress:
                 f"[red]{failed}[/]" if failed else "",
             )
         return table
-
-
-def duration(seconds: float) -> str:
-    """A time in hours, minutes and seconds, as far as they matter."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

@@ -11,8 +11,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from commands.live_progress import duration
 from commands.study_output import say
-from commands.study_progress import duration
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome, Retested
 from tuning.trial_queue import FAILURE, figures_of, seconds_of

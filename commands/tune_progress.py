@@ -4,26 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from types import TracebackType
 
 from rich.console import Console
-from rich.live import Live
-from rich.text import Text
 
-from commands.study_progress import duration
-from pipeline.signs_of_life import (
-    SECONDS_BETWEEN_LINES,
-    SECONDS_BETWEEN_LOOKS,
-    Heartbeat,
-    Silence,
-    can_move,
-)
+from commands.live_progress import LiveProgress, duration
 
 # To read all trials takes time, where there are many.
 SECONDS_BETWEEN_QUESTIONS = 5.0
 
 
-class TuningProgress:
+class TuningProgress(LiveProgress):
     """How far a search is, and the best that was found.
 
     Args:
@@ -42,34 +32,12 @@ class TuningProgress:
         *,
         is_cost: bool,
     ) -> None:
-        self.console, self.n_trials, self.is_cost = console, n_trials, is_cost
+        super().__init__(console)
+        self.n_trials, self.is_cost = n_trials, is_cost
         self._ended, self._asked_at = ended, time.monotonic()
         self.values = ended()
         self.n_before = len(self.values)
         self.n_runs = 0
-        self.started = time.monotonic()
-        self.silence = Silence(SECONDS_BETWEEN_LINES)
-        self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
-        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
-
-    def __enter__(self) -> TuningProgress:
-        if self.live is not None:
-            self.live.start()
-        self.heart.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.heart.stop()
-        if self.live is not None:
-            self._draw()
-            self.live.stop()
-        if isinstance(error, KeyboardInterrupt):
-            self._say(f"{self.figures()}; the same command goes on")
 
     def run_ended(self) -> None:
         """Count a run that has ended."""
@@ -83,9 +51,9 @@ class TuningProgress:
         best = self.best()
         self.values[number] = value
         if reason:
-            self._say(f"trial {number} failed: {reason}")
+            self.say(f"trial {number} failed: {reason}")
         elif value is not None and (best is None or self._is_better(value, best[1])):
-            self._say(f"trial {number}: {value:.4g}, the best so far")
+            self.say(f"trial {number}: {value:.4g}, the best so far")
 
     def _is_better(self, value: float, other: float) -> bool:
         return value < other if self.is_cost else value > other
@@ -96,23 +64,8 @@ class TuningProgress:
         sign = 1 if self.is_cost else -1
         return min(judged, key=lambda each: (sign * each[1], each[0]), default=None)
 
-    def look(self) -> None:
-        """Show how far it is, also while no run ends."""
-        if self.live is not None:
-            self._draw()
-        elif self.silence.is_too_long:
-            self._say(self.figures())
-
-    def _draw(self) -> None:
-        if self.live is not None:
-            self.live.update(Text(self.figures()), refresh=True)
-
-    def _say(self, line: str) -> None:
-        self.silence.end()
-        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
-
     def figures(self) -> str:
-        """How far it is, in a line."""
+        """How many trials have ended, the best of them, and how long the others may take."""
         seconds = time.monotonic() - self.started
         ended, new = len(self.values), len(self.values) - self.n_before
         text = f"{ended} of {self.n_trials} trials, {self.n_runs} runs in {duration(seconds)}"

@@ -1,0 +1,89 @@
+"""What a person watching sees: a picture that moves, or where none can, a line now and then."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console, RenderableType
+from rich.live import Live
+from rich.text import Text
+
+from pipeline.signs_of_life import (
+    SECONDS_BETWEEN_LINES,
+    SECONDS_BETWEEN_LOOKS,
+    Heartbeat,
+    Silence,
+    can_move,
+)
+
+
+class LiveProgress(ABC):
+    """Shows how far something is while its ``with`` statement runs.
+
+    Args:
+        console: where to.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self.console = console
+        self.started = time.monotonic()
+        self.silence = Silence(SECONDS_BETWEEN_LINES)
+        self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
+        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
+
+    @abstractmethod
+    def figures(self) -> str:
+        """How far it is, in a line."""
+
+    def picture(self) -> RenderableType:
+        """The same where it can move."""
+        return Text(self.figures())
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is nothing more to wait for."""
+        return False
+
+    def __enter__(self) -> Self:
+        if self.live is not None:
+            self.live.start()
+            self.look()
+        self.heart.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.heart.stop()
+        if self.live is not None:
+            self.look()
+            self.live.stop()
+        if isinstance(error, KeyboardInterrupt):
+            self.say(f"{self.figures()}; the same command goes on")
+
+    def look(self) -> None:
+        """Show how far it is, also while nothing ends."""
+        if self.live is not None:
+            self.live.update(self.picture(), refresh=True)
+        elif self.silence.is_too_long and not self.is_over:
+            self.say(self.figures())
+
+    def say(self, line: str) -> None:
+        """Print a line that stays."""
+        self.silence.end()
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def duration(seconds: float) -> str:
+    """A time in hours, minutes and seconds, as far as they matter."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
