@@ -1,0 +1,85 @@
+"""Figure 5.1: what sticking on 20 and 21 is worth in Blackjack, by Monte Carlo (example 5.1).
+
+    python textbook/figure_5_1.py              # 500,000 episodes, as in the book: a minute
+
+Beside the estimates stand the exact values, which the book does not have.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from _blackjack import OnePolicy, game, model, observations, stick_on_twenty, surfaces
+from _figures import Statement, agent_on, arguments, finish, learn_episodes
+from matplotlib.figure import Figure
+
+from mdp.array_types import Floats
+from mdp.chain import PolicyChain
+
+FEW, MANY = 10_000, 500_000
+
+
+def exact_values() -> Floats:
+    """The policy's values of all observations, naturals apart, shape (S,)."""
+    blackjack = model()
+    policy = stick_on_twenty(blackjack.n_states)  # naturals come after all that is observed
+    chain = PolicyChain.build(blackjack, np.eye(2)[policy])
+    values = np.full(blackjack.n_states, np.nan)
+    values[chain.states] = chain.solve(chain.mean(chain.reward), 1.0)
+    return values
+
+
+def learner() -> Any:
+    """First-visit Monte Carlo of the policy: its one action is what that does."""
+    policy = stick_on_twenty(len(model().initial) - 11)  # of what is observed
+    return agent_on(
+        lambda: OnePolicy(game(), policy), "monte_carlo", 0, learning_rate="sample_average"
+    )
+
+
+def main() -> None:
+    """Draw the figure, and hold it against the book."""
+    args = arguments("Figure 5.1 of Sutton and Barto: a policy's values in Blackjack.", MANY)
+    agent, shown = learner(), observations()
+    learn_episodes(agent, FEW)
+    few = agent.policy.q_table[shown, 0]
+    learn_episodes(agent, args.runs - FEW)
+    many, exact = agent.policy.q_table[shown, 0], exact_values()[shown]
+    figure = Figure(figsize=(9, 6), layout="constrained")
+    columns = {f"{FEW:,} episodes": few, f"{args.runs:,} episodes": many, "exact": exact}
+    for axes, (title, values) in zip(figure.subplots(2, 3).T, columns.items(), strict=True):
+        surfaces(axes[0], values[1], f"usable ace, {title}")
+        surfaces(axes[1], values[0], f"no usable ace, {title}")
+    finish("figure_5_1", figure, args.folder, statements(few, many, exact))
+
+
+def statements(few: Floats, many: Floats, exact: Floats) -> list[Statement]:
+    """What the book says of the surfaces, shapes (2, 10, 10)."""
+    off = {"few": np.abs(few - exact), "many": np.abs(many - exact)}
+    return [
+        Statement(
+            "the values are very well approximated after 500,000 episodes",
+            f"by {off['many'].mean():.3f} in the mean, {off['many'].max():.3f} at most",
+            bool(off["many"].mean() < 0.02),
+        ),
+        Statement(
+            "with a usable ace they are less certain, since such states are rare",
+            f"wrong by {off['few'][1].mean():.3f} at first, without by {off['few'][0].mean():.3f}",
+            bool(off["few"][1].mean() > off["few"][0].mean()),
+        ),
+        Statement(
+            "they jump up for the last two rows, where the policy sticks",
+            f"without an ace {exact[0, -2].mean():.2f} at 20, {exact[0, -3].mean():.2f} at 19",
+            bool((exact[:, -2] > exact[:, -3] + 0.5).all()),
+        ),
+        Statement(
+            "and drop off where the dealer shows an ace",
+            f"without an ace {exact[0, :-2, 0].mean():.2f}, {exact[0, :-2, 1:].mean():.2f} else",
+            bool((exact[:, :, 0] < exact[:, :, 1]).all()),
+        ),
+    ]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,95 @@
+"""Figure 6.3: three targets on the cliff, over step sizes (section 6.6).
+
+    python textbook/figure_6_3.py              # 100 runs: three minutes; the book has 50,000
+
+Mean return of an episode while learning, with a constant epsilon of 0.1: of the first 100 episodes
+(interim) and of 20,000 (asymptotic; the book has 100,000). Expected SARSA does not feel the chance
+in its own next action, so that its step size can be 1.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from _figures import Statement, agent_on, arguments, canvas, finish, learn_episodes, mean_and_error
+
+STEP_SIZES = np.arange(1, 11) / 10
+INTERIM, ASYMPTOTIC = 100, 20_000
+N_LONG_RUNS = 5
+LABELS = {"sarsa": "SARSA", "expected_sarsa": "expected SARSA", "qlearning": "Q-learning"}
+Curves = dict[str, tuple[list[float], list[float]]]
+
+
+def mean_return(algo: str, step_size: float, n_episodes: int, n_runs: int) -> float:
+    """Mean return of all episodes of all runs."""
+    means = []
+    for seed in range(n_runs):
+        agent = agent_on("CliffWalking-v1", algo, seed, learning_rate=step_size)
+        means.append(learn_episodes(agent, n_episodes)[0].mean())
+    return float(mean_and_error(np.array(means))[0])
+
+
+def measure(n_runs: int, n_long_runs: int, n_long: int) -> Curves:
+    """By agent, interim and asymptotic performance for each step size."""
+    return {
+        algo: (
+            [mean_return(algo, size, INTERIM, n_runs) for size in STEP_SIZES],
+            [mean_return(algo, size, n_long, n_long_runs) for size in STEP_SIZES],
+        )
+        for algo in LABELS
+    }
+
+
+def statements(curves: Curves) -> list[Statement]:
+    """What the book says of the curves."""
+    expected_interim, expected_long = curves["expected_sarsa"]
+    sarsa_interim, sarsa_long = curves["sarsa"]
+    q_interim, q_long = curves["qlearning"]
+    better = [
+        e > max(s, q) for e, s, q in zip(expected_interim, sarsa_interim, q_interim, strict=True)
+    ]
+    return [
+        Statement(
+            "expected SARSA is ahead of both over a wide range of step sizes",
+            f"interim at {sum(better)} of {len(better)} step sizes",
+            sum(better) >= len(better) - 2,
+        ),
+        Statement(
+            "it may set its step size to 1 without any loss at the end",
+            f"asymptotic {min(expected_long):.1f} to {max(expected_long):.1f}",
+            max(expected_long) - min(expected_long) < 2,
+        ),
+        Statement(
+            "SARSA does well in the long run only at a small step size",
+            f"{sarsa_long[0]:.1f} at 0.1, {sarsa_long[-1]:.1f} at 1",
+            sarsa_long[0] - sarsa_long[-1] > 20,
+        ),
+        Statement(
+            "Q-learning earns less than both while it explores",
+            f"{max(q_long):.1f} at best, expected SARSA {max(expected_long):.1f}",
+            max(q_long) < max(expected_long) and max(q_long) < sarsa_long[0],
+        ),
+    ]
+
+
+def main() -> None:
+    """Draw the figure, and hold it against the book."""
+    args = arguments("Figure 6.3 of Sutton and Barto: three targets on the cliff.", 100)
+    curves = measure(args.runs, N_LONG_RUNS, ASYMPTOTIC)
+    figure, axes = canvas("CliffWalking-v1", "step size", "mean return of an episode")
+    for algo, (interim, asymptotic) in curves.items():
+        (line,) = axes.plot(STEP_SIZES, asymptotic, marker="o", label=f"{LABELS[algo]}, asymptotic")
+        axes.plot(
+            STEP_SIZES,
+            interim,
+            "--",
+            marker="x",
+            color=line.get_color(),
+            label=f"{LABELS[algo]}, interim",
+        )
+    axes.set_ylim(-160, 0)
+    axes.legend(fontsize="small")
+    finish("figure_6_3", figure, args.folder, statements(curves))
+
+
+if __name__ == "__main__":
+    main()

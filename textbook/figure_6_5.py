@@ -1,0 +1,70 @@
+"""Figure 6.5: Q-learning takes chance for worth, double Q-learning does not (section 6.7).
+
+    python textbook/figure_6_5.py              # 1,000 runs: two minutes; the book has 10,000
+
+How often each goes left from A, in each of the first 300 episodes. With epsilon-greedy choices, 5 %
+are left at least.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from _figures import Statement, agent_on, arguments, canvas, finish, learn_episodes, mean_and_error
+
+from mdp.array_types import Floats
+
+N_EPISODES = 300
+LEFT = 2  # steps
+LEFT = 2  # steps
+LEAST = 0.05  # half of epsilon, for two actions
+LABELS = {"qlearning": "Q-learning", "double_qlearning": "double Q-learning"}
+
+
+def went_left(algo: str, seed: int) -> Floats:
+    """Whether each episode of a run went left, shape (N_EPISODES,): it took two steps then."""
+    agent = agent_on("envs:MaximizationBias-v0", algo, seed, learning_rate=0.1, mask_actions=True)
+    _, lengths = learn_episodes(agent, N_EPISODES)
+    left: Floats = np.where(lengths == LEFT, 1.0, 0.0)
+    return left
+
+
+def main() -> None:
+    """Draw the figure, and hold it against the book."""
+    args = arguments("Figure 6.5 of Sutton and Barto: maximization bias.", 1000)
+    figure, axes = canvas("Maximization bias", "episodes", "left from A, % of runs")
+    shares = {}
+    for algo, label in LABELS.items():
+        runs = np.array([went_left(algo, seed) for seed in range(args.runs)])
+        shares[algo], _ = mean_and_error(runs)
+        axes.plot(np.arange(1, N_EPISODES + 1), 100 * shares[algo], label=label)
+    axes.axhline(100 * LEAST, color="grey", linestyle="--", label="least, by epsilon")
+    axes.set_ylim(0, 100)
+    axes.legend()
+    single, double = shares["qlearning"], shares["double_qlearning"]
+    finish("figure_6_5", figure, args.folder, statements(single, double))
+
+
+def statements(single: Floats, double: Floats) -> list[Statement]:
+    """What the book says of the two curves, shapes (N_EPISODES,)."""
+    late = slice(N_EPISODES - 50, None)
+    return [
+        Statement(
+            "Q-learning begins by going left far more often than right",
+            f"up to {single.max():.0%} of runs, in episode {single.argmax() + 1}",
+            bool(single.max() > 0.7),
+        ),
+        Statement(
+            "and still does so more than the least at the end",
+            f"{single[late].mean():.1%} in the last 50 episodes",
+            bool(single[late].mean() > 1.2 * LEAST),
+        ),
+        Statement(
+            "double Q-learning is all but free of it",
+            f"{double[late].mean():.1%}, and {double.max():.0%} at most",
+            bool(double[late].mean() < single[late].mean() and double.max() < 0.6),
+        ),
+    ]
+
+
+if __name__ == "__main__":
+    main()
