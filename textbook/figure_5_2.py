@@ -2,8 +2,8 @@
 
     python textbook/figure_5_2.py              # 1,000,000 episodes: two minutes
 
-The book explores by its starts. Ours explores by an epsilon that falls from 1 to 0.1; the game deals
-by chance anyway. Beside what was learnt stands the optimal policy, by planning.
+The book explores by its starts. Ours explores by an epsilon that falls from 1 to 0.1; the game
+deals by chance anyway. Beside what was learnt stands the optimal policy, by planning.
 """
 
 from __future__ import annotations
