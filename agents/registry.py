@@ -137,6 +137,12 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         DISCRETE,
         DISCRETE,
     ),
+    "policy_iteration": AlgorithmEntry(
+        "agents.planning:PolicyIteration",
+        "planning: policies evaluated and improved in turn",
+        DISCRETE,
+        DISCRETE,
+    ),
     "optimal": AlgorithmEntry(
         "agents.planning:Optimal",
         "planning: the optimum under the time limit",

@@ -53,6 +53,7 @@ TRAININGS = [
     (GRID, "double_qlearning", 600, {"learning_rate": "lin_0.5"}),
     (LEFT_RIGHT, "qlearning", 600, {"engine": "compiled"}),
     (GRID, "value_iteration", 300, {}),
+    (GRID, "policy_iteration", 300, {}),
     (GRID, "optimal", 300, {}),
     (GRID, "random", 300, {}),
     (LEFT_RIGHT, "angle", 300, {}),
