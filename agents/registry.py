@@ -80,6 +80,9 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "double_qlearning": _tabular(
         "double_q_learning:DoubleQLearning", "double Q-learning on two tables"
     ),
+    "qlearning_ucb": _tabular(
+        "q_learning_ucb:QLearningUCB", "Q-learning with upper confidence bounds"
+    ),
     "dqn": _deep("agents.dqn:DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
     "deep_qlearning": _deep(
