@@ -80,6 +80,12 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "double_qlearning": _tabular(
         "double_q_learning:DoubleQLearning", "double Q-learning on two tables"
     ),
+    "dyna_q": _tabular("dyna_q:DynaQ", "Q-learning that plans on a learnt model"),
+    "dyna_q_plus": _tabular("dyna_q_plus:DynaQPlus", "Dyna-Q that tries again what is long ago"),
+    "prioritized_sweeping": _tabular(
+        "prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
+    ),
+    "r_max": _tabular("r_max:RMax", "planning, with the unknown taken for the best"),
     "qlearning_ucb": _tabular(
         "q_learning_ucb:QLearningUCB", "Q-learning with upper confidence bounds"
     ),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from numbers import Integral
 from typing import Any, get_args
 
 from gymnasium import spaces
@@ -50,6 +51,18 @@ def check_at_least(low: float, settings: Settings) -> None:
     for name, value in settings:
         if isinstance(value, int | float) and not value >= low:
             raise ValueError(f"{name} must be at least {low:g}, not {value}")
+
+
+def check_whole(low: int, high: int, settings: Settings) -> None:
+    """Refuse what is no whole number from ``low`` to ``high``.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    for name, value in settings:
+        is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not (is_whole and low <= value <= high):
+            raise ValueError(f"{name} must be a whole number from {low} to {high}, not {value!r}")
 
 
 def check_above_zero(settings: Settings) -> None:

@@ -44,14 +44,15 @@ class QLearningUCB(OptimisticAlgorithm):
     """Q-learning with a bonus of ``bonus_scale`` / sqrt(N) in the target of a pair's N-th update.
 
     As Jin and others have it ("Is Q-learning provably efficient?", 2018), next states count for
-    ``value_bound`` at most, and step sizes are (H + 1) / (H + N); as Dong and others do ("Q-learning
-    with UCB exploration is sample efficient for infinite-horizon MDP", 2020), it discounts and keeps
-    one table for all times. They prove that of rewards in [0, 1], with probability 1 - p, on all
-    steps but O(S A / (epsilon^2 (1 - gamma)^7)), up to logarithms, the policy is within epsilon of
-    the best. That is for a scale of c sqrt(H ln(S A (N + 1) (N + 2) / p)) / (1 - gamma), which is
-    far more than what serves here, and for values that never rise again. With another scale nothing
-    is proven; what is kept is why it works: a pair looks better than it is until it was tried
-    often, and so does all that leads there.
+    ``value_bound`` at most, and step sizes are (H + 1) / (H + N). As in Dong and others
+    ("Q-learning with UCB exploration is sample efficient for infinite-horizon MDP", 2020), it
+    discounts and has one table for all times. They prove that for rewards in [0, 1], with
+    probability 1 - p, the policy is within epsilon of the best on all steps but
+    O(S A / (epsilon^2 (1 - gamma)^7)), up to logarithms: with a scale of
+    c sqrt(H ln(S A (N + 1) (N + 2) / p)) / (1 - gamma), which is far more than what serves here,
+    and with values that never rise again. For this agent nothing is proven; what it keeps is why
+    that works: a pair looks better than it is until it was tried often, and so does all that leads
+    there.
 
     Args:
         args: as in `OptimisticAlgorithm`.

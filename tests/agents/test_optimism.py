@@ -4,8 +4,6 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
-from tests.agents.test_engine import assert_engines_agree, make
-from tests.agents.test_temporal_difference import Spaces
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
@@ -14,6 +12,8 @@ from agents.tabular.q_learning_ucb import optimistic_update
 from agents.tabular.temporal_difference import learn_from_all
 from envs.known_models import time_limit, transition_model
 from mdp import finite_horizon_optimum, policy_return
+from tests.agents.test_engine import assert_engines_agree, make
+from tests.agents.test_temporal_difference import Spaces
 
 DEEP_SEA, RIVER = ("DeepSea-v0", {"size": 10}), ("RiverSwim-v0", {})
 
