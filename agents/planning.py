@@ -28,7 +28,7 @@ from envs.known_models import (
     time_limit,
     transition_model,
 )
-from mdp import TransitionModel, finite_horizon_optimum, value_iteration
+from mdp import TransitionModel, finite_horizon_optimum, policy_iteration, value_iteration
 from mdp.array_types import Bools, Ints
 
 
@@ -99,8 +99,8 @@ class PlanningAgent(OnlineAlgorithm):
     Args:
         policy: ``"ActionTablePolicy"``.
         env: environment whose transition model is known, or its id.
-        gamma: discount factor of the planning; by default 0.99 for value iteration, and 1 for the
-            optimum under the time limit.
+        gamma: discount factor of the planning; by default 1 for the optimum under the time
+            limit, and 0.99 for the others.
         mask_actions: plan among the actions alone that the environment allows in each state.
         kwargs: as in `OnlineAlgorithm`.
 
@@ -227,6 +227,20 @@ class ValueIteration(PlanningAgent):
         self, model: TransitionModel, limit: int | None, mask: Bools | None
     ) -> tuple[NDArray[np.integer[Any]], int]:
         return value_iteration(model, self.gamma, mask=mask).policy[None], 1
+
+
+class PolicyIteration(PlanningAgent):
+    """The same plan by policies: each is evaluated exactly, then made greedy (section 4.3).
+
+    It takes few rounds, each of which solves a linear system: for up to some ten thousand states.
+    """
+
+    default_gamma = 0.99
+
+    def _plan(
+        self, model: TransitionModel, limit: int | None, mask: Bools | None
+    ) -> tuple[NDArray[np.integer[Any]], int]:
+        return policy_iteration(model, self.gamma, mask=mask).policy[None], 1
 
 
 class Optimal(PlanningAgent):

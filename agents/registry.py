@@ -88,6 +88,15 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "off_policy_monte_carlo": _tabular(
         "off_policy_monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
     ),
+    "dyna_q": _tabular("dyna_q:DynaQ", "Q-learning that plans on a learnt model"),
+    "dyna_q_plus": _tabular("dyna_q_plus:DynaQPlus", "Dyna-Q that tries again what is long ago"),
+    "prioritized_sweeping": _tabular(
+        "prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
+    ),
+    "r_max": _tabular("r_max:RMax", "planning, with the unknown taken for the best"),
+    "qlearning_ucb": _tabular(
+        "q_learning_ucb:QLearningUCB", "Q-learning with upper confidence bounds"
+    ),
     "dqn": _deep("agents.dqn:DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
     "deep_qlearning": _deep(
@@ -142,6 +151,12 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "value_iteration": AlgorithmEntry(
         "agents.planning:ValueIteration",
         "planning: greedy in the optimal values",
+        DISCRETE,
+        DISCRETE,
+    ),
+    "policy_iteration": AlgorithmEntry(
+        "agents.planning:PolicyIteration",
+        "planning: policies evaluated and improved in turn",
         DISCRETE,
         DISCRETE,
     ),

@@ -53,15 +53,17 @@ def check_at_least(low: float, settings: Settings) -> None:
             raise ValueError(f"{name} must be at least {low:g}, not {value}")
 
 
-def check_whole(low: int, settings: Settings) -> None:
-    """Refuse what is no whole number, and numbers below ``low``.
+def check_whole(low: int, high: float, settings: Settings) -> None:
+    """Refuse what is no whole number from ``low`` to ``high``, which may be infinite.
 
     Raises:
         ValueError: naming the argument.
     """
+    bounds = f"of at least {low}" if math.isinf(high) else f"from {low} to {high}"
     for name, value in settings:
-        if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
-            raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
+        is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+        if not (is_whole and low <= value <= high):
+            raise ValueError(f"{name} must be a whole number {bounds}, not {value!r}")
 
 
 def check_above_zero(settings: Settings) -> None:

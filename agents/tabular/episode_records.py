@@ -5,13 +5,14 @@ Source: Sutton and Barto (2nd edition), chapter 5.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.common.setting_checks import check_whole
+from agents.common.setting_checks import check_whole, settings_of
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.learning_algorithm import StepSize
 from agents.tabular.learning_in_turn import NOTHING_LEARNT, EpisodicAlgorithm
@@ -90,7 +91,7 @@ class RecordAlgorithm(EpisodicAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_whole(1, [("longest_episode", self.longest_episode)])
+        check_whole(1, math.inf, settings_of(self, "longest_episode"))
 
     def _make_memory(self) -> EpisodeRecords:
         shape = (self.n_envs, self.longest_episode)

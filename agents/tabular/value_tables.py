@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from agents.common.exploration import highest_value
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from mdp.array_types import Bools, Floats, Ints
 from mdp.machine_code import inlined
@@ -50,6 +51,12 @@ def average_tables(tables: Any, obs: int, room: Room) -> Room:
         if tables.values.shape[0] > 1:
             room.values[k] = 0.5 * (room.values[k] + tables.values[1, obs, action])
     return room
+
+
+@inlined
+def best_value(tables: Any, obs: int, room: Room) -> float:
+    """The highest of the mean values of the actions that are allowed at ``obs``."""
+    return highest_value(with_mean_values(tables, obs, room_at(tables, obs, room)).values)
 
 
 class Tables(NamedTuple):

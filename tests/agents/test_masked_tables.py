@@ -66,6 +66,8 @@ def masks(draw):
 def test_a_masked_action_is_never_chosen(name, exploration):
     if (name, exploration) == ("expected_sarsa", "gaussian"):
         return
+    if "exploration" not in load_algorithm(name).__signature__.parameters:
+        return
 
     @settings(max_examples=15, deadline=None, derandomize=True)
     @given(masks(), st.sampled_from(["random", "first"]))
@@ -185,8 +187,10 @@ WORLDS = {
     "FrozenLake": ("FrozenLake-v1", {"is_slippery": False}, IdleActionMasks),
     "tiny": ("Warehouse-v0", {"desc": ["S.", "#G"], "max_episode_steps": 5}, None),
 }
+# Agents with a loop of their own have tests of their own: each is compiled for each world.
+COMPILED = ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")
 CASES = [
-    (world, NAMES[i % len(NAMES)], list(EXPLORATION)[i % 2], 1 + 2 * (i % 2))
+    (world, COMPILED[i % len(COMPILED)], list(EXPLORATION)[i % 2], 1 + 2 * (i % 2))
     for i, world in enumerate([*WORLDS, *WORLDS])
 ]
 CASES.append(("Warehouse", "qlearning", "gaussian", 1))

@@ -1,5 +1,7 @@
 """Agents that plan: the known optima, zips that bring plans back, and time kept track of."""
 
+import re
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -7,13 +9,14 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import envs  # noqa: F401
-from agents.planning import Optimal, ValueIteration
+from agents.planning import Optimal, PolicyIteration, ValueIteration
 from envs.known_models import time_limit, transition_model
-from mdp import finite_horizon_optimum, policy_return
+from mdp import finite_horizon_optimum, policy_return, value_iteration
 
 
-def planned(algorithm, env_id, **kwargs):
-    return algorithm(env=make_vec_env(env_id, 1, seed=0, env_kwargs=kwargs), seed=0).learn(1)
+def planned(algorithm, env_id, gamma=None, **kwargs):
+    env = make_vec_env(env_id, 1, seed=0, env_kwargs=kwargs)
+    return algorithm(env=env, gamma=gamma, seed=0).learn(1)
 
 
 @pytest.mark.parametrize(
@@ -37,7 +40,43 @@ def test_the_known_returns(env_id, kwargs, by_values, optimum):
         assert result == pytest.approx(expected, abs=5e-5)
 
 
-@pytest.mark.parametrize("algorithm", [ValueIteration, Optimal])
+WITH_A_MODEL = {
+    "Warehouse-v0": {"slip": 0.2},
+    "MineMaze-v0": {},
+    "FrozenLake-v1": {},
+    "CliffWalking-v1": {},
+    "Taxi-v4": {},
+    "RandomWalk-v0": {},
+    "WindyGridworld-v0": {},
+    "DynaMaze-v0": {},
+    "GamblersProblem-v0": {},
+    "MaximizationBias-v0": {},
+    "RiverSwim-v0": {},
+    "DeepSea-v0": {},
+}
+
+
+@pytest.mark.parametrize("gamma", [0.9, 1.0])
+@pytest.mark.parametrize("env_id", WITH_A_MODEL)
+def test_plans_by_values_and_by_policies_are_worth_the_same(env_id, gamma):
+    """From each state, also where ties let the two choose other actions."""
+    kwargs = WITH_A_MODEL[env_id]
+    model = transition_model(gym.make(env_id, **kwargs))
+    try:
+        optimum = value_iteration(model, gamma).values[model.reachable]
+    except ValueError as refusal:  # an undiscounted optimum that is not finite
+        with pytest.raises(ValueError, match=re.escape(str(refusal))):
+            planned(PolicyIteration, env_id, gamma=gamma, **kwargs)
+        return
+    for algorithm in (ValueIteration, PolicyIteration):
+        actions = planned(algorithm, env_id, gamma=gamma, **kwargs).policy.actions.numpy()[0]
+        # Where one action is allowed, the optimum is what the policy is worth.
+        alone = np.eye(model.n_actions, dtype=bool)[actions[: model.n_states]]
+        worth = value_iteration(model, gamma, mask=alone).values[model.reachable]
+        np.testing.assert_allclose(worth, optimum, atol=1e-8, rtol=1e-9)
+
+
+@pytest.mark.parametrize("algorithm", [ValueIteration, PolicyIteration, Optimal])
 def test_zip_brings_the_plan_back(algorithm, tmp_path):
     agent = planned(algorithm, "FrozenLake-v1")
     agent.save(tmp_path / "agent")

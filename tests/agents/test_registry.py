@@ -13,7 +13,7 @@ from agents import ALGORITHMS, fitting_algorithms, load_algorithm
 
 DISCRETE = spaces.Discrete(4)
 BOX = spaces.Box(-1, 1, (4,))
-PLANNING = ["value_iteration", "optimal"]
+PLANNING = ["value_iteration", "policy_iteration", "optimal"]
 TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
 DEEP_Q = ["dqn", "double_dqn", "deep_qlearning"]
 CONTRIB = ["qrdqn", "tqc", "crossq", "trpo", "ars", "ppo_lstm", "ppo_mask"]
