@@ -27,6 +27,10 @@ def _tabular(entry_point: str, summary: str) -> AlgorithmEntry:
     return AlgorithmEntry(f"agents.tabular.{entry_point}", summary, DISCRETE, DISCRETE)
 
 
+def _tiled(entry_point: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(f"agents.linear.{entry_point}", summary, LINEAR_INPUTS, DISCRETE)
+
+
 def _deep(entry_point: str, summary: str, actions: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
     return AlgorithmEntry(entry_point, summary, NETWORK_INPUTS, actions)
 
@@ -96,6 +100,16 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "r_max": _tabular("r_max:RMax", "planning, with the unknown taken for the best"),
     "qlearning_ucb": _tabular(
         "q_learning_ucb:QLearningUCB", "Q-learning with upper confidence bounds"
+    ),
+    "semi_gradient_sarsa": _tiled(
+        "semi_gradient_sarsa:SemiGradientSARSA", "SARSA on tile coding (or a table)"
+    ),
+    "semi_gradient_q": _tiled(
+        "semi_gradient_q:SemiGradientQ", "Q-learning on tile coding (or a table)"
+    ),
+    "actor_critic": _tiled("actor_critic:ActorCritic", "one-step actor-critic on tiles or a table"),
+    "reinforce": _tiled(
+        "reinforce:Reinforce", "REINFORCE on tiles or a table, with or without a baseline"
     ),
     "dqn": _deep("agents.dqn:DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),

@@ -31,6 +31,7 @@ TEXTBOOK = {
     "Racetrack-v0": ("racetrack:RacetrackEnv", 1000),
     "RandomWalk-v0": ("random_walk:RandomWalkEnv", 1000),
     "RiverSwim-v0": ("river_swim:RiverSwimEnv", 20),
+    "ShortCorridor-v0": ("short_corridor:ShortCorridorEnv", 1000),
     "WindyGridworld-v0": ("windy_gridworld:WindyGridworldEnv", 1000),
 }
 

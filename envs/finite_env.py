@@ -28,7 +28,8 @@ class FiniteEnv(ShownEnv):
     same probabilities, means and variances.
 
     Args:
-        n_states: observations are the states, `Discrete(n_states)`.
+        n_states: observations are the states, `Discrete(n_states)`, unless a subclass says
+            otherwise by `observation_of` and a space of its own.
         n_actions: actions are `Discrete(n_actions)`.
         render_mode: see `ShownEnv`.
 
@@ -62,7 +63,7 @@ class FiniteEnv(ShownEnv):
         self.last_action = None
         if self.render_mode == "human":
             self.render()
-        return self.s, {}
+        return self._observe(), {}
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
         """Do one thing; see the class for the meaning of what is returned.
@@ -79,7 +80,21 @@ class FiniteEnv(ShownEnv):
         self.s, self.last_action = state, action
         if self.render_mode == "human":
             self.render()
-        return state, reward, terminated, False, {}
+        return self._observe(), reward, terminated, False, {}
+
+    def observation_of(self, states: Any) -> Any:
+        """What is observed in each of many states: by default the states themselves.
+
+        Args:
+            states: their numbers, shape (n,).
+
+        Returns:
+            The observations, shape (n,).
+        """
+        return states
+
+    def _observe(self) -> int:
+        return int(self.observation_of(self.s))
 
     def _draw(self, action: int) -> tuple[int, float, bool]:
         """What comes of an action: next state, reward, and whether the episode terminates."""

@@ -15,7 +15,7 @@ from pipeline.settings.hyperparams import Hyperparams
 from pipeline.train_spec import TrainSpec
 
 # Agents whose random numbers are all their own, or drawn after they have been seeded.
-FAMILIES = frozenset({"tabular"})
+FAMILIES = frozenset({"tabular", "linear"})
 # Those of the library, once they train on compiled code: weights are drawn after that too. In the
 # library's own loop they take too long to gain anything.
 NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})

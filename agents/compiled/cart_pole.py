@@ -104,3 +104,11 @@ class CartPole(NamedTuple):
         env.theta = -0.05 + width * next_uniform(handle)
         env.theta_dot = -0.05 + width * next_uniform(handle)
         env.new_obs = bin_index(self, env)
+
+    @inlined
+    def show(self, env: Any, vector: Any) -> None:
+        """What the agent sees where there are no bins, in single precision, shape (4,)."""
+        vector[0] = np.float32(env.x)
+        vector[1] = np.float32(env.x_dot)
+        vector[2] = np.float32(env.theta)
+        vector[3] = np.float32(env.theta_dot)

@@ -7,7 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.envs.classic_control import CartPoleEnv
+from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
 from gymnasium.wrappers import ClipReward, OrderEnforcing, PassiveEnvChecker, TimeLimit
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from agents.compiled.cart_pole import CartPole
 from agents.compiled.finite_model import OUTCOME, FiniteModel
 from agents.compiled.kept_worlds import World, keep_world, kept_world, recipe_of
+from agents.compiled.mountain_car import MountainCar
 from envs.checking.claimed_models import is_trusted
 from envs.known_models import (
     model_check,
@@ -103,6 +104,8 @@ def draws_alike(vec_env: DummyVecEnv) -> bool:
 def _world_of(env: Env) -> World:
     if isinstance(env.unwrapped, CartPoleEnv):
         return _cart_pole(env)
+    if isinstance(env.unwrapped, MountainCarEnv):
+        return _mountain_car(env)
     with one_look(env):
         return _finite_model(env)
 
@@ -210,3 +213,12 @@ def _cart_pole(env: Env) -> CartPole:
         dims=dims,
         bins=bins,
     )
+
+
+def _mountain_car(env: Env) -> MountainCar:
+    *wrappers, base = layers(env)
+    assert isinstance(base, MountainCarEnv)
+    if type(base) is not MountainCarEnv or {type(layer) for layer in wrappers} - COMMON_WRAPPERS:
+        raise NotCompilable("MountainCar compiles as it is, under Monitor alone")
+    constants = {name: float(getattr(base, name)) for name in MountainCar._fields[1:]}
+    return MountainCar(time_limit(env) or 0, **constants)

@@ -19,7 +19,7 @@ from numba.extending import overload
 
 from agents.common.signatures import CheckedConstructor
 from mdp.code_cache import RULE_PREFIX
-from mdp.machine_code import BARE_OPTIONS
+from mdp.machine_code import BARE_OPTIONS, INTERNAL_OPTIONS
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -42,7 +42,7 @@ def by_type(stub: Function) -> Function:
     def choose(thing: Any, *others: Any) -> Any:
         return getattr(getattr(_class_of(thing), name, None), "py_func", None)
 
-    options: Any = {**BARE_OPTIONS, "forceinline": True}
+    options: Any = {**BARE_OPTIONS, **INTERNAL_OPTIONS, "forceinline": True}
     overload(stub, strict=False, jit_options=options)(choose)
     return stub
 

@@ -77,12 +77,15 @@ class CompiledEngine:
         agent, progress = self.agent, self.progress[0]
         made_from = agent.made_from(agent.rng)
         if made_from != self.made_from:
-            self.made_from, self.learner = made_from, agent.compiled_agent(agent.rng)
+            self.made_from, self.learner = made_from, self._compiled_agent()
         for name, schedule in agent.schedules().items():
             progress[f"{name}_schedule"] = compiled_schedule(schedule)
             progress[name] = schedule(agent._current_progress_remaining)
         self._take_generators()
         return self.learner
+
+    def _compiled_agent(self) -> Any:
+        return self.agent.compiled_agent(self.agent.rng)
 
     def _take_generators(self) -> None:
         """A callback may have seeded the environments anew."""
@@ -177,14 +180,14 @@ class CompiledEngine:
             {"TimeLimit.truncated": bool(done and not terminated)}
             for done, terminated in zip(envs["done"], envs["terminated"], strict=True)
         ]
-        last = slice(earlier, None)
+        last, ends = slice(earlier, None), self.states.observations(envs, "next_")
         for env, info in zip(
             episodes.envs[last].tolist(), episodes.infos(last, times), strict=True
         ):
-            infos[env].update(episode=info, terminal_observation=int(envs["next_obs"][env]))
+            infos[env].update(episode=info, terminal_observation=ends[env])
         return {
             "actions": envs["action"].copy(),
-            "new_obs": envs["new_obs"].copy(),
+            "new_obs": self.states.observations(envs, "new_"),
             "rewards": envs["reward"].astype(np.float32),
             "dones": envs["done"].copy(),
             "infos": infos,
@@ -200,7 +203,7 @@ class CompiledEngine:
             agent._count_episodes(n_episodes, self.log_interval)
 
     def _take_over_position(self) -> None:
-        self.agent._last_obs = self.envs["obs"].copy()
+        self.agent._last_obs = self.states.observations(self.envs, "")
         self.agent.take_over(self.envs, self.progress)
 
     def _write(self) -> None:
@@ -219,6 +222,6 @@ class CompiledEngine:
         progress["total_timesteps"] = agent._total_timesteps
         progress["remaining"] = agent._current_progress_remaining
         progress["episodes"] = agent._episode_num
-        self.envs["obs"] = agent._last_obs
         agent.hand_over(self.envs, self.progress)
         self.states.read()
+        self.states.take_observations(agent._last_obs)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, Literal
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.callback_horizons import unknown_callbacks
 from agents.compiled.compile_envs import NotCompilable, compile_envs, draws_alike
 from agents.compiled.engine import CompiledEngine
-from agents.compiled.kept_worlds import World
 from agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]
@@ -32,13 +33,24 @@ SETTINGS = (
 
 
 def choose_engine(
-    agent: Any, callback: BaseCallback, log_interval: int | None
+    agent: Any,
+    callback: BaseCallback,
+    log_interval: int | None,
+    make_world: Callable[[VecEnv], Any] = compile_envs,
+    engine: type[CompiledEngine] = CompiledEngine,
 ) -> CompiledEngine | None:
     """The compiled engine where the agent wants it and it can be had; None for interpreting.
 
     An environment that draws in its own way is equal to its compiled copy in distribution alone:
     such a copy has to be asked for, so that results do not hang on what else kept an agent from
     compiling. The choice and its reason are left in ``agent.engine_in_use``.
+
+    Args:
+        agent: the algorithm.
+        callback: as in `CompiledEngine`.
+        log_interval: likewise.
+        make_world: from its environments to what the engine is handed as the world.
+        engine: the class of the engine.
 
     Raises:
         ValueError: if the agent insists on compiled and it cannot be had.
@@ -47,7 +59,7 @@ def choose_engine(
         agent.engine_in_use = "interpreted: asked for"
         return None
     try:
-        world = _world_for(agent, callback)
+        world = _world_for(agent, callback, make_world)
     except NotCompilable as reason:
         if agent.engine == "compiled":
             raise ValueError(f"engine: compiled is not possible: {reason}") from None
@@ -62,10 +74,12 @@ def choose_engine(
             )
             return None
         agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"
-    return CompiledEngine(agent, world, callback, log_interval)
+    return engine(agent, world, callback, log_interval)
 
 
-def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> World:
+def _world_for(
+    agent: LearningAlgorithm, callback: BaseCallback, make_world: Callable[[VecEnv], Any]
+) -> Any:
     check_class(type(agent))
     for name in vars(agent):
         if callable(vars(agent)[name]) and callable(getattr(type(agent), name, None)):
@@ -77,7 +91,7 @@ def _world_for(agent: LearningAlgorithm, callback: BaseCallback) -> World:
     for schedule in agent.schedules().values():
         compiled_schedule(schedule)
     assert agent.env is not None
-    return compile_envs(agent.env)
+    return make_world(agent.env)
 
 
 def check_class(algorithm: type) -> None:

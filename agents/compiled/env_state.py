@@ -20,10 +20,17 @@ from agents.compiled.env_steps import add_to_return
 from agents.compiled.episodes import Episodes
 from agents.compiled.finite_model import FINITE_ENV
 from agents.compiled.kept_worlds import World
+from agents.compiled.mountain_car import CAR_STATE, MOUNTAIN_CAR_ENV, MountainCar
 from mdp.array_types import Floats
 
 # Python's sum of floats makes up for rounding from this version on.
 COMPENSATED_SUM = sys.version_info >= (3, 12)
+
+# Of environments whose state is a vector: what it consists of, and their records.
+VECTOR_STATES: dict[type, tuple[tuple[str, ...], np.dtype[np.void]]] = {
+    CartPole: (STATE, CART_POLE_ENV),
+    MountainCar: (CAR_STATE, MOUNTAIN_CAR_ENV),
+}
 
 
 class EnvStates:
@@ -34,12 +41,13 @@ class EnvStates:
         world: their compiled counterpart.
 
     Attributes:
-        records: of `FINITE_ENV` or `CART_POLE_ENV`, shape (n_envs,).
+        records: of `FINITE_ENV`, or as `VECTOR_STATES` has them, shape (n_envs,).
+        vector_state: what the state consists of, where it is a vector; else nothing.
     """
 
     def __init__(self, vec_env: DummyVecEnv, world: World) -> None:
         self.vec_env = vec_env
-        self.is_cart_pole = isinstance(world, CartPole)
+        self.vector_state, self._record_type = VECTOR_STATES.get(type(world), ((), FINITE_ENV))
         self.records = np.zeros(vec_env.num_envs, dtype=self.record_type())
         self.monitors = [monitor_of(env) for env in vec_env.envs]
         # Monitor holds the rewards of the episode that is under way: so must we.
@@ -47,19 +55,31 @@ class EnvStates:
 
     def record_type(self) -> np.dtype[np.void]:
         """What the records hold."""
-        return CART_POLE_ENV if self.is_cart_pole else FINITE_ENV
+        return self._record_type
 
     def observation(self, i: int) -> Any:
         """What environment ``i`` shows."""
         return self.records[i]["obs"]
+
+    def observations(self, records: Any, prefix: str) -> Any:
+        """What environments show now (no prefix), before (``next_``) or after a reset (``new_``).
+
+        Returns:
+            Observations of shape (n, ...).
+        """
+        return records[f"{prefix}obs"].copy()
+
+    def take_observations(self, last_obs: Any) -> None:
+        """Let the records begin with these observations, shape (n, ...)."""
+        self.records["obs"] = last_obs
 
     def read(self) -> None:
         """Copy the state of the environments into the records."""
         for i, env in enumerate(self.vec_env.envs):
             base: Any = env.unwrapped
             record = self.records[i]
-            if self.is_cart_pole:
-                for name, value in zip(STATE, base.state, strict=True):
+            if self.vector_state:
+                for name, value in zip(self.vector_state, base.state, strict=True):
                     record[name] = value
             else:
                 record["state"] = base.s
@@ -86,9 +106,10 @@ class EnvStates:
             next(iter(self.vec_env.buf_obs.values()))[i] = self.observation(i)
 
     def _write_state(self, base: Any, record: Any) -> None:
-        if self.is_cart_pole:
-            base.state = np.array([record[name] for name in STATE])
-            base.steps_beyond_terminated = None
+        if self.vector_state:
+            base.state = np.array([record[name] for name in self.vector_state])
+            if hasattr(base, "steps_beyond_terminated"):
+                base.steps_beyond_terminated = None
             return
         base.s = int(record["state"])
         if hasattr(base, "lastaction"):

@@ -167,12 +167,3 @@ class NetworkEngine(CompiledEngine):
         self.training.read()
         self.states.read()
         self.states.take_observations(agent._last_obs)
-
-    def _last_step(self, episodes: Episodes, earlier: int, times: list[float]) -> dict[str, Any]:
-        told = super()._last_step(episodes, earlier, times)
-        told["new_obs"] = self.states.observations(self.envs, "new_")
-        ends = self.states.observations(self.envs, "next_")
-        for i, info in enumerate(told["infos"]):
-            if "terminal_observation" in info:
-                info["terminal_observation"] = ends[i]
-        return told

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.compiled.cart_pole import STATE, CartPole
+from agents.compiled.cart_pole import CartPole
 from agents.compiled.compile_envs import NotCompilable, compile_envs
-from agents.compiled.env_state import EnvStates
+from agents.compiled.dispatch import by_type
+from agents.compiled.env_state import VECTOR_STATES, EnvStates
 from agents.compiled.loop import reset, step
+from agents.compiled.mountain_car import MountainCar
 from agents.compiled.training_records import env_dtype
 from agents.networks.observations import Numbers, OwnVectors, StateVectors
 from envs.known_models import observations_of_states
@@ -22,41 +25,44 @@ _ESTIMATES = (("value", np.float64), ("log_probability", np.float64))
 
 _FINITE_ENV = env_dtype(("state", np.int64), *_ESTIMATES)
 
-_VECTORS: Any = [(name, np.float32, (4,)) for name in ("vector", "next_vector", "new_vector")]
-_CART_POLE_ENV = env_dtype(*((name, np.float64) for name in STATE), *_ESTIMATES, *_VECTORS)
 
-
-class CartPoleInFull(NamedTuple):
-    """CartPole that shows its state.
+class InFull(NamedTuple):
+    """CartPole or MountainCar, showing its state.
 
     Attributes:
         time_limit: steps after which an episode is truncated, or 0 for never.
-        cart_pole: the dynamics.
+        dynamics: what moves it.
     """
 
     time_limit: int
-    cart_pole: CartPole
+    dynamics: CartPole | MountainCar
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
-        """Push the cart as ``env.action`` says."""
-        step(self.cart_pole, env, handle)
-        _show_state(env, env.next_vector)
-        _show_state(env, env.new_vector)
+        """Push as ``env.action`` says."""
+        step(self.dynamics, env, handle)
+        show(self.dynamics, env, env.next_vector)
+        show(self.dynamics, env, env.new_vector)
 
     @inlined
     def reset(self, env: Any, handle: Any) -> None:
         """Draw a state."""
-        reset(self.cart_pole, env, handle)
-        _show_state(env, env.new_vector)
+        reset(self.dynamics, env, handle)
+        show(self.dynamics, env, env.new_vector)
 
 
-@inlined
-def _show_state(env: Any, vector: Any) -> None:
-    vector[0] = np.float32(env.x)
-    vector[1] = np.float32(env.x_dot)
-    vector[2] = np.float32(env.theta)
-    vector[3] = np.float32(env.theta_dot)
+@by_type
+def show(world: Any, env: Any, vector: Any) -> None:
+    """Write the state of an environment into a vector."""
+
+
+@lru_cache(maxsize=4)
+def _record_in_full(names: tuple[str, ...]) -> np.dtype[np.void]:
+    """The record of an environment with a state of these numbers, which networks see."""
+    vectors: Any = [
+        (name, np.float32, (len(names),)) for name in ("vector", "next_vector", "new_vector")
+    ]
+    return env_dtype(*((name, np.float64) for name in names), *_ESTIMATES, *vectors)
 
 
 def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
@@ -72,8 +78,9 @@ def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
     space = vec_env.observation_space
     if isinstance(space, spaces.Discrete):
         return world, Numbers(int(space.n))
-    if isinstance(world, CartPole):
-        return CartPoleInFull(world.time_limit, world), OwnVectors(len(STATE))
+    if isinstance(world, CartPole | MountainCar):
+        names, _ = VECTOR_STATES[type(world)]
+        return InFull(world.time_limit, world), OwnVectors(len(names))
     observed = observations_of_states(vec_env.envs[0])  # type: ignore[attr-defined]
     if observed is None or observed.ndim < 2:
         raise NotCompilable("the observations of the states are not known")
@@ -91,11 +98,11 @@ class NetworkEnvStates(EnvStates):
 
     def __init__(self, vec_env: Any, world: Any, seen: Any) -> None:
         self.seen = seen
-        super().__init__(vec_env, getattr(world, "cart_pole", world))
+        super().__init__(vec_env, getattr(world, "dynamics", world))
 
     def record_type(self) -> np.dtype[np.void]:
         """With room for what networks expect, and for vectors."""
-        return _CART_POLE_ENV if self.is_cart_pole else _FINITE_ENV
+        return _record_in_full(self.vector_state) if self.vector_state else _FINITE_ENV
 
     def observation(self, i: int) -> Any:
         """What environment ``i`` shows, in the shape that it has in the environment's space."""

@@ -58,6 +58,8 @@ class Claim:
         """What is observed in each state, states along the first axis; None if it does not say."""
         if isinstance(self.base, GridWorld):
             return self.base.observation_of(np.arange(self.base.dynamics.n_states))
+        if isinstance(self.base, FiniteEnv):
+            return np.asarray(self.base.observation_of(np.arange(self.model.n_states)))
         if isinstance(self.base, BlackjackEnv):
             return blackjack_observations()
         space = self.base.observation_space
@@ -73,10 +75,13 @@ class Claim:
             return self.model.reward_variance is None
         return not isinstance(self.base, BlackjackEnv)
 
-    @property
+    @cached_property
     def observes_states(self) -> bool:
         """Whether an observation is the number of the state."""
-        return not isinstance(self.base, GridWorld) and self.observations is not None
+        if isinstance(self.base, GridWorld):
+            return False
+        seen = self.observations
+        return seen is not None and np.array_equal(seen, np.arange(self.model.n_states))
 
     def check_spaces(self) -> None:
         """Make sure that the model has the environment's actions and as many states.

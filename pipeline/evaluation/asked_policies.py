@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from agents.linear.tile_algorithm import TileAlgorithm
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.q_table_policy import QTablePolicy
@@ -113,6 +114,8 @@ def policy_matrix(
         return np.eye(n_actions)[best_actions(agent, observations, masks)]
     if isinstance(agent, TabularAlgorithm):
         return np.asarray(agent.action_probabilities()[observations])
+    if isinstance(agent, TileAlgorithm):
+        return agent.action_probabilities(observations)
     policy = getattr(agent, "policy", None)
     if hasattr(policy, "get_distribution"):
         return _in_parts(agent, observations, masks, partial(_actor_probabilities, policy))

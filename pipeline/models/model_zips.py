@@ -16,7 +16,7 @@ from pipeline.run_folder import Run
 from pipeline.train_spec import TrainSpec
 
 # Folders of `agents` in which no agent has a zip with a pickle: known before any is imported.
-_JSON_FAMILIES = {"tabular", "bandits", "mabwiser"}
+_JSON_FAMILIES = {"tabular", "linear", "bandits", "mabwiser"}
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabula
 EXPLORERS = [
     name for name in TABULAR if "exploration" in load_algorithm(name).__signature__.parameters
 ]
-HAND_WRITTEN = [*TABULAR, "random", "angle"]
+LINEAR = [name for name, entry in ALGORITHMS.items() if entry.family == "linear"]
+HAND_WRITTEN = [*TABULAR, *LINEAR, "random", "angle"]
 
 pytestmark = pytest.mark.filterwarnings(
     "ignore:Training and eval env are not of the same type:UserWarning"
@@ -122,7 +123,8 @@ def test_counts_steps_and_episodes_over_all_environments(name, n_envs):
 
 @pytest.mark.parametrize("name", HAND_WRITTEN)
 def test_learning_in_two_calls_is_learning_in_one(name):
-    constant = {"exploration_decay": "constant"} if name in EXPLORERS else {}
+    explores = "exploration_decay" in load_algorithm(name).__signature__.parameters
+    constant = {"exploration_decay": "constant"} if explores else {}
     once = make(name, **constant).learn(700)
     twice = make(name, **constant).learn(400).learn(300, reset_num_timesteps=False)
     assert attributes(once) == attributes(twice)

@@ -50,6 +50,7 @@ ENVIRONMENTS: list[tuple[str, dict[str, Any]]] = [
     ("WindyGridworld-v0", {"moves": "king", "stochastic": True}),
     ("GamblersProblem-v0", {"heads_probability": 0.55, "goal": 20}),
     ("RiverSwim-v0", {}),
+    ("ShortCorridor-v0", {}),
     ("DeepSea-v0", {"size": 4}),
     ("Racetrack-v0", {}),
 ]

@@ -28,6 +28,7 @@ LIMITS = {
     "Racetrack-v0": 1000,
     "RandomWalk-v0": 1000,
     "RiverSwim-v0": 20,
+    "ShortCorridor-v0": 1000,
     "WindyGridworld-v0": 1000,
 }
 
@@ -298,7 +299,8 @@ def test_corners_of_the_sea_have_noise_where_it_is_rough() -> None:
 # --- what they share -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("env_id", LIMITS)
+# An agent that plans has to see where it is.
+@pytest.mark.parametrize("env_id", LIMITS.keys() - {"ShortCorridor-v0"})
 def test_an_agent_that_plans_reaches_the_optimum(env_id) -> None:
     env = gym.make(env_id, max_episode_steps=30)
     model, states = transition_model(env), np.arange(env.observation_space.n)

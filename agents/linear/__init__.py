@@ -1,0 +1,1 @@
+"""Agents on sums of weights of tiles, a table among them: action values and policy gradients."""

@@ -1,0 +1,206 @@
+"""REINFORCE, with and without a baseline."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple, Unpack
+
+import numpy as np
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from agents.common.online import Transitions
+from agents.common.setting_checks import check_at_least, check_option, settings_of
+from agents.compiled.compile_envs import NotCompilable
+from agents.linear.softmax import (
+    SoftmaxAlgorithm,
+    SoftmaxArguments,
+    ascend,
+    move_state_value,
+    state_value,
+)
+from agents.linear.weighted_tiles import LinearAgent, look
+from agents.networks.observations import AFTER, BEFORE, move_on
+from envs.known_models import time_limit
+from mdp.array_types import Floats, Ints
+from mdp.machine_code import called
+
+Baseline = Literal["none", "value"]
+
+FIRST_CAPACITY = 64
+# Eight bytes each: steps that are kept times tilings, over all environments.
+MOST_KEPT = 50_000_000
+
+
+class KeptEpisodes(NamedTuple):
+    """What the agent keeps besides its preferences: the episodes under way in n environments.
+
+    Attributes:
+        values: weights of the state values, shape (tiles,); of shape (0,) without a baseline.
+        lengths: steps that are kept, shape (n,).
+        tiles: active tiles of the observations, shape (n, capacity, n_tilings).
+        actions: what was done, shape (n, capacity).
+        rewards: what it gave, shape (n, capacity); the returns, once the episode is over.
+    """
+
+    values: Floats
+    lengths: Ints
+    tiles: Ints
+    actions: Ints
+    rewards: Floats
+
+
+@called
+def keep_step(agent: LinearAgent, env: Any, i: int) -> None:
+    """Note the step that environment ``i`` has taken."""
+    kept, room = agent.memory, agent.room
+    t = kept.lengths[i]
+    look(agent, env, BEFORE, room.tiles)
+    for k in range(len(room.tiles)):
+        kept.tiles[i, t, k] = room.tiles[k]
+    kept.actions[i, t] = env.action
+    kept.rewards[i, t] = env.reward
+    kept.lengths[i] = t + 1
+
+
+@called
+def make_returns(rewards: Floats, n_steps: int, gamma: float, following: float) -> None:
+    """Turn the rewards of an episode into its returns, from the last to the first."""
+    for t in range(n_steps - 1, -1, -1):
+        following = rewards[t] + gamma * following
+        rewards[t] = following
+
+
+@called
+def reinforce_step(agent: LinearAgent, i: int, t: int, step: float) -> float:
+    """Learn from step ``t`` of a finished episode, and return by how much it beat the baseline."""
+    kept, room, settings = agent.memory, agent.room, agent.settings
+    for k in range(len(room.tiles)):
+        room.tiles[k] = kept.tiles[i, t, k]
+    advantage = kept.rewards[i, t]
+    if len(kept.values) > 0:
+        advantage -= state_value(kept.values, room.tiles)
+        value_step = settings.value_step_size / len(room.tiles)
+        move_state_value(kept.values, room.tiles, value_step * advantage)
+    ascend(agent, room.tiles, kept.actions[i, t], step * advantage)
+    return float(advantage)
+
+
+@called
+def learn_from_episode(agent: LinearAgent, env: Any, progress: Any, i: int) -> None:
+    """Learn from the episode that has ended in environment ``i``, from its first step on."""
+    kept, room, settings = agent.memory, agent.room, agent.settings
+    n_steps, following, total = kept.lengths[i], 0.0, 0.0
+    if len(kept.values) > 0 and not env.terminated:
+        look(agent, env, AFTER, room.next_tiles)
+        following = state_value(kept.values, room.next_tiles)
+    make_returns(kept.rewards[i], n_steps, settings.gamma, following)
+    step = progress.learning_rate / len(room.tiles)
+    for t in range(n_steps):
+        total += abs(reinforce_step(agent, i, t, step))
+        if settings.gamma_power:
+            step *= settings.gamma
+    kept.lengths[i] = 0
+    progress.mean_td_error = total / n_steps
+
+
+@called
+def learn_at_ends(agent: LinearAgent, envs: Any, progress: Any) -> None:
+    """Keep all steps, and learn from the episodes that have ended."""
+    for i in range(len(envs)):
+        env = envs[i]
+        keep_step(agent, env, i)
+        if env.done:
+            learn_from_episode(agent, env, progress, i)
+        move_on(agent.seen, env)
+
+
+class Reinforce(SoftmaxAlgorithm):
+    """REINFORCE, Monte Carlo policy gradient (Williams, 1992; Sutton and Barto, 13.3 and 13.4).
+
+    It learns at the end of an episode, step by step from the first one on. The return of a
+    truncated episode ends where the episode does, and goes on with the value of its last state
+    where ``baseline`` is ``"value"``.
+
+    Args:
+        policy: ``"TilePolicy"``.
+        env: as in `TileAlgorithm`.
+        learning_rate: step size of the policy, constant or scheduled, as in `TileAlgorithm`.
+        baseline: what returns are compared with: ``"none"``, or ``"value"``, a learnt state value.
+        value_step_size: step size of that value, divided by the number of tilings likewise.
+        kwargs: as in `SoftmaxAlgorithm`.
+    """
+
+    parameters = {"value_step_size": np.float64}  # noqa: RUF012
+    learn_from_step = learn_at_ends
+
+    # An agent that is loaded begins new episodes.
+    _kept = ("_lengths", "_kept_tiles", "_kept_actions", "_kept_rewards")
+    _rebuilt = (*SoftmaxAlgorithm._rebuilt, *_kept)
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "TilePolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: float | Schedule = 0.1,
+        baseline: Baseline = "none",
+        value_step_size: float = 0.2,
+        **kwargs: Unpack[SoftmaxArguments],
+    ) -> None:
+        self.baseline = baseline
+        self.value_step_size = value_step_size
+        self._lengths = np.zeros(0, dtype=np.int64)
+        self._kept_tiles = np.zeros((0, 0, 1), dtype=np.int64)
+        self._kept_actions = np.zeros((0, 0), dtype=np.int64)
+        self._kept_rewards = np.zeros((0, 0))
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_option("baseline", self.baseline, Baseline)
+        check_at_least(0, settings_of(self, "value_step_size"))
+
+    @property
+    def values_states(self) -> bool:  # type: ignore[override]
+        """Whether the policy holds weights of state values."""
+        return self.baseline == "value"
+
+    def _begin_episodes(self) -> None:
+        super()._begin_episodes()
+        self._lengths = np.zeros(self.n_envs, dtype=np.int64)
+        self._keep_up_to(FIRST_CAPACITY)
+
+    def _keep_up_to(self, n_steps: int) -> None:
+        """Make room for so many steps of each episode, with what is kept so far."""
+        n_tilings, n_envs = self.policy.tiles.n_tilings, self.n_envs
+        shapes = (n_envs, n_steps, n_tilings), (n_envs, n_steps), (n_envs, n_steps)
+        for name, shape in zip(self._kept[1:], shapes, strict=True):
+            old = getattr(self, name)
+            new = np.zeros(shape, dtype=old.dtype)
+            if len(old) == n_envs:
+                new[:, : old.shape[1]] = old[:, :n_steps]
+            setattr(self, name, new)
+
+    def check_compilable(self) -> None:
+        super().check_compilable()
+        assert self.env is not None
+        limits = [time_limit(env) or 0 for env in getattr(self.env, "envs", [])]
+        longest = max(limits, default=0)
+        if not all(limits) or longest == 0:
+            raise NotCompilable("episodes are kept, and there is no limit to their length")
+        if self.n_envs * longest * self.policy.tiles.n_tilings > MOST_KEPT:
+            raise NotCompilable(f"episodes are kept, and {longest:,} steps are too many for that")
+        if longest > self._kept_rewards.shape[1]:
+            self._keep_up_to(longest)
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        capacity = self._kept_rewards.shape[1]
+        if self._lengths.max() >= capacity:
+            self._keep_up_to(2 * capacity)
+        super()._learn_from(transitions)
+
+    def _memory(self) -> KeptEpisodes:
+        kept = (getattr(self, name) for name in self._kept)
+        return KeptEpisodes(self.policy.state_weights.numpy(), *kept)
+
+    def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
+        return (*super().made_from(rng), *(id(getattr(self, name)) for name in self._kept))
