@@ -10,6 +10,7 @@ Source: Sutton and Barto (2nd edition), chapter 6.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 from agents.common.exploration import GAUSSIAN_NOISE, choose_action, random_action
@@ -114,6 +115,7 @@ def update(agent: TabularAgent, env: Any, progress: Any) -> float:
     count = tables.visit_counts[table, env.obs, env.action]
     size = step_size(progress.learning_rate, settings.averages_samples, count)
     td_error = target - tables.values[table, env.obs, env.action]
+    env.target, env.td_error = target, td_error
     tables.values[table, env.obs, env.action] += size * td_error
     return float(td_error)
 
@@ -131,6 +133,8 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
         env = envs[i]
         if not (env.terminated and agent.settings.skip_terminal_update):
             total_error += abs(update(agent, env, progress))
+        else:
+            env.target = env.td_error = math.nan
         env.obs = env.new_obs
         if env.done:
             env.next_action = UNDECIDED

@@ -86,7 +86,7 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
     missing = [name for name in data["gym_packages"] if name not in {m.name for m in typed}]
     if missing:
         raise UserError(f"the run needs --gym-packages {' '.join(missing)}: type it again")
-    paths = ("tensorboard_log", "trained_agent")
+    paths = ("tensorboard_log", "trained_agent", "watch_learning")
     given = {name: None if data[name] is None else Path(data[name]) for name in paths}
     raw = data.pop("hyperparams")
     if not isinstance(raw, dict) or environment_name(str(data["env_id"])) != run.env_name:
