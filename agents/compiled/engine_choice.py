@@ -14,15 +14,17 @@ from agents.compiled.learning_algorithm import LearningAlgorithm, compiled_sched
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]
 
-# What a class may say anew in Python: all of it ends up in the settings, schedules and tables that
-# compiled functions are handed.
+# What a class may say anew in Python: all of it ends up in the settings, schedules, tables and the
+# memory that compiled functions are handed.
 SETTINGS = (
     "__dict__",
     "__init__",
     "__weakref__",
     "_check_arguments",
     "_make_exploration_schedule",
+    "_make_memory",
     "_make_policy",
+    "_memory_in_use",
     "strategy",
     "tie_scale",
     "averages_samples",

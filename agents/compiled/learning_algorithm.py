@@ -57,6 +57,8 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         "strategy": np.int64,
     }
     settings_type: ClassVar[np.dtype[np.void]]
+    # Arrays of the algorithm's own that compiled functions work on.
+    _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
 
     _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspaces")
@@ -139,13 +141,14 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:
         """What a workspace is made from: once this differs, it is out of date.
 
-        Callbacks may change settings, replace a table or seed the agent anew.
+        Callbacks may change settings, replace a table or the memory, or seed the agent anew.
         """
         # Looked up in one go each: this is asked after every step.
         tables = [
             buffer.data_ptr() for buffer in self.policy._buffers.values() if buffer is not None
         ]
-        return rng, self._read_settings(self), *tables
+        # What was made from it keeps the memory alive, so that no other one has its number.
+        return rng, self._read_settings(self), id(self._memory), *tables
 
     def _workspace_for(self, rng: np.random.Generator, n: int) -> Any:
         """A workspace that is up to date, and keeps the generator alive that it draws from."""

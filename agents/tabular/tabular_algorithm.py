@@ -28,7 +28,8 @@ from agents.compiled.engine_choice import EngineChoice, choose_engine
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import StepSize
 from agents.compiled.training_records import UNDECIDED
-from agents.tabular.mask_keeping import MaskedArguments, MaskKeeper
+from agents.tabular.episode_keeping import EpisodeKeeper
+from agents.tabular.mask_keeping import MaskedArguments
 from agents.tabular.q_table_policy import QTablePolicy
 from agents.tabular.temporal_difference import (
     TabularAgent,
@@ -43,7 +44,7 @@ from mdp.array_types import Floats, Ints
 ExplorationStrategy = Literal["epsilon_greedy", "boltzmann", "gaussian_noise"]
 
 
-class TabularAlgorithm(MaskKeeper):
+class TabularAlgorithm(EpisodeKeeper):
     """Temporal-difference control on a table of action values.
 
     Args:
@@ -83,7 +84,7 @@ class TabularAlgorithm(MaskKeeper):
     learn_from_step = td_learning
     commit = no_commitment
 
-    _rebuilt = (*MaskKeeper._rebuilt, "_in_use", "last_steps")
+    _rebuilt = (*EpisodeKeeper._rebuilt, "_in_use", "last_steps")
     not_in_snapshots = ("_in_use", "last_steps")
 
     def __init__(
@@ -121,7 +122,6 @@ class TabularAlgorithm(MaskKeeper):
         self.engine = engine
         self.engine_in_use = ""
         self.mean_td_error = 0.0
-        self._next_actions: Ints = np.empty(0, dtype=np.int64)
         self._in_use: Workspace | None = None
         # A record for each environment, with target and TD error of its last update.
         self.last_steps: NDArray[np.void] | None = None
@@ -177,6 +177,7 @@ class TabularAlgorithm(MaskKeeper):
         """The agent as compiled functions see it, its tables in the memory of its policy."""
         values = self.policy.q_tables.numpy()
         self._check_tables()
+        self._check_memory()
         n_actions = values.shape[2]
         n_draws = draws_per_choice(self.strategy, n_actions)
         return TabularAgent(
@@ -184,15 +185,13 @@ class TabularAlgorithm(MaskKeeper):
             self._tables(),
             Room(np.empty(n_actions), np.arange(n_actions), np.empty(n_draws)),
             handles_of([rng])[0],
+            self._memory_in_use(),
         )
 
     def _check_tables(self) -> None:
         super()._check_tables()
         if self.strategy not in STRATEGIES.values():
             raise ValueError(f"unknown exploration strategy {self.strategy}")
-
-    def _begin_episodes(self) -> None:
-        self._next_actions = np.full(self.n_envs, UNDECIDED)
 
     def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
         engine = choose_engine(self, callback, log_interval)
@@ -207,12 +206,13 @@ class TabularAlgorithm(MaskKeeper):
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Write what the compiled loop goes on from into its records."""
-        envs["next_action"] = self._next_actions
+        super().hand_over(envs, progress)
         progress["mean_td_error"] = self.mean_td_error
 
     def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Go on from where the compiled loop is."""
-        self._next_actions, self.last_steps = envs["next_action"].copy(), envs
+        super().take_over(envs, progress)
+        self.last_steps = envs
         self.mean_td_error = float(progress["mean_td_error"][0])
 
     def _present_workspace(self) -> Workspace:

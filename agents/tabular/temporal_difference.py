@@ -32,12 +32,14 @@ class TabularAgent(NamedTuple):
         tables: what it knows, `Tables` or `MaskedTables`.
         room: for its work.
         rng: a handle of its generator.
+        memory: arrays of its algorithm's own, by name; see `EpisodeKeeper`.
     """
 
     settings: Any
     tables: Any
     room: Room
     rng: Any
+    memory: Any
 
 
 @by_type
@@ -108,7 +110,7 @@ def update(agent: TabularAgent, env: Any, progress: Any) -> float:
     room = room_at(tables, env.next_obs, agent.room)
     for k in range(len(room.values)):
         room.values[k] = tables.values[table, env.next_obs, action_at(tables, room, k)]
-    ahead = TabularAgent(settings, tables, room, agent.rng)
+    ahead = TabularAgent(settings, tables, room, agent.rng, agent.memory)
     discount = 0.0 if env.terminated else settings.gamma
     target = env.reward + discount * next_value(ahead, env, progress, table)
     tables.visit_counts[table, env.obs, env.action] += 1
@@ -156,6 +158,7 @@ def act_in_all(
     actions: Ints,
     draws: Floats,
     rng: Any,
+    memory: Any,
 ) -> int:
     """`act` in each environment, for the interpreted loop.
 
@@ -167,7 +170,7 @@ def act_in_all(
         if not 0 <= envs[i].obs < values.shape[1]:
             return i
     tables = MaskedTables(values, visit_counts, allowed)
-    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0])
+    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0], memory)
     for i in range(len(envs)):
         act(agent, envs[i], progress[0])
     return -1
@@ -185,12 +188,13 @@ def learn_from_all(
     actions: Ints,
     draws: Floats,
     rng: Any,
+    memory: Any,
 ) -> int:
     """`learn_from_step` of all environments, for the interpreted loop; returns as `act_in_all`."""
     for i in range(len(envs)):
         if not 0 <= envs[i].next_obs < values.shape[1]:
             return i
     tables = MaskedTables(values, visit_counts, allowed)
-    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0])
+    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0], memory)
     learn_from_step(agent, envs, progress[0])
     return -1

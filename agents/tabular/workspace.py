@@ -37,6 +37,7 @@ class Workspace:
             masks,
             *agent.room,
             handles_of([rng]),
+            agent.memory,
         )
         # Looked up once: finding a field takes longer than filling it.
         self.fields = {name: self.envs[name] for name in ENV.names or ()}
