@@ -24,6 +24,7 @@ from pipeline.stopping import stops_noticed
 if TYPE_CHECKING:
     from pipeline.models.model_choice import ChosenModel, ModelRequest
 
+FRAMES = whole_number(1, 60)
 STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
 RUN_NUMBER = whole_number(0, besides={-1: "the run without a number"})
 
@@ -108,6 +109,12 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
         help="how to watch (default: human where there is a display, else none)",
     )
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
+    add(
+        "--fps",
+        type=FRAMES,
+        metavar="N",
+        help="pictures a second of --render ansi on a terminal (default: 4)",
+    )
     add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
     add("--reward-log", metavar="DIR", help="write the returns there too, as Monitor's CSV files")
     add("--verbose", type=VERBOSITY, default=1, help="0 for no output (default: 1)")
@@ -172,6 +179,7 @@ def _play(args: argparse.Namespace) -> int:
         monitor_folder=Path(args.reward_log) if args.reward_log else None,
         norm_reward=args.norm_reward,
         num_threads=args.num_threads,
+        **({} if args.fps is None else {"fps": args.fps}),
     )
     play(console, chosen, request)
     return 0

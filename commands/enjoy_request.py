@@ -45,6 +45,8 @@ def check_playing(args: argparse.Namespace) -> None:
     """
     if args.progress:
         raise UserError("-P: there is no bar; each episode is printed as it ends")
+    if args.fps is not None and args.render != "ansi":
+        raise UserError("--fps is the pace of --render ansi: give that too")
     if args.n_envs > 1 and (args.record is not None or args.render in ("human", "ansi")):
         flag = "--record" if args.record is not None else f"--render {args.render}"
         raise UserError(f"{flag} shows one environment: leave out --n-envs")

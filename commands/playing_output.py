@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,9 @@ import numpy as np
 import torch as th
 from rich.console import Console
 
+from commands.live_show import LiveShow
 from commands.run_output import describe, episodes, print_refusal
+from envs.layout import DOWN, LEFT, RIGHT, UP, grid_layout
 from pipeline.errors import UserError
 from pipeline.evaluation.asked_policies import why_not_exact
 from pipeline.evaluation.exact import exact_evaluator, model_refusal
@@ -22,8 +24,11 @@ from pipeline.models.model_choice import ChosenModel
 from pipeline.models.model_loading import load_to_play
 from pipeline.models.normalization import with_normalised_rewards
 from pipeline.playing import KEPT_MODES, FrameTaker, RenderMode, play_episodes, playing_env
-from pipeline.signs_of_life import Activity, doing
+from pipeline.signs_of_life import Activity, can_move, doing
 from pipeline.train_spec import TrainSpec
+
+FRAMES_PER_SECOND = 4
+_WORDS = {UP: "up", DOWN: "down", LEFT: "left", RIGHT: "right"}
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,7 @@ class PlayingRequest:
         monitor_folder: where to write the returns of the episodes, or None.
         norm_reward: count rewards as training normalised them.
         num_threads: torch threads; below 1 for PyTorch's own choice.
+        fps: pictures a second of ``"ansi"`` on a terminal.
     """
 
     n_episodes: int | None = 10
@@ -52,6 +58,7 @@ class PlayingRequest:
     monitor_folder: Path | None = None
     norm_reward: bool = False
     num_threads: int = 1
+    fps: int = FRAMES_PER_SECOND
 
     @property
     def mode(self) -> RenderMode | None:
@@ -83,6 +90,13 @@ class _Show:
     steps: int = 0
     returns: list[float] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
+
+    def shown(self) -> AbstractContextManager[None]:
+        # Pictures of letters show by themselves that something goes on.
+        return nullcontext() if self.mode == "ansi" else self.activity.shown()
+
+    def before_step(self, obs: Any, actions: Any) -> None:
+        """Nothing: what is drawn is shown afterwards."""
 
     def after_step(self, done: bool) -> None:
         self.steps += 1
@@ -122,23 +136,33 @@ def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None
             env = with_normalised_rewards(env)
         model = load_to_play(spec.algo, chosen.file, env, spec.device, spec.user_modules)
         env.seed(spec.seed)
-    show = _Show(Activity(console, "playing"), request.mode, FrameTaker(env))
-    # Pictures of letters show by themselves that something goes on.
-    with nullcontext() if request.mode == "ansi" else show.activity.shown():
+    show = _show_of(console, request, model, env)
+    with show.shown():
         for total_return, length in play_episodes(
             model,
             env,
             request.n_episodes,
             request.n_steps,
             deterministic=request.deterministic,
+            before_step=show.before_step,
             after_step=show.after_step,
         ):
             show.after_episode(total_return, length)
     env.close()
-    if request.film is not None:
+    if request.film is not None and isinstance(show, _Show):
         _write_film(console, request.film, show.frames)
     _print_returns(console, show.returns, show.lengths)
     _print_exact(console, spec, model, request.deterministic)
+
+
+def _show_of(console: Console, request: PlayingRequest, model: Any, env: Any) -> _Show | LiveShow:
+    """What shows it: one picture that moves where it can, else what is drawn as it comes."""
+    taker = FrameTaker(env)
+    if request.mode != "ansi" or not can_move(console) or console.quiet:
+        return _Show(Activity(console, "playing"), request.mode, taker)
+    layout = grid_layout(env.unwrapped.envs[0])
+    names = tuple(_WORDS.get(move, str(move)) for move in layout.moves) if layout else ()
+    return LiveShow(console, model, taker, request.fps, names)
 
 
 def _write_film(console: Console, path: Path, frames: list[Any]) -> None:

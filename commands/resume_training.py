@@ -29,6 +29,7 @@ from pipeline.train_spec import TrainSpec
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from pipeline.preparation import Training
     from pipeline.training import Outcome
 
 # What may be given beside --resume: how it is shown, kept and imported, and not what is done.
@@ -95,7 +96,7 @@ def _check_given(args: argparse.Namespace) -> None:
 
 
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
-    from commands.run_output import print_header, print_line, print_outcome
+    from commands.run_output import print_header, print_line, print_outcome, write_watched
     from commands.terminal import TextConsole
     from pipeline.run_folder import INTERRUPTED
     from pipeline.run_lock import at_work_on, check_left
@@ -111,8 +112,9 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
             lock.enter_context(at_work_on(run, partial(print_line, console)))
         if is_finished(run):
             return _nothing_to_do(args, run, console)
-        outcome = _carried_out(args, run, spec, console)
+        training, outcome = _carried_out(args, run, spec, console)
         print_outcome(console, spec, outcome)
+        write_watched(console, training)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 
@@ -123,8 +125,10 @@ def _nothing_to_do(args: argparse.Namespace, run: Run, console: Console) -> int:
     return 0
 
 
-def _carried_out(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console) -> Outcome:
-    """What comes out of the run, from its newest state on."""
+def _carried_out(
+    args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console
+) -> tuple[Training, Outcome]:
+    """The run and what comes out of it, from its newest state on."""
     from commands.run_output import print_line
     from pipeline.library_loading import loading_libraries
     from pipeline.resuming.state_keeping import StateKeeping
@@ -143,4 +147,4 @@ def _carried_out(args: argparse.Namespace, run: Run, spec: TrainSpec, console: C
         else:
             say(f"going on from step {keeping.state.note['steps']:,}")
         training = prepare(spec, console, {}, command_line(), run, keeping)
-    return carry_out(training)
+    return training, carry_out(training)

@@ -20,6 +20,7 @@ from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from pipeline.evaluation.sampled import Evaluation
+    from pipeline.preparation import Training
     from pipeline.pull_recording import PullSummary
     from pipeline.training import Outcome
 
@@ -169,3 +170,16 @@ def _brief(value: object) -> str:
     """A setting as the header shows it; a whole map would fill the screen."""
     text = str(value)
     return text if len(text) <= _LONGEST_SETTING else f"{text[:_LONGEST_SETTING]}..."
+
+
+def write_watched(console: Console, training: Training) -> None:
+    """Write the page that plays the training, where one was asked for, and say so."""
+    path = training.spec.watch_learning
+    if training.watch is None or path is None:
+        return
+    from pipeline.signs_of_life import doing
+    from report.learning_page import write_learning_page
+
+    with doing(console, "writing the page that plays the training"):
+        write_learning_page(training.spec, training.watch, path)
+    console.print(f"learning {path}", markup=False, highlight=False, soft_wrap=True)

@@ -59,6 +59,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         print_outcome,
         print_refusal,
         telling_what_is_kept,
+        write_watched,
     )
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
@@ -86,6 +87,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         ):
             outcome = carry_out(training)
         print_outcome(console, spec, outcome)
+        write_watched(console, training)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 

@@ -14,8 +14,11 @@ from commands.flag_values import (
     VERBOSITY,
     filled,
     save_interval,
+    whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, program_name
+
+WATCHED = whole_number(1, besides={0: "those of the first 5,000 steps"})
 
 # The flags of a run that was cut off, by the names of their values.
 RESUMING = ("resume", "resume_or_start", "save_state_every", "keep_state")
@@ -157,3 +160,17 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         help="0 silent, 1 progress and summary (default), 2 the library's tables as well",
     )
     add("-P", "--progress", action="store_true", help="a live bar even without a terminal")
+    add(
+        "--watch-learning",
+        type=filled,
+        metavar="FILE",
+        help="write a page (.html) that plays the training: each update of a table, or what a "
+        "network does in each state, at every evaluation",
+    )
+    add(
+        "--watch-episodes",
+        type=WATCHED,
+        default=0,
+        metavar="N",
+        help="episodes that it shows of tables (default: those of the first 5,000 steps)",
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from dataclasses import fields
 from pathlib import Path
 from secrets import randbelow
@@ -51,12 +52,31 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
         "user_modules": modules,
         "unique_id": args.uuid,
         "final_episodes": args.eval_episodes,
+        "watch_learning": _page_path(args),
     }
     spec = TrainSpec(**{**named, **changed})
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
         raise UserError("how long to train? give -n STEPS or --n-episodes EPISODES")
     check_fit(spec)
     return spec
+
+
+def _page_path(args: argparse.Namespace) -> Path | None:
+    """Where the page is to be written that shows the learning; None where none is asked for."""
+    if args.watch_learning is None:
+        if args.watch_episodes:
+            raise UserError("--watch-episodes says how much --watch-learning shows: give that too")
+        return None
+    path = Path(args.watch_learning)
+    if path.suffix != ".html":
+        raise UserError(f"--watch-learning writes a .html file, not {path.name!r}")
+    if not path.absolute().parent.is_dir():
+        raise UserError(f"--watch-learning: there is no folder {path.parent}")
+    if not os.access(path.absolute().parent, os.W_OK):
+        raise UserError(f"--watch-learning: nothing can be written in {path.parent}")
+    if path.is_dir():
+        raise UserError(f"--watch-learning: {path} is a folder")
+    return path
 
 
 def _raw_hyperparams(args: argparse.Namespace) -> dict[str, Any]:

@@ -76,6 +76,7 @@ def play_episodes(
     n_steps: int | None = None,
     *,
     deterministic: bool = True,
+    before_step: Callable[[Any, Any], object] = lambda obs, actions: None,
     after_step: Callable[[bool], object] = lambda done: None,
 ) -> Iterator[tuple[float, int]]:
     """Play until so many episodes have ended, or so many steps are done.
@@ -87,6 +88,7 @@ def play_episodes(
         n_episodes: how many episodes; None for any number.
         n_steps: how many steps at most, over all environments; None for any number.
         deterministic: the policy's best actions rather than samples of them.
+        before_step: told before each step what the agent observes, and what it will do.
         after_step: told after each step whether it ended an episode of the first environment.
 
     Yields:
@@ -106,6 +108,7 @@ def play_episodes(
     steps = 0
     while any(due > 0) and (n_steps is None or steps < n_steps):
         actions, state = choose(obs, state=state, episode_start=starts, deterministic=deterministic)
+        before_step(obs, actions)
         obs, _, starts, infos = env.step(actions)
         steps += env.num_envs
         after_step(bool(starts[0]))

@@ -64,6 +64,9 @@ from pipeline.training_callbacks import (
     named_callbacks,
     pull_recorder,
 )
+from pipeline.watching.map_recorder import MapRecorder
+from pipeline.watching.table_recorder import TableRecorder
+from pipeline.watching.watch_choice import Watch, watch_of
 from pipeline.worker_processes import close_environments, end_workers_after_stop
 
 
@@ -83,6 +86,7 @@ class Training:
         pulls: keeps every pull, on bandits; else None, and where a compiled loop was asked for.
         refusal: why the model that the environment brings is not believed; None if it is.
         trained_digest: that of the zip that the agent goes on from; None for a new agent.
+        watch: keeps how the agent learns, for a page; None where nobody asked for one.
     """
 
     spec: TrainSpec
@@ -97,6 +101,7 @@ class Training:
     pulls: PullRecorder | None = None
     refusal: str | None = None
     trained_digest: str | None = None
+    watch: Watch | None = None
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
@@ -167,7 +172,10 @@ def set_up(
     # In this order: of a broken number nothing is kept, and no other callback sees a moment that a
     # training goes back from.
     first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
-    saver.root = all_callbacks(spec, [*first, *filter(None, [pulls]), evaluation], display)
+    watch = _watch(spec, model, exact, evaluation)
+    steps = watch if isinstance(watch, TableRecorder) else None
+    others = [*filter(None, [pulls, steps]), evaluation]
+    saver.root = all_callbacks(spec, [*first, *others], display)
     refusal = None if evaluation.value_maps is not None else model_refusal(spec)
     return Training(
         spec,
@@ -182,7 +190,21 @@ def set_up(
         pulls,
         refusal,
         None if trained is None else trained.digest,
+        watch,
     )
+
+
+def _watch(
+    spec: TrainSpec,
+    model: BaseAlgorithm,
+    exact: ExactEvaluator | None,
+    evaluation: EvaluationCallback,
+) -> Watch | None:
+    """What keeps how the agent learns; one that looks at evaluations is told of them from now."""
+    watch = watch_of(spec, model, exact)
+    if isinstance(watch, MapRecorder):
+        evaluation.callback = watch
+    return watch
 
 
 def _n_eval_envs(spec: TrainSpec, model: BaseAlgorithm, *, is_exact: bool) -> int:

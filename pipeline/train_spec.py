@@ -10,7 +10,7 @@ from typing import Any, Self
 from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.user_modules import UserModule
 
-_PATHS = ("log_folder", "tensorboard_log", "trained_agent")
+_PATHS = ("log_folder", "tensorboard_log", "trained_agent", "watch_learning")
 
 
 @dataclass(frozen=True)
@@ -48,6 +48,9 @@ class TrainSpec:
         user_modules: the same, as another process can import them.
         unique_id: give the folder a name that no other machine's run can have.
         pictures: draw the learning curve and the like into the run folder.
+        watch_learning: file of a page that plays the training step by step, or None.
+        watch_episodes: how many episodes that page shows of an agent with tables; 0 for as many as
+            there are in its first steps.
     """
 
     algo: str
@@ -75,6 +78,8 @@ class TrainSpec:
     user_modules: tuple[UserModule, ...] = ()
     unique_id: bool = False
     pictures: bool = True
+    watch_learning: Path | None = None
+    watch_episodes: int = 0
 
     def as_data(self) -> dict[str, Any]:
         """The spec as JSON."""

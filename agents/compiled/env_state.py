@@ -21,6 +21,7 @@ from agents.compiled.episodes import Episodes
 from agents.compiled.finite_model import FINITE_ENV
 from agents.compiled.kept_worlds import World
 from agents.compiled.mountain_car import CAR_STATE, MOUNTAIN_CAR_ENV, MountainCar
+from agents.compiled.training_records import env_records
 from mdp.array_types import Floats
 
 # Python's sum of floats makes up for rounding from this version on.
@@ -48,7 +49,7 @@ class EnvStates:
     def __init__(self, vec_env: DummyVecEnv, world: World) -> None:
         self.vec_env = vec_env
         self.vector_state, self._record_type = VECTOR_STATES.get(type(world), ((), FINITE_ENV))
-        self.records = np.zeros(vec_env.num_envs, dtype=self.record_type())
+        self.records = env_records(vec_env.num_envs, self.record_type())
         self.monitors = [monitor_of(env) for env in vec_env.envs]
         # Monitor holds the rewards of the episode that is under way: so must we.
         self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]

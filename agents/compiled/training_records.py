@@ -7,6 +7,7 @@ learning itself.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 SCHEDULE = np.dtype(
     [(name, np.float64) for name in ("kind", "start", "end", "end_fraction")], align=True
@@ -29,6 +30,8 @@ _ENV_FIELDS = [
     ("new_obs", np.int64),  # after it
     ("next_action", np.int64),  # committed to, or UNDECIDED
     ("uniform", np.float64),  # in [0, 1), for updates that are partly random
+    ("target", np.float64),  # of the last update, where the agent tells; else nan
+    ("td_error", np.float64),  # likewise
 ]
 
 UNDECIDED = -1
@@ -38,6 +41,13 @@ def env_dtype(*state: tuple[str, type]) -> np.dtype[np.void]:
     """The record of an environment whose own state has these fields."""
     # First: behind the others they would make the record a subtype of `ENV` in Numba's eyes.
     return np.dtype([*state, *_ENV_FIELDS], align=True)
+
+
+def env_records(n: int, kind: np.dtype[np.void]) -> NDArray[np.void]:
+    """Records of n environments that nothing was learnt in yet, of a type from `env_dtype`."""
+    records = np.zeros(n, dtype=kind)
+    records["target"] = records["td_error"] = np.nan
+    return records
 
 
 # An environment that is stepped outside of compiled code keeps its state to itself.

@@ -84,8 +84,8 @@ class TabularAlgorithm(EpisodeKeeper):
     learn_from_step = td_learning
     commit = no_commitment
 
-    _rebuilt = (*EpisodeKeeper._rebuilt, "_in_use")
-    not_in_snapshots = ("_in_use",)
+    _rebuilt = (*EpisodeKeeper._rebuilt, "_in_use", "last_steps")
+    not_in_snapshots = ("_in_use", "last_steps")
 
     def __init__(
         self,
@@ -123,6 +123,8 @@ class TabularAlgorithm(EpisodeKeeper):
         self.engine_in_use = ""
         self.mean_td_error = 0.0
         self._in_use: Workspace | None = None
+        # A record for each environment, with target and TD error of its last update.
+        self.last_steps: NDArray[np.void] | None = None
         super().__init__(policy, env, learning_rate, tie_breaking, policy_kwargs, **kwargs)
 
     def _check_arguments(self) -> None:
@@ -200,7 +202,7 @@ class TabularAlgorithm(EpisodeKeeper):
         super()._run(total_timesteps, callback, log_interval)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_in_use": None}
+        return {**super().__getstate__(), "_in_use": None, "last_steps": None}
 
     def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Write what the compiled loop goes on from into its records."""
@@ -210,6 +212,7 @@ class TabularAlgorithm(EpisodeKeeper):
     def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
         """Go on from where the compiled loop is."""
         super().take_over(envs, progress)
+        self.last_steps = envs
         self.mean_td_error = float(progress["mean_td_error"][0])
 
     def _present_workspace(self) -> Workspace:
@@ -242,6 +245,7 @@ class TabularAlgorithm(EpisodeKeeper):
         if self.asks_for_masks:
             self._note_next_masks(transitions)
         self._in_use = workspace = self._present_workspace()
+        self.last_steps = workspace.envs
         self.mean_td_error = workspace.learn(transitions)
         self._n_updates += self.n_envs
 

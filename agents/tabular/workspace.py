@@ -8,7 +8,7 @@ import numpy as np
 
 from agents.common.online import Transitions
 from agents.compiled.generators import handles_of
-from agents.compiled.training_records import ENV, PROGRESS, UNDECIDED
+from agents.compiled.training_records import ENV, PROGRESS, UNDECIDED, env_records
 from agents.tabular.temporal_difference import TabularAgent, act_in_all, learn_from_all
 from mdp.array_types import Bools, Ints
 
@@ -25,7 +25,7 @@ class Workspace:
 
     def __init__(self, agent: TabularAgent, masks: Bools, rng: np.random.Generator, n: int) -> None:
         self.rng = rng  # the handle does not keep it alive
-        self.envs = np.zeros(n, dtype=ENV)
+        self.envs = env_records(n, ENV)
         self.envs["next_action"] = UNDECIDED
         self.progress = np.zeros(1, dtype=PROGRESS)
         # In the order that `act_in_all` and `learn_from_all` take them in.

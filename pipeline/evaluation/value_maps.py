@@ -101,6 +101,11 @@ def _deterministic_policy(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> In
     """What the agent does at each step in each state, shape (1 or horizon, S)."""
     if evaluator.layout is None or evaluator.model.n_states > MAX_STATES:
         return None
+    return best_actions_of(evaluator, agent)
+
+
+def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
+    """What the agent does at each step in each state, shape (1 or horizon, S); None if it draws."""
     policy = evaluator.policy(agent, deterministic=True)
     if np.issubdtype(policy.dtype, np.integer):
         return np.atleast_2d(policy).astype(np.int64)

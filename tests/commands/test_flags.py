@@ -1,6 +1,7 @@
 """From flags to specifications: a flag reaches the field that has its name."""
 
 from dataclasses import fields
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +11,7 @@ from commands.study_request import study_spec
 from commands.train_request import train_spec
 from experiments.study_plan import plan
 from experiments.study_spec import StudySpec
+from pipeline.errors import UserError
 from pipeline.train_spec import TrainSpec
 
 TRAIN = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
@@ -37,6 +39,27 @@ COMPARE = ["--algos", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
 def test_a_flag_of_train_reaches_the_specification(words, name, value):
     args = train_agent.build_parser().parse_args([*TRAIN, *words])
     assert getattr(train_spec(args), name) == value
+
+
+def test_the_page_that_plays_a_training(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def spec_of(*words):
+        return train_spec(train_agent.build_parser().parse_args([*TRAIN, *words]))
+
+    page = ("--watch-learning", "page.html")
+    assert (spec_of(*page).watch_learning, spec_of(*page).watch_episodes) == (Path("page.html"), 0)
+    assert spec_of(*page, "--watch-episodes", "3").watch_episodes == 3
+    for words, complaint in [
+        (("--watch-episodes", "3"), "says how much --watch-learning shows: give that too"),
+        (("--watch-learning", "page.pdf"), "writes a .html file, not 'page.pdf'"),
+        (("--watch-learning", "no/page.html"), "there is no folder no"),
+    ]:
+        with pytest.raises(UserError, match=complaint):
+            spec_of(*words)
+    (tmp_path / "page.html").mkdir()
+    with pytest.raises(UserError, match=r"page\.html is a folder"):
+        spec_of(*page)
 
 
 def test_without_flags_a_run_is_the_default_one():

@@ -116,8 +116,11 @@ def training_of(spec, keeping, run=None):
     return prepare(spec, Console(quiet=True), {}, "", run, keeping)
 
 
+OFF = StateKeeping(SaveInterval(is_off=True))
+
+
 def undisturbed(spec):
-    return train(spec, Console(quiet=True), {}, "", keeping=StateKeeping(SaveInterval(is_off=True)))
+    return train(spec, Console(quiet=True), {}, "", keeping=OFF)
 
 
 def until_cut_off(training, monkeypatch, n_states=2, steps=7):
@@ -222,6 +225,30 @@ def test_so_it_is_where_a_trained_agent_goes_on(tmp_path, monkeypatch, env_id, a
     run = cut_off(spec_of(tmp_path / "parts", env_id, algo, 600, settings, **trained), monkeypatch)
     assert gone_on(run).n_steps == whole.n_steps > 600
     assert_same(whole.run, run)
+
+
+@pytest.mark.parametrize("algo", ["double_qlearning", "dqn"])
+def test_a_run_that_is_watched_goes_on_being_watched(tmp_path, monkeypatch, algo):
+    watched = {"watch_learning": tmp_path / "page.html"}
+    settings = EAGER if algo == "dqn" else {}
+    whole = training_of(spec_of(tmp_path / "whole", GRID, algo, 300, settings, **watched), OFF)
+    carry_out(whole)
+    spec = spec_of(tmp_path / "parts", GRID, algo, 300, settings, **watched)
+    run = cut_off(spec, monkeypatch)
+    keeping = go_on(run, StateKeeping(SaveInterval(is_off=True)), pytest.fail)
+    recorded = replace(recorded_training(run, ()), verbose=0, pictures=False)
+    assert recorded.watch_learning == watched["watch_learning"]
+    rest = training_of(recorded, keeping, run)
+    carry_out(rest)
+    if algo == "dqn":
+        pairs = zip(whole.watch.moments, rest.watch.moments, strict=True)
+        assert all(
+            one[:2] == other[:2] and np.array_equal(one[2:], other[2:]) for one, other in pairs
+        )
+        return
+    for name in ("steps", "moves", "changes"):
+        assert getattr(whole.watch, name).rows.tobytes() == getattr(rest.watch, name).rows.tobytes()
+    assert len(whole.watch.steps) == 300
 
 
 def test_a_state_makes_the_difference(tmp_path, monkeypatch):

@@ -1,0 +1,197 @@
+"""Keeps every step of the first episodes of an agent that learns in tables.
+
+Which entries have moved is seen by holding the tables before an update against those after it, so
+that a rule may move one entry or many, in any of its tables. Target and TD error are those that the
+update worked with, where the agent tells them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.common.callback_horizons import BlockCallback, Horizon
+from agents.common.online import true_outcome
+from mdp.array_types import Floats
+from pipeline.watching.growing_rows import GrowingRows
+
+# All that a page of three megabytes can hold, and what it holds where nobody says how much.
+MOST_MOVES = 20_000
+MOST_CHANGES = 60_000
+MOVES_UNASKED = 5_000
+MOST_ENTRIES = 100_000
+
+# What ended with a step.
+GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
+NO_STATE = -1
+
+# One step of all environments.
+STEP = np.dtype(
+    [
+        ("timesteps", np.int64),  # after it, over all environments
+        ("exploration", np.float64),
+        ("learning_rate", np.float64),  # nan where it is no number of the schedule's
+    ]
+)
+# What one environment did in it.
+MOVE = np.dtype(
+    [
+        ("step", np.int64),  # number of the step
+        ("env", np.int64),
+        ("episode", np.int64),  # of this environment, from 0 on
+        ("obs", np.int64),  # `NO_STATE` where observations are no numbers
+        ("action", np.int64),
+        ("reward", np.float64),
+        ("next_obs", np.int64),  # before any reset
+        ("end", np.int64),
+        ("target", np.float64),  # nan where nothing was learnt, or the agent does not tell
+        ("td_error", np.float64),
+        ("episode_return", np.float64),  # sum of the rewards so far
+    ]
+)
+# An entry that moved in it.
+CHANGE = np.dtype(
+    [
+        ("step", np.int64),
+        ("table", np.int64),
+        ("entry", np.int64),  # place in the table as one row
+        ("after", np.float64),
+    ]
+)
+
+
+class TableRecorder(BlockCallback):
+    """Records the first episodes of a training; it changes nothing of it.
+
+    Args:
+        n_episodes: how many, over all environments; 0 for those of the first 5000 steps.
+
+    Attributes:
+        names: of the tables.
+        has_actions: whether the first of them has a number for each state and action.
+        initial: the tables before the first step, by their names.
+        steps, moves, changes: records of types `STEP`, `MOVE` and `CHANGE`.
+        is_cut: whether there were more steps in these episodes than are kept.
+    """
+
+    def __init__(self, n_episodes: int) -> None:
+        super().__init__()
+        self.n_episodes = n_episodes
+        self.names: list[str] = []
+        self.has_actions = False
+        self.initial: dict[str, Floats] = {}
+        self.steps = GrowingRows(STEP)
+        self.moves = GrowingRows(MOVE)
+        self.changes = GrowingRows(CHANGE)
+        self.is_full = False
+        self.is_cut = False
+        self._tables: list[Floats] = []  # as they were last
+        self._obs: Any = None
+        self._returns = np.zeros(0)
+        self._episodes = np.zeros(0, dtype=np.int64)
+
+    def horizon(self) -> Horizon:
+        """After each step, as long as steps are kept."""
+        return Horizon() if self.is_full else Horizon(calls=1)
+
+    def _on_rollout_start(self) -> None:
+        if self.is_full:
+            return
+        if not self.initial:
+            self.initial = {name: table.copy() for name, table in tables_of(self.model).items()}
+            self.names = [*self.initial]
+            self.has_actions = has_actions(self.model, self.initial[self.names[0]])
+            self._tables = [table.copy() for table in self.initial.values()]
+            self._returns = np.zeros(self.model.n_envs)
+            self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)
+        self._obs = np.array(self.model._last_obs)
+
+    def _on_step(self) -> bool:
+        if not self.is_full:
+            self._note_moves()
+        return True
+
+    def _note_moves(self) -> None:
+        """What was done; what is learnt from it comes afterwards."""
+        agent: Any = self.model
+        told = self.locals
+        next_obs, terminated = true_outcome(told["new_obs"], told["dones"], told["infos"])
+        self._returns += told["rewards"]
+        moves = np.zeros(agent.n_envs, dtype=MOVE)
+        moves["step"], moves["env"] = len(self.steps), np.arange(agent.n_envs)
+        moves["episode"], moves["episode_return"] = self._episodes, self._returns
+        moves["obs"], moves["next_obs"] = self._numbers(self._obs), self._numbers(next_obs)
+        moves["action"], moves["reward"] = told["actions"], told["rewards"]
+        moves["end"] = np.where(told["dones"], np.where(terminated, TERMINATED, TRUNCATED), GOES_ON)
+        moves["target"] = moves["td_error"] = np.nan
+        self.steps.append(self.num_timesteps, agent.exploration_rate, _learning_rate(agent))
+        self.moves.extend(moves)
+        self._returns[told["dones"]] = 0.0
+        self._episodes[told["dones"]] += 1
+
+    def _on_rollout_end(self) -> None:
+        if self.is_full or not len(self.steps):
+            return
+        agent: Any = self.model
+        told = getattr(agent, "last_steps", None)
+        if told is not None:
+            last = self.moves.rows[-agent.n_envs :]
+            last["target"], last["td_error"] = told["target"], told["td_error"]
+        for number, now in enumerate(tables_of(agent).values()):
+            before = self._tables[number]
+            moved = np.flatnonzero(before != now)
+            if len(moved):
+                self._note_changes(number, moved, now)
+        self._look_whether_full()
+
+    def _note_changes(self, number: int, moved: Any, now: Floats) -> None:
+        changes = np.zeros(len(moved), dtype=CHANGE)
+        changes["step"], changes["table"] = len(self.steps) - 1, number
+        changes["entry"], changes["after"] = moved, now.reshape(-1)[moved]
+        self.changes.extend(changes)
+        self._tables[number].reshape(-1)[moved] = changes["after"]
+
+    def _look_whether_full(self) -> None:
+        if self.n_episodes and self._episodes.sum() >= self.n_episodes:
+            self.is_full = True
+            return
+        most = MOST_MOVES if self.n_episodes else MOVES_UNASKED
+        has_room = len(self.moves) + self.model.n_envs <= most
+        self.is_full = not has_room or len(self.changes) > MOST_CHANGES
+        self.is_cut = self.is_full
+
+    def _numbers(self, observations: Any) -> Any:
+        is_number = isinstance(self.model.observation_space, spaces.Discrete)
+        return observations if is_number else NO_STATE
+
+
+def tables_of(agent: BaseAlgorithm) -> dict[str, Floats]:
+    """The tables that an agent learns in, by name, in the agent's own memory.
+
+    First comes one with a number for each state (or for all as one) and action, if there is one.
+    """
+    tables = {
+        name: buffer.numpy()
+        for name, buffer in agent.policy.named_buffers()
+        if buffer.is_floating_point()
+    }
+    return dict(sorted(tables.items(), key=lambda item: not has_actions(agent, item[1])))
+
+
+def has_actions(agent: BaseAlgorithm, table: Floats) -> bool:
+    """Whether a table has a row for each state, or one for all, with a number for each action."""
+    states, actions = agent.observation_space, agent.action_space
+    if not isinstance(states, spaces.Discrete) or not isinstance(actions, spaces.Discrete):
+        return False
+    return table.ndim > 1 and table.shape[-1] == actions.n and table.shape[-2] in (states.n, 1)
+
+
+def _learning_rate(agent: Any) -> float:
+    """What its schedule says; nan for agents that go by no schedule."""
+    if agent.averages_samples or agent.learning_rate == 0.0:
+        return math.nan
+    return float(agent.lr_schedule(agent._current_progress_remaining))

@@ -1,0 +1,136 @@
+"""``enjoy.py --render ansi`` on a terminal: one picture in its place, with figures beside it."""
+
+import io
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import train
+from commands import live_show, playing_output
+from commands.enjoy_agent import build_parser
+from commands.enjoy_request import check_playing
+from commands.live_show import LiveShow, figures_table
+from commands.playing_output import PlayingRequest, play
+from commands.terminal import TextConsole
+from pipeline.action_figures import ActionFigures
+from pipeline.errors import UserError
+from pipeline.models.model_choice import ModelRequest, choose_model
+
+REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty
+
+
+@pytest.fixture
+def lake(monkeypatch, tmp_path):
+    """An agent on ice that is not slippery, which walks straight to the goal or into a wall."""
+    monkeypatch.chdir(tmp_path)
+    agent = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--env-kwargs", "is_slippery:False"]
+    words = ["-n", "3000", "--seed", "0", "--verbose", "0"]
+    monkeypatch.setattr("sys.argv", ["train.py", *agent, *words])
+    assert train.main() == 0
+    return choose_model(ModelRequest(algo="qlearning", env_id="FrozenLake-v1"))
+
+
+@pytest.fixture
+def pauses(monkeypatch):
+    """How long it would have waited between pictures."""
+    waited = []
+    clock = SimpleNamespace(sleep=waited.append, monotonic=time.monotonic)
+    monkeypatch.setattr(live_show, "time", clock)
+    return waited
+
+
+def played(chosen, width=100, **fields):
+    console = TextConsole(file=io.StringIO(), force_terminal=True, width=width, height=40)
+    play(console, chosen, PlayingRequest(render="ansi", **fields))
+    return console.file.getvalue()
+
+
+def test_pictures_replace_each_other_at_their_pace(lake, pauses, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    shown = played(lake, n_episodes=2, fps=5)
+    # Six steps to the goal: seven pictures an episode.
+    assert pauses == [0.2] * 14
+    assert shown.count("step 0") == 2
+    assert shown.count(REPLACED) > 0
+    assert "episode 1: return 1.00, 6 steps" in shown
+    assert "return 1.00 ± 0.00 over 2 episodes" in without_style(shown)
+    # The last picture is the goal, with no step to come.
+    last = shown.rindex("episode 2, step 6")
+    assert "value" not in shown[last:]
+
+
+def test_what_the_table_holds_stands_beside_the_map(lake, pauses, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    shown = played(lake, n_episodes=1)
+    first = shown[: shown.index("step 1")]
+    for name in ("left", "down", "right", "up"):
+        assert name in first
+    model = playing_output.load_to_play("qlearning", lake.file, None, "cpu", ())
+    for number in model.policy.q_table[0]:
+        assert f"{number:.4g}" in first
+    assert any("SFFF" in line and "left" in line for line in without_style(first).splitlines())
+    # Where there is no room beside the map, they stand below it.
+    narrow = without_style(played(lake, width=30, n_episodes=1))
+    assert any(line.strip() == "SFFF" for line in narrow.splitlines())
+
+
+def without_style(text):
+    from rich.text import Text
+
+    return Text.from_ansi(text).plain
+
+
+def test_elsewhere_pictures_stand_one_below_the_other(lake, pauses):
+    console = TextConsole(file=io.StringIO())
+    play(console, lake, PlayingRequest(render="ansi", n_episodes=1))
+    shown = console.file.getvalue()
+    assert without_style(shown).count("SFFF") == 7
+    assert pauses == []
+    assert REPLACED not in shown
+    assert "value" not in shown
+
+
+def test_a_playing_that_is_broken_off_shows_where_it_was(lake, pauses, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    assert "episode 1, step 3" in played(lake, n_episodes=None, n_steps=3)
+
+
+def test_bars_lie_between_the_lowest_and_the_highest():
+    table = figures_table(ActionFigures("value", np.array([-1.0, 0.0, 3.0])), 2, ("a", "b"))
+    console = TextConsole(file=io.StringIO(), width=60)
+    console.print(table)
+    rows = [line.split() for line in console.file.getvalue().splitlines()]
+    assert rows[1:] == [["a", "-1"], ["b", "0", "###"], [">", "2", "3", "#" * 12]]
+
+
+def test_of_many_actions_the_chosen_one_is_among_those_shown():
+    table = figures_table(ActionFigures("value", np.arange(100.0)), 99, ())
+    assert table.row_count == 1 + 20 + 1
+
+
+def test_what_an_environment_draws_moves_no_cursor(pauses, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    console = TextConsole(file=io.StringIO(), force_terminal=True, width=60)
+    frames = [["\x1b[2J\x1b]0;taken\x07[red]S\x1b[31mR\x1b[0m"]]
+    taker = SimpleNamespace(take=lambda done: frames.pop() if frames else [])
+    agent = SimpleNamespace(policy=None, action_space=None)
+    show = LiveShow(console, agent, taker, 4)
+    with show.shown():
+        show.before_step(np.array([0]), np.array([0]))
+    shown = console.file.getvalue()
+    assert "\x1b[2J" not in shown
+    assert "\x1b]0" not in shown
+    assert "[red]S" in shown
+
+
+def test_a_pace_is_for_letters_alone():
+    for words in (["--fps", "3"], ["--fps", "3", "--render", "none"]):
+        with pytest.raises(UserError, match="--fps is the pace of --render ansi: give that too"):
+            check_playing(build_parser().parse_args(words))
+    args = build_parser().parse_args(["--fps", "3", "--render", "ansi"])
+    check_playing(args)
+    for wrong in ("0", "61", "x"):
+        with pytest.raises(SystemExit):
+            build_parser().parse_args(["--fps", wrong])

@@ -1,0 +1,221 @@
+"""A training that is watched: what is kept of it is what the agent did, and it is not disturbed."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from rich.console import Console
+from stable_baselines3.common.env_util import make_vec_env
+
+import envs  # noqa: F401  # registers the environments
+from agents import load_algorithm
+from pipeline.errors import UserError
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+from pipeline.training import carry_out, prepare, train
+from pipeline.watching import table_recorder, watch_choice
+from pipeline.watching.table_recorder import NO_STATE, TERMINATED, TRUNCATED, TableRecorder
+
+LAKE = "FrozenLake-v1"
+
+
+class Corridor(gym.Env):
+    """Three cells and one action, forward: the rewards are 1 and 2, the last cell is the end."""
+
+    observation_space = gym.spaces.Discrete(3)
+    action_space = gym.spaces.Discrete(1)
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.cell = 0
+        return 0, {}
+
+    def step(self, action):
+        self.cell += 1
+        return self.cell, float(self.cell), self.cell == 2, False, {}
+
+
+def spec_of(env_id=LAKE, algo="qlearning", n_timesteps=300, settings=(), **fields):
+    entry = {"n_timesteps": n_timesteps, **dict(settings)}
+    common = {"seed": 3, "verbose": 0, "pictures": False, "eval_episodes": 5, "final_episodes": 5}
+    return TrainSpec(algo, env_id, split(entry), entry, **{**common, **fields})
+
+
+def watched(env, name="qlearning", n_timesteps=300, n_episodes=0, **settings):
+    """An agent that was watched while it learnt, and what was kept."""
+    recorder = TableRecorder(n_episodes)
+    agent = load_algorithm(name)(env=env, seed=1, **settings).learn(n_timesteps, recorder)
+    return agent, recorder
+
+
+def test_two_episodes_worked_by_hand():
+    """With step size and discount 1/2: targets 1, 2, then 1 + 1/2 = 1.5, 2."""
+    halves = {"learning_rate": 0.5, "gamma": 0.5}
+    _, recorder = watched(Corridor(), n_timesteps=9, n_episodes=2, **halves)
+    moves, changes = recorder.moves.rows, recorder.changes.rows
+    assert moves["target"].tolist() == [1.0, 2.0, 1.5, 2.0]
+    assert moves["td_error"].tolist() == [1.0, 2.0, 1.0, 1.0]
+    assert moves["obs"].tolist() == [0, 1, 0, 1]
+    assert moves["next_obs"].tolist() == [1, 2, 1, 2]
+    assert moves["reward"].tolist() == [1.0, 2.0, 1.0, 2.0]
+    assert moves["episode_return"].tolist() == [1.0, 3.0, 1.0, 3.0]
+    assert moves["episode"].tolist() == [0, 0, 1, 1]
+    assert moves["end"].tolist() == [0, TERMINATED, 0, TERMINATED]
+    assert changes["entry"].tolist() == [0, 1, 0, 1]
+    assert changes["after"].tolist() == [0.5, 1.0, 1.0, 1.5]
+    assert changes["step"].tolist() == [0, 1, 2, 3]
+    assert recorder.steps.rows["timesteps"].tolist() == [1, 2, 3, 4]
+    assert recorder.steps.rows["learning_rate"].tolist() == [0.5] * 4
+    # The two episodes are over: nothing was left out.
+    assert (recorder.is_full, recorder.is_cut) == (True, False)
+
+
+@pytest.mark.parametrize("engine", ["compiled", "interpreted"])
+def test_targets_are_those_of_the_rule_to_the_last_bit(engine):
+    agent, recorder = watched(LAKE, n_timesteps=2000, engine=engine, learning_rate=0.3)
+    assert agent.engine_in_use.startswith(engine)
+    table = recorder.initial["q_tables"].copy()[0]
+    changes = {row["step"]: row for row in recorder.changes.rows}
+    assert len(changes) == len(recorder.changes)  # one entry at a time
+    for move in recorder.moves.rows:
+        follows = 0.0 if move["end"] == TERMINATED else 0.99 * table[move["next_obs"]].max()
+        assert move["target"] == move["reward"] + follows
+        at = move["obs"], move["action"]
+        assert move["td_error"] == move["target"] - table[at]
+        after = table[at] + 0.3 * move["td_error"]
+        if after != table[at]:
+            change = changes[move["step"]]
+            assert (change["entry"], change["after"]) == (at[0] * 4 + at[1], after)
+            table[at] = after
+    assert np.array_equal(table, agent.policy.q_table)
+    assert table.any()
+
+
+@pytest.mark.parametrize("engine", ["compiled", "interpreted"])
+@pytest.mark.parametrize(("name", "n_envs"), [("sarsa", 1), ("double_qlearning", 3)])
+def test_who_is_watched_learns_the_same(name, n_envs, engine):
+    ended = []
+    for recorder in (None, TableRecorder(4)):
+        env = make_vec_env(LAKE, n_envs, seed=3)
+        agent = load_algorithm(name)(env=env, seed=1, engine=engine).learn(900, recorder)
+        assert agent.engine_in_use.startswith(engine)
+        ended.append((agent.policy.q_tables.numpy().tobytes(), agent.rng.bit_generator.state))
+    assert ended[0] == ended[1]
+    assert recorder.is_full
+    # It goes on to the end of the step in which the fourth episode ends.
+    assert recorder.moves.rows["end"].astype(bool).sum() >= 4
+    assert len(recorder.moves) == n_envs * len(recorder.steps)
+    assert recorder.moves.rows["env"].tolist() == [*range(n_envs)] * len(recorder.steps)
+
+
+def test_several_entries_move_in_a_step_of_several_environments():
+    _, recorder = watched(make_vec_env(LAKE, 3, seed=3), n_timesteps=30, initial_q=1.0)
+    per_step = np.bincount(recorder.changes.rows["step"])
+    assert per_step.max() == 3
+    last = recorder.moves.rows[recorder.moves.rows["step"] == 0]
+    assert np.isfinite(last["target"]).all()
+
+
+def test_where_nothing_is_learnt_there_is_no_target():
+    # Some episodes end in a hole.
+    _, recorder = watched(LAKE, n_timesteps=200, skip_terminal_update=True, initial_q=1.0)
+    moves = recorder.moves.rows
+    ends = moves["end"] == TERMINATED
+    assert ends.any()
+    assert np.array_equal(np.isnan(moves["target"]), ends)
+    assert not np.isin(moves["step"][ends], recorder.changes.rows["step"]).any()
+
+
+def test_an_episode_that_is_cut_off_still_bootstraps():
+    env = gym.make(LAKE, max_episode_steps=3, is_slippery=False)
+    _, recorder = watched(env, n_timesteps=60, initial_q=1.0, gamma=0.5)
+    cut = recorder.moves.rows[recorder.moves.rows["end"] == TRUNCATED]
+    assert len(cut) > 5
+    # Where its best next value is still the first one.
+    assert 0.5 in cut["target"]
+
+
+def test_there_is_an_end_to_what_is_kept(monkeypatch):
+    monkeypatch.setattr(table_recorder, "MOVES_UNASKED", 50)
+    monkeypatch.setattr(table_recorder, "MOST_MOVES", 80)
+    for n_episodes, kept in ((0, 50), (10_000, 80)):
+        _, recorder = watched(LAKE, n_timesteps=200, n_episodes=n_episodes)
+        assert (len(recorder.moves), recorder.is_cut) == (kept, True)
+    monkeypatch.setattr(table_recorder, "MOST_CHANGES", 9)
+    _, recorder = watched(Corridor(), n_timesteps=50)
+    assert len(recorder.changes) == 10
+
+
+@pytest.mark.parametrize(
+    ("env_id", "algo"), [("SegmentBandit-v0", "epsilon_greedy"), ("LinearBandit-v0", "linucb")]
+)
+def test_bandits_are_watched_in_their_tables(env_id, algo):
+    agent, recorder = watched(f"envs:{env_id}", algo, n_timesteps=20)
+    assert np.isnan(recorder.moves.rows["target"]).all()
+    knows_contexts = env_id == "SegmentBandit-v0"
+    assert recorder.has_actions == knows_contexts
+    assert (recorder.moves.rows["obs"][0] == NO_STATE) != knows_contexts
+    for number, name in enumerate(recorder.names):
+        table = recorder.initial[name].reshape(-1).copy()
+        for change in recorder.changes.rows:
+            if change["table"] == number:
+                table[change["entry"]] = change["after"]
+        assert np.array_equal(table, getattr(agent.policy, name).numpy().reshape(-1))
+
+
+def episodes_of(folder):
+    rows = (folder / "0.monitor.csv").read_text().splitlines()[2:]
+    return [row.split(",")[:2] for row in rows]
+
+
+def done(spec):
+    training = prepare(spec, Console(quiet=True), {}, "")
+    return training, carry_out(training)
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings"),
+    [
+        ("qlearning", {}),
+        ("dqn", {"learning_starts": 50, "buffer_size": 200}),
+        ("ppo", {"n_steps": 32, "batch_size": 32, "engine": "compiled"}),
+    ],
+)
+def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
+    spec = spec_of(algo=algo, settings=settings, log_folder=tmp_path)
+    alone = train(spec, Console(quiet=True), {}, "")
+    training, outcome = done(replace(spec, watch_learning=tmp_path / "page.html"))
+    one, other = (
+        load_algorithm(algo).load(run.run.model_path).policy.state_dict()
+        for run in (alone, outcome)
+    )
+    assert all(one[name].numpy().tobytes() == other[name].numpy().tobytes() for name in one)
+    one, other = (episodes_of(run.run.path) for run in (alone, outcome))
+    assert one == other
+    if algo == "qlearning":
+        assert len(training.watch.steps) == 300
+        return
+    steps = [moment[0] for moment in training.watch.moments]
+    evaluated = np.load(outcome.run.evaluations_path)
+    assert steps == [0, *evaluated["timesteps"]]
+    # The value of the start is the return that the evaluation computed.
+    values = [moment[2][0] for moment in training.watch.moments[1:]]
+    assert values == pytest.approx(evaluated["results"].mean(axis=1), abs=1e-12)
+    assert training.watch.moments[0][1] == (1.0 if algo == "dqn" else None)
+
+
+def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, monkeypatch):
+    page = {"log_folder": tmp_path / "logs", "watch_learning": tmp_path / "page.html"}
+    small = {"learning_starts": 50, "buffer_size": 200}
+    with pytest.raises(UserError, match="dqn on CartPole-v1 has neither"):
+        done(spec_of("CartPole-v1", "dqn", settings=small, **page))
+    with pytest.raises(UserError, match="random on FrozenLake-v1 has neither"):
+        done(spec_of(algo="random", **page))
+    with pytest.raises(UserError, match="--watch-episodes is for agents with tables: dqn"):
+        done(spec_of(algo="dqn", settings=small, watch_episodes=3, **page))
+    monkeypatch.setattr(watch_choice, "MOST_ENTRIES", 63)
+    with pytest.raises(UserError, match=r"up to 63 entries; those of qlearning on Froz.* have 64"):
+        done(spec_of(**page))
+    assert not Path(page["log_folder"]).exists()
