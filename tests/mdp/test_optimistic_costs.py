@@ -1,0 +1,122 @@
+"""Costs by cells are below what anything reaches, and come near it."""
+
+import math
+
+import numpy as np
+import pytest
+
+from envs.brackets.classic_motions import MOTIONS
+from mdp.interpolated_costs import best_action, interpolated, interpolated_costs
+from mdp.optimistic_costs import (
+    cells_of,
+    mean_cost,
+    optimistic_costs,
+    push_costs,
+    rounded_down,
+)
+from mdp.pushed_motion import moved
+
+# A sled on ice: no pull, from -1 to the goal at 1, a thousandth faster in each step at most.
+SLED = MOTIONS["MountainCar-v0"]._replace(low=-1.0, high=1.0, pull_size=0.0)
+
+
+def steps_of_a_sled(distance):
+    """The least n with 0.001 (1 + 2 + ... + n), at 0.07 at most, not below a distance."""
+    steps, done = 0, 0.0
+    while done < distance - 1e-12:
+        steps += 1
+        done += min(0.001 * steps, 0.07)
+    return steps
+
+
+def test_a_sled_takes_as_many_steps_as_worked_out():
+    cells = cells_of(SLED, 1000, 1401)
+    costs = optimistic_costs(SLED, cells)
+    for start in (-0.499, -0.1, 0.35, 0.95):
+        least = mean_cost(SLED, cells, costs, (start, start + 1e-4), (0.0, 0.0))
+        exact = steps_of_a_sled(1 - start)
+        assert exact * 0.93 - 1 <= least <= exact
+
+
+def test_finer_cells_bound_more_closely():
+    motion = MOTIONS["MountainCar-v0"]
+    bounds = []
+    for n in (200, 400, 800):
+        cells = cells_of(motion, n, n + 1)
+        costs = optimistic_costs(motion, cells)
+        bounds.append(mean_cost(motion, cells, costs, (-0.6, -0.4), (0.0, 0.0)))
+    assert bounds == sorted(bounds)
+    assert bounds[-1] > bounds[0] + 5
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_no_way_costs_less_than_its_cells_say(name):
+    """Ways at random, and those of a plan: what remains of their cost, at each state on them."""
+    motion = MOTIONS[name]._replace(horizon=60, final_cost=0.0)
+    cells = cells_of(motion, 150, 151)
+    costs, rng = optimistic_costs(motion, cells), np.random.default_rng(0)
+    plan = interpolated_costs(motion, 40, 41, motion.actions)
+    for trial in range(60):
+        states, paid = _way(motion, plan if trial % 2 else None, rng)
+        remaining = np.cumsum(paid[::-1])[::-1]
+        # The bound of a state with the whole limit ahead: of the first alone.
+        column, row = _cell(motion, cells, *states[0])
+        assert costs[column, row] <= remaining[0] + 1e-9
+
+
+def _way(motion, plan, rng):
+    position = rng.uniform(motion.low, motion.high)
+    speed = rng.uniform(-motion.most_speed, motion.most_speed)
+    states, paid = [(position, speed)], []
+    for left in range(motion.horizon)[::-1]:
+        own = motion.position_cost * position**2 + motion.speed_cost * speed**2
+        if plan is None:
+            action = rng.uniform(*motion.actions[[0, -1]])
+            action = action if motion.is_continuous else round(action)
+        else:
+            action, _ = best_action(motion, motion.actions, plan[left], position, speed)
+        paid.append(motion.step_cost + own + motion.action_cost * action**2)
+        position, speed = moved(motion, position, speed, action)
+        states.append((position, speed))
+        if position >= motion.high:
+            break
+    return states, paid
+
+
+def _cell(motion, cells, position, speed):
+    column = int((position - motion.low) / cells.width)
+    row = int((speed + motion.most_speed) / cells.height)
+    return min(column, len(cells.positions) - 1), min(row, len(cells.speeds) - 1)
+
+
+def test_rows_that_an_action_leads_into():
+    """Without pull, and rows of half a push: an action of 1 leads one to three rows further."""
+    motion = SLED._replace(most_speed=0.01, action_cost=2.0, rounding=1e-12)
+    first, costs = push_costs(motion, cells_of(motion, 3, 40))
+    assert (first == -3).all()
+    # A row further is within reach of no action too.
+    assert costs[1].tolist() == [2.0, 2.0, 0.0, 0.0, 0.0, 2.0, 2.0]
+
+
+def test_no_number_is_rounded_up():
+    values = np.array([0.1, 1 / 3, 1e10 / 7, 2.0, np.inf])
+    singles = rounded_down(values)
+    assert (singles <= values).all()
+    assert singles[3:].tolist() == [2.0, np.inf]
+    assert np.allclose(singles[:3], values[:3], rtol=2e-7)
+
+
+def test_between_nodes_costs_are_linear():
+    nodes = np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]], np.float32)
+    motion = SLED
+    assert interpolated(motion, nodes, -1.0, -0.07) == 0.0
+    assert interpolated(motion, nodes, 0.0, 0.035) == pytest.approx(5 + 1.5)
+    assert interpolated(motion, nodes, 1.0, 0.0) == 0.0, "the goal"
+
+
+def test_a_circle_wraps_and_a_wall_stops():
+    pendulum, car = MOTIONS["Pendulum-v1"], MOTIONS["MountainCar-v0"]
+    position, speed = moved(pendulum, 3.1, 7.0, 0.0)
+    assert position == pytest.approx(3.1 + 0.05 * (7 + 0.75 * math.sin(3.1)) - 2 * math.pi)
+    assert speed == pytest.approx(7 + 0.75 * math.sin(3.1))
+    assert moved(car, -1.19, -0.05, 0.0) == (-1.2, 0.0)
