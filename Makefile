@@ -26,7 +26,7 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help train test peers lint style types types-elsewhere format bench mutants wheel clean
+.PHONY: help train test peers lint style types types-elsewhere format bench mutants docs images wheel clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
@@ -64,6 +64,16 @@ bench: $(STAMP) ## Time everything, with few rounds
 
 mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N=25 SEED=0 JOBS=2
 	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED) --jobs $(JOBS)
+
+docs: $(STAMP) ## Make the site of all pages, build/site/index.html, and check its links
+	$(BIN)/python docs/scripts/fill_pages.py --check
+	rm -rf build/site
+	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/site
+	$(BIN)/python docs/scripts/check_links.py build/site
+
+images: $(STAMP) ## Draw the pictures of README and docs anew; needs Chromium for one of them
+	$(BIN)/python docs/scripts/draw_images.py
+	$(BIN)/python docs/images/bandits.py
 
 wheel: $(STAMP) ## Build dist/, install the wheel in an environment of its own, and try it
 	rm -rf dist

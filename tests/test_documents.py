@@ -12,7 +12,7 @@ from commands.train_request import train_spec
 from commands.tune_request import tuning_spec
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 COMMAND = re.compile(r"python ((?:train|enjoy|compare|tune)\.py [^`\n)#]*)")
 
 
@@ -78,6 +78,13 @@ def test_there_are_commands_to_check():
     assert len(commands("enjoy.py")) >= 2
 
 
+def test_the_readmes_script_prints_what_stands_below_it(capsys):
+    text = (ROOT / "README.md").read_text()
+    (code, printed) = re.search(r"```python\n(.*?)```\n\n```\n(.*?)```", text, re.DOTALL).groups()
+    exec(code, {})  # noqa: S102  # a page of this project
+    assert capsys.readouterr().out == printed
+
+
 def test_what_the_readme_points_to_is_there():
     text = (ROOT / "README.md").read_text()
     targets = re.findall(r"\]\(([^)#]+)\)", text) + re.findall(r'src="([^"]+)"', text)
@@ -88,6 +95,6 @@ def test_what_the_readme_points_to_is_there():
 
 def test_make_targets_of_the_readme_exist():
     targets = set(re.findall(r"\bmake ([a-z]+)", (ROOT / "README.md").read_text()))
-    assert targets == {"train", "test", "bench"}
+    assert targets == {"train", "test", "docs", "bench"}
     makefile = (ROOT / "Makefile").read_text()
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)

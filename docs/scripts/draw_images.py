@@ -1,0 +1,117 @@
+"""Draws the pictures of README and docs: ``python docs/scripts/draw_images.py``.
+
+Everything in them is made by the version that is checked out: environments are rendered, agents are
+trained and their runs drawn by the code that users run. The picture of a study's page needs
+Chromium, and is left as it is where there is none. Names of pictures draw those alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parents[1]
+ROOT = DOCS.parent
+IMAGES = DOCS / "images"
+sys.path[:0] = [str(ROOT), str(DOCS / "scripts")]
+os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+
+WIDEST = 560  # pixels, of an environment
+SLIPPERY = ("slip:0.1", "shelf_reward:-5")
+
+
+def main() -> None:
+    """Draw all, or those that are named."""
+    parser = argparse.ArgumentParser(description="Draw the pictures of README and docs.")
+    parser.add_argument("names", nargs="*", help=f"of {', '.join(PICTURES)}; all without")
+    names = parser.parse_args().names
+    unknown = set(names) - set(PICTURES)
+    if unknown:
+        sys.exit(f"there is no picture {', '.join(sorted(unknown))}, but {', '.join(PICTURES)}")
+    for name in names or PICTURES:
+        print(name, flush=True)
+        PICTURES[name]()
+
+
+def draw_environments() -> None:
+    """Each environment at the start of an episode."""
+    import gymnasium as gym
+    from PIL import Image
+
+    import envs  # noqa: F401  # registers them
+    from fill_pages import pictured_environments
+
+    folder = IMAGES / "environments"
+    folder.mkdir(exist_ok=True)
+    for env_id, kwargs in pictured_environments().items():
+        env = gym.make(env_id, render_mode="rgb_array", **kwargs)
+        env.reset(seed=0)
+        picture = Image.fromarray(env.render())  # type: ignore[arg-type]
+        picture.thumbnail((WIDEST, WIDEST))
+        picture.convert("P", palette=Image.Palette.ADAPTIVE).save(
+            folder / f"{env_id}.png", optimize=True
+        )
+        env.close()
+
+
+def draw_warehouse() -> None:
+    """What a short training leaves: the value map on slippery ground, curve and route of PPO."""
+    with tempfile.TemporaryDirectory() as folder:
+        slippery = ("--env", "Warehouse-v0", "--algo", "qlearning", "--env-kwargs", *SLIPPERY)
+        command("train.py", *slippery, "--seed", "0", "-n", "20000", folder=folder)
+        keep(f"{folder}/logs/qlearning/Warehouse-v0_1/value_map.png", "value-map.png")
+        chosen = ("--env", "Warehouse-v0", "--algo", "ppo")
+        command("train.py", *chosen, "--seed", "0", folder=folder)
+        keep(f"{folder}/logs/ppo/Warehouse-v0_1/learning_curve.png", "warehouse-ppo.png")
+
+
+def draw_report() -> None:
+    """The top of the page that a study of a minute ends in, photographed by Chromium."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        print("no Chromium: docs/images/report.png stays as it is")
+        return
+    agents = ("--algos", "qlearning", "sarsa", "expected_sarsa", "double_qlearning")
+    with tempfile.TemporaryDirectory() as folder:
+        study = ("--env", "FrozenLake8x8-v1", *agents, "--seeds", "10", "--first-seed", "1000")
+        command("compare.py", *study, "--name", "shown", folder=folder)
+        page = Path(folder) / "logs/studies/shown/report.html"
+        words = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+        size = ["--window-size=1280,1000", "--virtual-time-budget=8000"]
+        shot = Path(folder) / "report.png"
+        subprocess.run(
+            [*words, *size, f"--screenshot={shot}", page.as_uri()], check=True, capture_output=True
+        )
+        keep(shot, "report.png")
+
+
+def command(script: str, *words: str, folder: str) -> None:
+    """Run one of the project's commands in a folder of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
+    line = [sys.executable, str(ROOT / script), *words]
+    subprocess.run(line, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
+
+
+def keep(source: str | Path, name: str) -> None:
+    """Put a picture in its place, in a palette of 256 colours."""
+    from PIL import Image
+
+    with Image.open(source) as picture:
+        few = picture.convert("RGB").convert("P", palette=Image.Palette.ADAPTIVE)
+        few.save(IMAGES / name, optimize=True)
+
+
+PICTURES: dict[str, Callable[[], None]] = {
+    "environments": draw_environments,
+    "warehouse": draw_warehouse,
+    "report": draw_report,
+}
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,184 @@
+"""What a page says of an environment: worked out from its model and its docstring, never typed."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium.envs.registration import load_env_creator
+
+import envs  # noqa: F401  # registers the environments
+from agents.registry import ALGORITHMS
+from envs.known_models import success_outcomes, time_limit, transition_model
+from mdp import TransitionModel, baseline_policies, finite_horizon_optimum, policy_return
+from mdp.policy_returns import PolicyReturn
+from pipeline.settings.hyperparam_entries import entry_names
+from pipeline.settings.literals import parse_assignments
+
+LIMIT = 1000  # what commands take where an environment has none
+MOST_REWARDS = 8
+LEFT_OUT = ("Version History",)
+
+
+def environment_block(env_id: str, *arguments: str) -> str:
+    """The picture, the facts and the docstring of an environment of this project."""
+    return f"{facts_block(env_id, *arguments)}\n{docstring_block(env_id)}"
+
+
+def docstring_block(env_id: str) -> str:
+    """The docstring of an environment, but for its history."""
+    entry_point = gym.spec(env_id).entry_point
+    assert isinstance(entry_point, str)
+    return "\n\n".join(docstring_sections(load_env_creator(entry_point))) + "\n"
+
+
+def facts_block(env_id: str, *arguments: str) -> str:
+    """The picture and the facts alone, of an environment that others document."""
+    return f"{picture(env_id)}\n\n{facts_table(env_id, *arguments)}\n"
+
+
+def made(env_id: str, *arguments: str) -> gym.Env[Any, Any]:
+    """The environment with arguments such as ``size:20``, values being words or numbers."""
+    return gym.make(env_id, **parse_assignments(arguments))
+
+
+def optima_block(*written: str) -> str:
+    """A row for each environment: a link to its page, what it is, its optimum, what chance earns.
+
+    Args:
+        written: page and id, as in ``warehouse=Warehouse-v0``.
+    """
+    lines = ["| id | what it is | optimum | random actions |", "|---|---|---|---|"]
+    for item in written:
+        page, _, env_id = item.partition("=")
+        found = solution(env_id)
+        figures = (
+            (number(found.optimum), number(found.random.expected_return)) if found else ("",) * 2
+        )
+        env = made(env_id)
+        summary = (inspect.getdoc(type(env.unwrapped)) or "").partition("\n")[0].rstrip(".")
+        lines.append(
+            f"| [`{env_id}`](environments/{page}.md) | {summary} | {' | '.join(figures)} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def variants_block(*words: str) -> str:
+    """A row for each variant of an environment, with its optimum.
+
+    Args:
+        words: ids, each followed by arguments such as ``moves:king``.
+    """
+    lines = ["| id | arguments | optimum |", "|---|---|---|"]
+    starts = [k for k, word in enumerate(words) if word in gym.registry]
+    for first, last in zip(starts, [*starts[1:], len(words)], strict=True):
+        env_id, *arguments = words[first:last]
+        found = solution(env_id, *arguments)
+        assert found is not None, f"{env_id} has no model"
+        lines.append(f"| `{env_id}` | `{' '.join(arguments)}` | {number(found.optimum)} |")
+    return "\n".join(lines) + "\n"
+
+
+def picture(env_id: str) -> str:
+    """A link to the picture that `draw_images.py` makes."""
+    return f"![{env_id} at the start](../images/environments/{env_id}.png)"
+
+
+def facts_table(env_id: str, *arguments: str) -> str:
+    """Spaces, limit, and what the model says, as a table."""
+    env = made(env_id, *arguments)
+    limit = time_limit(env)
+    rows = {
+        "observations": f"`{env.observation_space}`",
+        "actions": f"`{env.action_space}`",
+        "time limit": f"{limit:,} steps" if limit else f"none; commands set {LIMIT:,} steps",
+    }
+    model, found = transition_model(env), solution(env_id, *arguments)
+    if model is None or found is None:
+        rows["model"] = "not known: what agents are worth is sampled"
+    else:
+        rows |= {
+            "states that can be reached": f"{model.reachable.sum():,}",
+            "transitions": "random" if is_random(model) else "deterministic",
+            "rewards of a step": rewards(model),
+            "**optimum**: the highest expected return": f"**{number(found.optimum)}**",
+            "the best policy of one action throughout": number(found.best_constant),
+            "random actions": random_actions(found.random),
+        }
+    rows["settings are shipped for"] = agents_with_settings(env_id)
+    return "| | |\n|---|---|\n" + "\n".join(f"| {key} | {said} |" for key, said in rows.items())
+
+
+@dataclass(frozen=True)
+class Solution:
+    """What follows from a model: the optimum, and what policies earn that see nothing."""
+
+    optimum: float
+    best_constant: float
+    random: PolicyReturn
+
+
+@lru_cache
+def solution(env_id: str, *arguments: str) -> Solution | None:
+    """The figures of an environment under its time limit; None where no model is known."""
+    env = made(env_id, *arguments)
+    model, limit = transition_model(env), time_limit(env) or LIMIT
+    if model is None:
+        return None
+    uniform, *constant = baseline_policies(model)
+    return Solution(
+        optimum=finite_horizon_optimum(model, limit).start_value,
+        best_constant=max(policy_return(model, one, limit).expected_return for one in constant),
+        random=policy_return(model, uniform, limit, success=success_outcomes(env)),
+    )
+
+
+def random_actions(found: PolicyReturn) -> str:
+    """How far chance alone gets."""
+    said = f"{number(found.expected_return)} in {number(found.expected_length)} steps"
+    if found.success_rate is None:
+        return said
+    return f"{said}; {100 * found.success_rate:.3g} % of the episodes succeed"
+
+
+def is_random(model: TransitionModel) -> bool:
+    """Whether an action can have more than one outcome where it matters."""
+    possible = (model.prob > 0).sum(axis=2)[model.reachable]
+    return bool((possible > 1).any())
+
+
+def rewards(model: TransitionModel) -> str:
+    """The rewards there are, or their range."""
+    possible = model.reachable[:, None, None] & (model.prob > 0)
+    found = np.unique(np.round(model.reward[possible], 12))
+    drawn = " in the mean: they are drawn" if model.reward_variance is not None else ""
+    if len(found) > MOST_REWARDS:
+        return f"from {number(found[0])} to {number(found[-1])}{drawn}"
+    return ", ".join(number(value) for value in found) + drawn
+
+
+def number(value: float) -> str:
+    """At least four digits, and no more than tell something."""
+    value = float(value)
+    if abs(value - round(value)) < 1e-9:
+        return f"{round(value):,}"
+    return f"{value:,.2f}" if abs(value) >= 10 else f"{value:.4g}"
+
+
+def agents_with_settings(env_id: str) -> str:
+    """The agents in whose file of hyperparameters the environment has an entry."""
+    found = [f"`{name}`" for name in ALGORITHMS if env_id in entry_names(name)]
+    return ", ".join(found) or "no agent; those that fit have default ones"
+
+
+def docstring_sections(cls: Any) -> list[str]:
+    """A class's docstring, which is Markdown but for the colons before its maps."""
+    text = re.sub(r"::\n", ":\n", inspect.getdoc(cls) or "")
+    lead, *sections = re.split(r"(?m)^(?=## )", text.partition("\n")[2].strip())
+    kept = [part.strip() for part in sections if part[3:].split("\n")[0] not in LEFT_OUT]
+    return [part for part in (lead.strip(), *kept) if part]

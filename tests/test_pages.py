@@ -1,0 +1,95 @@
+"""What scripts write into the pages of docs/ is there as they would write it now."""
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from agents import ALGORITHMS
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+FORM = ["Idea", "Update", "Pseudo-code, and the code that runs", "By hand", "When it fails"]
+FORM += ["See it", "Source"]
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(name, DOCS / "scripts" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def fill_pages():
+    before = list(sys.path)
+    yield script("fill_pages")
+    sys.path[:] = before
+
+
+def test_pages_are_as_the_script_fills_them(fill_pages):
+    """Otherwise: python docs/scripts/fill_pages.py. `make docs` looks at the dear ones too."""
+    dear = {"environments.md", "jacks-car-rental.md"}
+    pages = sorted(path for path in DOCS.rglob("*.md") if path.name not in dear)
+    assert [path.name for path in pages if not fill_pages.is_current(path)] == []
+
+
+def test_every_environment_is_pictured(fill_pages):
+    drawn = {path.stem for path in (DOCS / "images" / "environments").glob("*.png")}
+    assert drawn == set(fill_pages.pictured_environments())
+
+
+def test_a_block_is_filled_and_others_stay(fill_pages):
+    page = "<!-- code: mdp/graph.py nothing -->\nold\n<!-- end -->\n"
+    with pytest.raises(ValueError, match=r"mdp/graph\.py defines no nothing"):
+        fill_pages.filled(page)
+    other = "<!-- headline: held-out -->\nkept\n<!-- end -->\n"
+    agents = "<!-- agents -->\nformer words\n<!-- end -->\n"
+    filled = fill_pages.filled(other + agents)
+    assert filled.startswith(other)
+    assert "former words" not in filled
+    assert all(f"`{name}`" in filled for name in ALGORITHMS)
+
+
+def test_definitions_are_cut_out_whole(fill_pages):
+    text = "A = 1\n\n\n@cached\ndef f():\n    return A\n\n\n"
+    text += "class B:\n    def g(self):\n        return 2\n"
+    definition = script("code_blocks").definition
+    assert definition(text, "A", "") == "A = 1"
+    assert definition(text, "f", "") == "@cached\ndef f():\n    return A"
+    assert definition(text, "B.g", "") == "def g(self):\n    return 2"
+
+
+@pytest.mark.parametrize("page", sorted((DOCS / "algorithms").glob("*.md")), ids=lambda p: p.stem)
+def test_pages_of_algorithms_have_one_form(page):
+    text = page.read_text()
+    assert page.stem in ALGORITHMS
+    assert re.match(rf"# .*\(`{page.stem}`\)\n", text)
+    assert re.findall(r"^## (.*)$", re.sub(r"```.*?```", "", text, flags=re.DOTALL), re.M) == FORM
+    for file, name in re.findall(r"`(test_\w+)` in `(tests/[\w/]+\.py)`", text):
+        assert f"def {file}(" in (DOCS.parent / name).read_text()
+
+
+def test_every_page_of_an_environment_says_who_finds_it_hard():
+    for page in (DOCS / "environments").glob("*-*.md"):
+        assert "\n## Who finds it hard\n" in page.read_text(), page.name
+
+
+def test_links_that_lead_nowhere_are_found(tmp_path):
+    check_links = script("check_links")
+    (tmp_path / "b.html").write_text('<p id="here"></p>')
+    links = ["b.html", "b.html#here", "#top", "https://example.org/x", "data:,x"]
+    bad = ["b.html#there", "c.html", "#nowhere"]
+    anchors = "".join(f'<a href="{url}"></a>' for url in links + bad)
+    (tmp_path / "a.html").write_text(
+        f'<h1 id="top"></h1>{anchors}<link rel="search" href="b.html">'
+        '<script src="https://cdn.example.org/x.js"></script><img src="data:,x">'
+    )
+    assert check_links.faults(tmp_path) == [
+        "a.html loads https://cdn.example.org/x.js",
+        "a.html links to b.html#there, where there is no place there",
+        "a.html links to c.html, which is not there",
+        "a.html links to #nowhere, where there is no place nowhere",
+    ]
