@@ -1,6 +1,6 @@
 """Figure 5.2: how to play Blackjack, learnt by Monte Carlo control (example 5.3).
 
-    python textbook/figure_5_2.py              # 1,000,000 episodes: two minutes
+    python textbook/figure_5_2.py              # 500,000 episodes: two minutes
 
 The book explores by its starts. Ours explores by an epsilon that falls from 1 to 0.1; the game
 deals by chance anyway. Beside what was learnt stands the optimal policy, by planning.
@@ -19,7 +19,7 @@ from mdp.array_types import Ints
 from mdp.finite_horizon import finite_horizon_optimum
 from mdp.policy_evaluation import policy_return
 
-N_EPISODES = 1_000_000
+N_EPISODES = 500_000
 LONGEST = 25  # cards; a hand is bust before
 NAMES = {HIT: "hit", STICK: "stick"}
 
