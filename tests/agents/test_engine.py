@@ -140,7 +140,7 @@ def state_of(model):
         "observations": model._last_obs.tolist(),
         "episode starts": model._last_episode_starts.tolist(),
         "pending actions": model._next_actions.tolist(),
-        "memory": [array.tobytes() for array in model._memory_in_use()],
+        "memory": [array.tobytes() for array in model._memory],
         "steps": model.num_timesteps,
         "total": model._total_timesteps,
         "episodes": model._episode_num,
