@@ -62,7 +62,7 @@ def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
     for name, value in settings:
         if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
             raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
-        if value > high:
+        if int(value) > high:
             raise ValueError(f"{name} must be at most {high}, not {value}")
 
 

@@ -384,7 +384,7 @@ def test_a_damaged_model_is_refused(name, array, value, tmp_path):
 
 def test_a_model_of_another_number_of_outcomes_is_refused(tmp_path):
     make("dyna_q", "FrozenLake-v1", engine="interpreted").save(tmp_path / "agent")
-    with pytest.raises(ValueError, match="room for 1 outcomes of .* the settings ask for 3"):
+    with pytest.raises(ValueError, match=r"room for 1 outcomes of .* the settings ask for 3"):
         load_algorithm("dyna_q").load(tmp_path / "agent.zip", outcomes_kept=3)
 
 
