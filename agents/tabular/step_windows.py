@@ -5,7 +5,6 @@ Source: Sutton and Barto (2nd edition), chapter 7.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,7 +118,7 @@ class WindowAlgorithm(EpisodicAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_whole(1, math.inf, settings_of(self, "n_steps"))
+        check_whole(1, settings_of(self, "n_steps"))
 
     def _make_memory(self) -> Windows:
         shape = (self.n_envs, self.n_steps)
