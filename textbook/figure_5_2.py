@@ -2,9 +2,9 @@
 
     python textbook/figure_5_2.py              # 500,000 episodes: two minutes
 
-The book explores by its starts, and averages all returns. Ours explores by an epsilon that falls from
-0.3 to 0.05, and its step size falls too: returns of early, worse play are forgotten. Beside what was
-learnt stands the optimal policy, by planning.
+The book explores by its starts, and averages all returns. Ours explores by an epsilon that falls
+from 0.3 to 0.05, and its step size falls too: returns of early, worse play are forgotten. Beside
+what was learnt stands the optimal policy, by planning.
 """
 
 from __future__ import annotations

@@ -59,7 +59,6 @@ def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
     Raises:
         ValueError: naming the argument.
     """
-    bounds = f"of at least {low}" if math.isinf(high) else f"from {low} to {high}"
     for name, value in settings:
         if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
             raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
