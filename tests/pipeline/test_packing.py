@@ -1,5 +1,6 @@
 """Packs: what is in them and what is not, that they verify, play elsewhere, and are no code."""
 
+import base64
 import hashlib
 import io
 import json
@@ -21,7 +22,7 @@ from pipeline.file_digests import sealed
 from pipeline.models.model_choice import ModelRequest, choose_model
 from pipeline.packing.model_card import fenced
 from pipeline.packing.pack_files import check_pack, default_target, pack, unpacked
-from pipeline.packing.scrubbing import without_places, zip_to_tell
+from pipeline.packing.scrubbing import check_untold, without_places, zip_to_tell
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
@@ -184,6 +185,19 @@ def test_what_is_not_packed(runs, tmp_path, change, complaint):
         pack(changed(runs["table"], tmp_path, change), tmp_path / "pack")
     assert not (tmp_path / "pack").exists()
     assert list(tmp_path.glob(".*.tmp")) == []
+
+
+@pytest.mark.parametrize("form", ["plain", "pickled"])
+def test_zips_are_looked_into(runs, form):
+    """Deflated, as some pack them, and in what is pickled as text."""
+    place = f"{Path.home()}/notes".encode()
+    pickled = b'{":serialized:": "' + base64.b64encode(place) + b'"}'
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("data", (place if form == "plain" else pickled) + bytes(1000))
+    assert place not in stream.getvalue()
+    with pytest.raises(UserError, match=r"model\.zip names"):
+        check_untold({"model.zip": stream.getvalue()}, runs["table"])
 
 
 def test_a_damaged_run_is_not_packed(runs, tmp_path):
