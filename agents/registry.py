@@ -80,6 +80,14 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "double_qlearning": _tabular(
         "double_q_learning:DoubleQLearning", "double Q-learning on two tables"
     ),
+    "n_step_sarsa": _tabular("n_step_sarsa:NStepSARSA", "n-step SARSA on a table"),
+    "n_step_tree_backup": _tabular("tree_backup:NStepTreeBackup", "n-step tree backup on a table"),
+    "sarsa_lambda": _tabular("sarsa_lambda:SARSALambda", "SARSA(lambda): traces on a table"),
+    "q_lambda": _tabular("q_lambda:QLambda", "Watkins's Q(lambda): traces on a table"),
+    "monte_carlo": _tabular("monte_carlo:MonteCarlo", "on-policy Monte Carlo on a table"),
+    "off_policy_monte_carlo": _tabular(
+        "off_policy_monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
+    ),
     "dqn": _deep("agents.dqn:DQN", "deep Q-network (Stable-Baselines3)"),
     "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
     "deep_qlearning": _deep(

@@ -163,6 +163,36 @@ def expected_value(strategy: int, values: Floats, rate: float) -> float:
     return weighted / total
 
 
+@inlined
+def action_probability(
+    strategy: int, values: Floats, rate: float, tie_scale: float, action: int
+) -> float:
+    """How probable one action is, as `action_probabilities` has it of all.
+
+    Args:
+        strategy: `EPSILON_GREEDY` or `BOLTZMANN`.
+        values: action values, shape (A,).
+        rate: epsilon or temperature.
+        tie_scale: 1 where tied best actions share their probability, 0 where the first has it all.
+        action: which action.
+    """
+    highest = highest_value(values)
+    if strategy == EPSILON_GREEDY:
+        n_best, n_before = 0, 0
+        for other in range(len(values)):
+            if values[other] == highest:
+                n_best += 1
+                n_before += other < action
+        share = 1.0 / n_best if tie_scale > 0.0 else 1.0
+        is_chosen = values[action] == highest and (tie_scale > 0.0 or n_before == 0)
+        greedy = share if is_chosen else 0.0
+        return rate / len(values) + (1.0 - rate) * greedy
+    total = 0.0
+    for other in range(len(values)):
+        total += math.exp((values[other] - highest) / rate)
+    return math.exp((values[action] - highest) / rate) / total
+
+
 def action_probabilities(
     strategy: int,
     values: Floats,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from numbers import Integral
 from typing import Any, get_args
 
 from gymnasium import spaces
@@ -50,6 +51,17 @@ def check_at_least(low: float, settings: Settings) -> None:
     for name, value in settings:
         if isinstance(value, int | float) and not value >= low:
             raise ValueError(f"{name} must be at least {low:g}, not {value}")
+
+
+def check_whole(low: int, settings: Settings) -> None:
+    """Refuse what is no whole number, and numbers below ``low``.
+
+    Raises:
+        ValueError: naming the argument.
+    """
+    for name, value in settings:
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
+            raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
 
 
 def check_above_zero(settings: Settings) -> None:

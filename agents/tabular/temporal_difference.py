@@ -10,7 +10,6 @@ Source: Sutton and Barto (2nd edition), chapter 6.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 from agents.common.exploration import GAUSSIAN_NOISE, choose_action, random_action
@@ -55,7 +54,7 @@ def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> floa
 
 @by_type
 def commit(agent: TabularAgent, env: Any, progress: Any) -> None:
-    """Decide on ``env.next_action`` where the update needs it."""
+    """Decide on ``env.next_action``, or note what else is to be known before any table changes."""
 
 
 @inlined
@@ -100,25 +99,54 @@ def act_on_values(agent: TabularAgent, env: Any, progress: Any) -> None:
 
 
 @inlined
+def values_at(agent: TabularAgent, obs: int, table: int) -> Room:
+    """The room, filled with a table's values of the actions that are allowed at ``obs``."""
+    room = room_at(agent.tables, obs, agent.room)
+    for k in range(len(room.values)):
+        room.values[k] = agent.tables.values[table, obs, action_at(agent.tables, room, k)]
+    return room
+
+
+@inlined
+def value_ahead(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
+    """`next_value`, with the room that it needs."""
+    room = values_at(agent, env.next_obs, table)
+    ahead = TabularAgent(agent.settings, agent.tables, room, agent.rng, agent.memory)
+    return float(next_value(ahead, env, progress, table))
+
+
+@inlined
+def count_visit(agent: TabularAgent, progress: Any, table: int, obs: int, action: int) -> float:
+    """Count an update of an entry, and return its step size."""
+    visit_counts = agent.tables.visit_counts
+    visit_counts[table, obs, action] += 1
+    count = visit_counts[table, obs, action]
+    return float(step_size(progress.learning_rate, agent.settings.averages_samples, count))
+
+
+@inlined
+def move_towards(
+    agent: TabularAgent, progress: Any, table: int, obs: int, action: int, target: float
+) -> float:
+    """Move one entry towards its target, and return by how much it was wrong."""
+    values = agent.tables.values
+    size = count_visit(agent, progress, table, obs, action)
+    error = target - values[table, obs, action]
+    values[table, obs, action] += size * error
+    return float(error)
+
+
+@inlined
 def update(agent: TabularAgent, env: Any, progress: Any) -> float:
     """Move one entry towards its target, and return the TD error.
 
     ``env.uniform`` decides which of two tables is updated.
     """
-    settings, tables = agent.settings, agent.tables
-    table = int(env.uniform * tables.values.shape[0])
-    room = room_at(tables, env.next_obs, agent.room)
-    for k in range(len(room.values)):
-        room.values[k] = tables.values[table, env.next_obs, action_at(tables, room, k)]
-    ahead = TabularAgent(settings, tables, room, agent.rng, agent.memory)
-    discount = 0.0 if env.terminated else settings.gamma
-    target = env.reward + discount * next_value(ahead, env, progress, table)
-    tables.visit_counts[table, env.obs, env.action] += 1
-    count = tables.visit_counts[table, env.obs, env.action]
-    size = step_size(progress.learning_rate, settings.averages_samples, count)
-    td_error = target - tables.values[table, env.obs, env.action]
+    table = int(env.uniform * agent.tables.values.shape[0])
+    discount = 0.0 if env.terminated else agent.settings.gamma
+    target = env.reward + discount * value_ahead(agent, env, progress, table)
+    td_error = move_towards(agent, progress, table, env.obs, env.action, target)
     env.target, env.td_error = target, td_error
-    tables.values[table, env.obs, env.action] += size * td_error
     return float(td_error)
 
 
@@ -135,8 +163,6 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
         env = envs[i]
         if not (env.terminated and agent.settings.skip_terminal_update):
             total_error += abs(update(agent, env, progress))
-        else:
-            env.target = env.td_error = math.nan
         env.obs = env.new_obs
         if env.done:
             env.next_action = UNDECIDED
