@@ -5,6 +5,7 @@ Source: Sutton and Barto (2nd edition), chapter 7.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -67,6 +68,7 @@ def learn_oldest(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
     target = windowed_return(agent, env, progress, i)
     state, action = windows.states[i, place], windows.actions[i, place]
     error = move_towards(agent, progress, 0, state, action, target)
+    env.target, env.td_error = target, error
     windows.oldest[i] = (place + 1) % windows.states.shape[1]
     windows.lengths[i] -= 1
     return abs(error)
@@ -87,6 +89,7 @@ def learn_from_window(agent: TabularAgent, env: Any, progress: Any, i: int) -> f
     while env.done and windows.lengths[i] > 0:
         error += learn_oldest(agent, env, progress, i)
         n_learnt += 1
+        env.target = env.td_error = math.nan  # there is more than one
     return error / n_learnt
 
 
