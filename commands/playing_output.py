@@ -187,7 +187,7 @@ def _print_returns(console: Console, returns: list[float], lengths: list[int]) -
         console.print("no episode came to its end: raise --n-timesteps")
 
 
-def _print_measured(console: Console, spec: TrainSpec, show: _Show) -> None:
+def _print_measured(console: Console, spec: TrainSpec, show: _Show | LiveShow) -> None:
     """Say how the returns stand to the optimum, where that is bracketed."""
     played = Evaluation(np.array(show.returns), np.array(show.lengths), None)
     measured = describe_measured(played.measured_by(bracketed_yardstick(spec)))
