@@ -52,6 +52,12 @@ TRAININGS = [
     ("Warehouse-v0", "expected_sarsa", 600, {"mask_actions": True}),
     (GRID, "double_qlearning", 600, {"learning_rate": "lin_0.5"}),
     (LEFT_RIGHT, "qlearning", 600, {"engine": "compiled"}),
+    (GRID, "semi_gradient_sarsa", 600, {"engine": "compiled", "n_envs": 3}),
+    ("MountainCar-v0", "semi_gradient_q", 600, {"engine": "interpreted"}),
+    (GRID, "actor_critic", 600, {"gamma_power": True, "n_envs": 2}),
+    # Cut off in the middle of episodes.
+    (LEFT_RIGHT, "reinforce", 600, {"engine": "compiled"}),
+    (GRID, "reinforce", 600, {"engine": "interpreted", "n_envs": 2}),
     (GRID, "value_iteration", 300, {}),
     (GRID, "optimal", 300, {}),
     (GRID, "random", 300, {}),
