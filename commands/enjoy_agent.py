@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -47,7 +49,11 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("model", nargs="?", help="path of a model zip or run folder, instead of looking for a run")
+    add(
+        "model",
+        nargs="?",
+        help="path of a model zip, a run folder or a pack, instead of looking for a run",
+    )
     add("--algo", type=filled, help="agent (default: ppo, or what the zip's run folder says)")
     add(
         "--env",
@@ -148,18 +154,28 @@ def main() -> int:
 def _play(args: argparse.Namespace) -> int:
     from commands.enjoy_request import check_playing, model_request
     from pipeline.filming import check_film_path
+    from pipeline.packing.pack_files import unpacked
 
     check_playing(args)
     film = None if args.record is None else Path(args.record)
     if film is not None:
         check_film_path(film)
     wanted = model_request(args)
+    with ExitStack() as stack:
+        if wanted.path is not None:
+            wanted = replace(wanted, path=stack.enter_context(unpacked(wanted.path)))
+        return _play_found(args, wanted, film)
+
+
+def _play_found(args: argparse.Namespace, wanted: ModelRequest, film: Path | None) -> int:
     found = _found_model(wanted)
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
 
     console = TextConsole(highlight=False, quiet=args.verbose < 1)
-    about = f"{found.spec.algo} on {found.spec.env_id}: {found.path}"
+    is_moved = wanted.path is not None and wanted.path != Path(args.model)
+    place = args.model if is_moved else found.path  # of a pack's zip, the zip
+    about = f"{found.spec.algo} on {found.spec.env_id}: {place}"
     console.print(about, markup=False, soft_wrap=True)
     with doing(console, "loading the libraries"), loading_libraries():
         from commands.playing_output import PlayingRequest, play

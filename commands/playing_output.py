@@ -14,11 +14,13 @@ import torch as th
 from rich.console import Console
 
 from commands.live_show import LiveShow
-from commands.run_output import describe, episodes, print_refusal
+from commands.run_output import describe, describe_measured, episodes, print_refusal
 from envs.layout import DOWN, LEFT, RIGHT, UP, grid_layout
 from pipeline.errors import UserError
 from pipeline.evaluation.asked_policies import why_not_exact
+from pipeline.evaluation.bracketed import bracketed_yardstick
 from pipeline.evaluation.exact import exact_evaluator, model_refusal
+from pipeline.evaluation.sampled import Evaluation
 from pipeline.filming import write_film
 from pipeline.models.model_choice import ChosenModel
 from pipeline.models.model_loading import load_to_play
@@ -152,6 +154,8 @@ def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None
     if request.film is not None and isinstance(show, _Show):
         _write_film(console, request.film, show.frames)
     _print_returns(console, show.returns, show.lengths)
+    if show.returns and not request.norm_reward:
+        _print_measured(console, spec, show)
     _print_exact(console, spec, model, request.deterministic)
 
 
@@ -181,6 +185,14 @@ def _print_returns(console: Console, returns: list[float], lengths: list[int]) -
         )
     else:
         console.print("no episode came to its end: raise --n-timesteps")
+
+
+def _print_measured(console: Console, spec: TrainSpec, show: _Show | LiveShow) -> None:
+    """Say how the returns stand to the optimum, where that is bracketed."""
+    played = Evaluation(np.array(show.returns), np.array(show.lengths), None)
+    measured = describe_measured(played.measured_by(bracketed_yardstick(spec)))
+    if measured:
+        console.print(measured)
 
 
 def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: bool) -> None:

@@ -36,12 +36,25 @@ def describe(evaluation: Evaluation) -> str:
         text += f" ± {evaluation.std_return:.2f} over {episodes(len(evaluation.returns))}"
     if evaluation.success_rate is not None:
         text += f", success {evaluation.success_rate:.1%}"
-    yardstick = evaluation.yardstick
-    if yardstick is not None:
+    measured = describe_measured(evaluation)
+    return f"{text}, {measured}" if measured else text
+
+
+def describe_measured(evaluation: Evaluation) -> str:
+    """How the return stands to the optimum; empty where that is neither known nor bracketed."""
+    yardstick, value = evaluation.yardstick, evaluation.mean_return
+    if yardstick is None:
+        return ""
+    optimum, score = f"optimum {yardstick.optimum:.2f}", f"score {yardstick.score(value):.2f}"
+    if yardstick.at_least is not None:
+        optimum = f"optimum between {yardstick.at_least:.2f} and {yardstick.optimum:.2f}"
+        most = f"{yardstick.lower_end.score(value):.2f}"
+        score += f" to {most} (bracketed)" if not score.endswith(most) else " (bracketed)"
+    text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"
+    if evaluation.beats_optimum:
         text += (
-            f", optimum {yardstick.optimum:.2f}"
-            f", best random or constant policy {yardstick.baseline:.2f}, "
-            f"score {yardstick.score(evaluation.mean_return):.2f}"
+            ". THIS IS MORE THAN ANY POLICY CAN REACH: the environment is not the one that the "
+            "bracket is of, or the bracket is wrong"
         )
     return text
 

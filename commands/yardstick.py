@@ -35,6 +35,10 @@ def _carry_out(command: str) -> int:
         from commands import inspect_model
 
         return inspect_model.main()
+    if command == "pack":
+        from commands import pack_run
+
+        return pack_run.main()
     if command == "tune":
         from commands import tune_agent
 

@@ -50,6 +50,7 @@ default_role = "literal"
 autodoc_typehints = "signature"
 autodoc_member_order = "bysource"
 napoleon_numpy_docstring = False
+napoleon_use_ivar = True
 
 # Two classes in different packages may have the same name.
 suppress_warnings = ["ref.python"]
@@ -58,6 +59,7 @@ html_theme = "furo"
 html_math_renderer = "mathml"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_show_copyright = False
 html_show_sphinx = False
 # What a search shows of pages is fetched, which browsers refuse where pages are files.
 html_show_search_summary = False

@@ -85,7 +85,8 @@ class EnvironmentAnalysis:
     Attributes:
         environment: its label.
         env_id: its Gymnasium id.
-        optimum: the highest expected return that any policy has, or None.
+        optimum: the highest expected return that any policy has, or of a bracket what none
+            exceeds; or None.
         baseline: that of the best random or constant policy, or None.
         threshold: the return that counts as solved, or None.
         margin: the difference within which agents count as equivalent.
@@ -99,6 +100,7 @@ class EnvironmentAnalysis:
         speeds: every two agents, as to which of them stays above the threshold sooner.
         seeds: by agent, how many seeds it was to have.
         look: which look at these runs it is.
+        optimum_at_least: the lower end of the optimum's bracket; None where there is none.
     """
 
     environment: str
@@ -117,6 +119,7 @@ class EnvironmentAnalysis:
     speeds: tuple[SpeedComparison, ...] = ()
     seeds: Mapping[str, int] = field(default_factory=dict)
     look: Standing = field(default_factory=Standing)
+    optimum_at_least: float | None = None
 
 
 @dataclass(frozen=True)
@@ -191,6 +194,7 @@ def _analyse_environment(
         speeds=speeds(results, environment, names, look.level),
         seeds=evidence.seeds,
         look=look,
+        optimum_at_least=evidence.optimum_at_least,
     )
 
 

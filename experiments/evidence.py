@@ -27,7 +27,9 @@ class Evidence:
         environment: its label.
         scores: by agent, the higher the better, shape (n_seeds,): NaN where there is no run.
         seeds: by agent, how many of the seeds it was to have.
-        optimum: the highest expected return that any policy has, or None.
+        optimum: the highest expected return that any policy has, or of a bracket what none
+            exceeds; or None.
+        optimum_at_least: the lower end of that bracket; None where there is none.
         baseline: that of the best random or constant policy, or None.
         threshold: the return that counts as solved, or None.
         margin: the difference within which agents count as equivalent.
@@ -38,6 +40,7 @@ class Evidence:
     scores: Mapping[str, Floats]
     seeds: Mapping[str, int]
     optimum: float | None
+    optimum_at_least: float | None
     baseline: float | None
     threshold: float | None
     margin: float
@@ -64,12 +67,15 @@ def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
     sign = -1.0 if study.metric in COSTS else 1.0
     values = values_over_seeds(results, environment, study.metric)
     optimum, baseline = _first(table, "optimum"), _first(table, "baseline")
-    span = 0.0 if optimum is None or baseline is None else optimum - baseline
+    at_least = _first(table, "optimum_at_least")
+    reachable = optimum if at_least is None else at_least
+    span = 0.0 if reachable is None or baseline is None else reachable - baseline
     return Evidence(
         environment=environment,
         scores={name: sign * each for name, each in values.items()},
         seeds=_seeds(results, environment),
         optimum=optimum,
+        optimum_at_least=at_least,
         baseline=baseline,
         threshold=_first(table, "threshold"),
         margin=MARGIN * span if study.margin is None else study.margin,

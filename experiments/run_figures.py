@@ -32,6 +32,7 @@ _FINAL_FIGURES = (
     "exact",
     "gap",
     "score",
+    "optimum_at_least",
 )
 _MAPS = ("timesteps", "values", "actions", "optimal_values", "optimal_actions")
 _COLUMNS = ["r", "l", "t"]  # return, length, seconds since the beginning

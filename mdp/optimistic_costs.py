@@ -77,7 +77,7 @@ def optimistic_costs(motion: PushedMotion, cells: Cells) -> Floats:
         if np.array_equal(now, then):
             break
         now, then = then, now
-    return np.asarray(now * (1 - SINGLE_ROUNDING) ** motion.horizon, dtype=np.float64)
+    return np.asarray(now.astype(np.float64) * (1 - SINGLE_ROUNDING) ** motion.horizon)
 
 
 def mean_cost(

@@ -19,9 +19,10 @@ from safe_files.limits import memory_bytes
 _BYTES_PER_ENVIRONMENT = 20_000  # CartPole with its Monitor takes more
 _BYTES_PER_WEIGHT = 16  # of 32 bits, with its gradient and two moments of Adam
 _BYTES_PER_PULL = 24  # the arm, the reward and the regret
+_BYTES_PER_RECORDED_STEP = 32  # state, action, reward and probability
 
 # What counts observations among the arguments of an agent's constructor.
-_BUFFERS = frozenset({"buffer_size", "n_steps", "n_delta"})
+_BUFFERS = frozenset({"buffer_size", "n_steps", "n_delta", "longest_episode"})
 
 
 def observation_bytes(space: spaces.Space[Any]) -> int:
@@ -109,6 +110,7 @@ def _check_buffers(
         "buffer_size": (1, copies * stored),
         "n_steps": (n_envs, stored),
         "n_delta": (1, stored),
+        "longest_episode": (n_envs, _BYTES_PER_RECORDED_STEP),
         "batch_size": (1, stored if _number(arguments.get("buffer_size")) else 0),
     }
     for name, (times, n_bytes) in asked.items():

@@ -17,7 +17,7 @@ from report.pair_sentences import (
     too_few_seeds,
 )
 from report.speed_sentences import speed_sentences
-from report.wording import enumeration, interval, number, ordinal
+from report.wording import enumeration, interval, number, optimum_words, ordinal
 
 MOST_FIGURES = 3  # agents whose figures stand in a line
 
@@ -51,6 +51,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
         notes=(
             *on_unreliable(environment),
             *speed_sentences(environment),
+            *_on_the_impossible(study, environment),
             *_on_variants(study, environment),
             *_on_missing(study, environment),
             *_on_looks(environment),
@@ -137,7 +138,8 @@ def _figure(study: StudySpec, environment: EnvironmentAnalysis, agent: AgentAnal
 
 def _optimum(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     known = study.metric in ON_THE_SCALE and environment.optimum is not None
-    return f"; the optimum is {number(environment.optimum)}" if known else ""
+    words = optimum_words(environment.optimum, environment.optimum_at_least)
+    return f"; the optimum is {words}" if known else ""
 
 
 def _extreme(study: StudySpec) -> str:
@@ -179,6 +181,20 @@ def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
         return False
     reach = baseline + environment.margin
     return all(agent.metric.median.point <= reach for agent in environment.agents)
+
+
+def _on_the_impossible(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:
+    """Agents whose returns are above what no policy exceeds."""
+    most = environment.optimum
+    if environment.optimum_at_least is None or most is None:
+        return
+    names = [a.agent for a in environment.agents if a.final.low > most + abs(most) * 1e-6]
+    if names:
+        verb = "has" if len(names) == 1 else "have"
+        yield (
+            f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, {number(most)}: the "
+            "environment is not the one that the bracket is of, or the bracket is wrong."
+        )
 
 
 def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:

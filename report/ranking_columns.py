@@ -88,7 +88,9 @@ def _gap(row: Row) -> Cell | None:
     optimum, final = row.environment.optimum, row.agent.final
     if optimum is None:
         return None
-    low, high = optimum - final.high, optimum - final.low
+    at_least = row.environment.optimum_at_least
+    # Of a bracket the gap's interval goes from the lower end to the upper one.
+    low, high = (optimum if at_least is None else at_least) - final.high, optimum - final.low
     return estimate_cell(replace(final, point=optimum - final.point, low=low, high=high))
 
 

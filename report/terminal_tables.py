@@ -20,7 +20,7 @@ from report.ranking_cells import Cell
 from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, BanditRow, Column, Row, filled
 from report.seed_sentence import seed_sentence
 from report.verdict_matrix import LEGEND, SIGNS, says_more, verdict_matrix
-from report.wording import enumeration, number
+from report.wording import enumeration, number, optimum_words
 
 MOST_AGENT_WIDTH = 20
 UNBOUNDED = 10_000  # columns
@@ -140,7 +140,7 @@ def _table(
 def _title(environment: EnvironmentAnalysis) -> str:
     title = escape(environment.environment)
     if environment.optimum is not None:
-        title += f": optimum {number(environment.optimum)}"
+        title += f": optimum {optimum_words(environment.optimum, environment.optimum_at_least)}"
         title += f", best random or constant policy {number(environment.baseline)}"
     return title
 

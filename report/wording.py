@@ -39,6 +39,16 @@ def interval_alone(estimate: Estimate) -> str:
     return f"{number(estimate.low)} to {number(estimate.high)}"
 
 
+def optimum_words(optimum: float | None, at_least: float | None) -> str:
+    """The optimum; where it is bracketed, its ends with as many digits as tell them apart."""
+    if at_least is None or optimum is None:
+        return number(optimum)
+    ends = [number(at_least), number(optimum)]
+    if ends[0] == ends[1]:
+        ends = [f"{at_least:,.3f}", f"{optimum:,.3f}"]
+    return f"{ends[0]} to {ends[1]} (bracketed)"
+
+
 def enumeration(words: Sequence[str]) -> str:
     """Words joined by commas, the last by "and"."""
     return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)

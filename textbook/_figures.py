@@ -17,11 +17,10 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
-from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback, Horizon
+from agents.common.callback_horizons import BlockCallback, EpisodeBudget, Horizon
 from mdp.array_types import Bools, Floats
 
 mpl.use("Agg")
@@ -93,12 +92,12 @@ def agent_on(
 
 
 def learn_episodes(agent: Any, n_episodes: int) -> tuple[Floats, Floats]:
-    """Train for so many episodes.
+    """Train for so many episodes, by which schedules run too.
 
     Returns:
         Their returns and their lengths, shapes (n_episodes,).
     """
-    agent.learn(MOST_STEPS, callback=StopTrainingOnMaxEpisodes(n_episodes), log_interval=None)
+    agent.learn(MOST_STEPS, callback=EpisodeBudget(n_episodes), log_interval=None)
     monitor = agent.env.envs[0]
     returns, lengths = monitor.get_episode_rewards(), monitor.get_episode_lengths()
     return np.array(returns[:n_episodes], dtype=float), np.array(lengths[:n_episodes], dtype=float)

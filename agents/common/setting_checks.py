@@ -53,17 +53,17 @@ def check_at_least(low: float, settings: Settings) -> None:
             raise ValueError(f"{name} must be at least {low:g}, not {value}")
 
 
-def check_whole(low: int, high: float, settings: Settings) -> None:
-    """Refuse what is no whole number from ``low`` to ``high``, which may be infinite.
+def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
+    """Refuse what is no whole number, and numbers below ``low`` or above ``high``.
 
     Raises:
         ValueError: naming the argument.
     """
-    bounds = f"of at least {low}" if math.isinf(high) else f"from {low} to {high}"
     for name, value in settings:
-        is_whole = isinstance(value, Integral) and not isinstance(value, bool)
-        if not (is_whole and low <= value <= high):
-            raise ValueError(f"{name} must be a whole number {bounds}, not {value!r}")
+        if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
+            raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
+        if int(value) > high:
+            raise ValueError(f"{name} must be at most {high}, not {value}")
 
 
 def check_above_zero(settings: Settings) -> None:

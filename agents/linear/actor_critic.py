@@ -110,7 +110,7 @@ class ActorCritic(SoftmaxAlgorithm):
         super()._begin_episodes()
         self._discounts = np.ones(self.n_envs)
 
-    def _memory(self) -> Critic:
+    def _memory_record(self) -> Critic:
         return Critic(self.policy.state_weights.numpy(), self._discounts)
 
     def made_from(self, rng: np.random.Generator) -> tuple[Any, ...]:

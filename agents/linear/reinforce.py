@@ -198,7 +198,7 @@ class Reinforce(SoftmaxAlgorithm):
             self._keep_up_to(2 * capacity)
         super()._learn_from(transitions)
 
-    def _memory(self) -> KeptEpisodes:
+    def _memory_record(self) -> KeptEpisodes:
         kept = (getattr(self, name) for name in self._kept)
         return KeptEpisodes(self.policy.state_weights.numpy(), *kept)
 

@@ -135,7 +135,7 @@ class TileAlgorithm(LearningAlgorithm):
     def _probabilities(self, sums: Floats) -> Floats:
         """How likely actions are by sums of shape (n, A), likewise."""
 
-    def _memory(self) -> Any:
+    def _memory_record(self) -> Any:
         """What compiled functions are handed besides the weights, in the memory of the agent."""
         return ()
 
@@ -152,7 +152,7 @@ class TileAlgorithm(LearningAlgorithm):
         return LinearAgent(
             self.settings()[0],
             self.policy.weights.numpy(),
-            self._memory(),
+            self._memory_record(),
             tiles,
             seen,
             room,

@@ -116,5 +116,5 @@ class DynaQ(ModelKeeper, QLearning):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_whole(0, MOST_PLANNING, settings_of(self, "planning_steps"))
-        check_whole(1, MOST_OUTCOMES, settings_of(self, "outcomes_kept"))
+        check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
+        check_whole(1, settings_of(self, "outcomes_kept"), MOST_OUTCOMES)

@@ -97,7 +97,8 @@ def learn_along_traces(agent: TabularAgent, env: Any, progress: Any, i: int) -> 
     settings, values, traces = agent.settings, agent.tables.values, agent.memory
     value = values[0, env.obs, env.action]
     ahead = 0.0 if env.terminated else value_ahead(agent, env, progress, 0)
-    td_error = env.reward + settings.gamma * ahead - value
+    env.target = env.reward + settings.gamma * ahead
+    env.td_error = td_error = env.target - value
     size = count_visit(agent, progress, 0, env.obs, env.action)
     factor = settings.gamma * settings.trace_decay * trace_kept(agent, env)
     earlier = fade(traces, i, factor, env.obs, env.action)

@@ -5,7 +5,6 @@ Source: Sutton and Barto (2nd edition), chapter 5.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,7 +90,7 @@ class RecordAlgorithm(EpisodicAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_whole(1, math.inf, settings_of(self, "longest_episode"))
+        check_whole(1, settings_of(self, "longest_episode"))
 
     def _make_memory(self) -> EpisodeRecords:
         shape = (self.n_envs, self.longest_episode)

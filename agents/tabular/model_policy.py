@@ -100,8 +100,15 @@ class ModelPolicy(QTablePolicy):
         """Take over a table and a model.
 
         Raises:
-            ValueError: if it is no model of these observations and actions.
+            ValueError: if it is no model of these observations and actions, or holds another
+                number of outcomes.
         """
+        held = state_dict.get("model_next_obs")
+        if getattr(held, "ndim", 0) == 3 and held.shape[2] != self.outcomes_kept:
+            raise ValueError(
+                f"holds a model with room for {held.shape[2]} outcomes of each pair of state and "
+                f"action, and the settings ask for {self.outcomes_kept}: leave them as they were"
+            )
         result = super().load_state_dict(state_dict, strict, assign)
         self.check_places()
         return result

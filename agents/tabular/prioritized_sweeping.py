@@ -108,6 +108,6 @@ class PrioritizedSweeping(ModelKeeper):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_whole(0, MOST_PLANNING, settings_of(self, "planning_steps"))
+        check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
         check_at_least(0.0, settings_of(self, "threshold"))
         check_finite(settings_of(self, "threshold"))

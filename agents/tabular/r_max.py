@@ -111,7 +111,7 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
         super()._check_arguments()
         if self.gamma == 1:
             raise ValueError("gamma must be below 1, so that planning comes to an end")
-        check_whole(1, MOST_OUTCOMES, settings_of(self, "known_after"))
+        check_whole(1, settings_of(self, "known_after"), MOST_OUTCOMES)
         check_above_zero(settings_of(self, "tolerance"))
         check_finite(settings_of(self, "tolerance"))
 

@@ -68,6 +68,7 @@ def learn_oldest(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:
     target = windowed_return(agent, env, progress, i)
     state, action = windows.states[i, place], windows.actions[i, place]
     error = move_towards(agent, progress, 0, state, action, target)
+    env.target, env.td_error = target, error
     windows.oldest[i] = (place + 1) % windows.states.shape[1]
     windows.lengths[i] -= 1
     return abs(error)
@@ -88,6 +89,7 @@ def learn_from_window(agent: TabularAgent, env: Any, progress: Any, i: int) -> f
     while env.done and windows.lengths[i] > 0:
         error += learn_oldest(agent, env, progress, i)
         n_learnt += 1
+        env.target = env.td_error = math.nan  # there is more than one
     return error / n_learnt
 
 
@@ -119,7 +121,7 @@ class WindowAlgorithm(EpisodicAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_whole(1, math.inf, settings_of(self, "n_steps"))
+        check_whole(1, settings_of(self, "n_steps"))
 
     def _make_memory(self) -> Windows:
         shape = (self.n_envs, self.n_steps)

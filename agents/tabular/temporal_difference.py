@@ -10,7 +10,6 @@ Source: Sutton and Barto (2nd edition), chapter 6.
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 from agents.common.exploration import GAUSSIAN_NOISE, choose_action, random_action
@@ -145,9 +144,10 @@ def update(agent: TabularAgent, env: Any, progress: Any) -> float:
     """
     table = int(env.uniform * agent.tables.values.shape[0])
     discount = 0.0 if env.terminated else agent.settings.gamma
-    env.target = env.reward + discount * value_ahead(agent, env, progress, table)
-    env.td_error = move_towards(agent, progress, table, env.obs, env.action, env.target)
-    return float(env.td_error)
+    target = env.reward + discount * value_ahead(agent, env, progress, table)
+    td_error = move_towards(agent, progress, table, env.obs, env.action, target)
+    env.target, env.td_error = target, td_error
+    return float(td_error)
 
 
 @inlined
@@ -163,8 +163,6 @@ def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
         env = envs[i]
         if not (env.terminated and agent.settings.skip_terminal_update):
             total_error += abs(update(agent, env, progress))
-        else:
-            env.target = env.td_error = math.nan
         env.obs = env.new_obs
         if env.done:
             env.next_action = UNDECIDED

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
+
 from sphinx.application import Sphinx
 
-# Pages that begin a folder, and the pages in it.
+# Pages that begin a folder, and what the names of the pages in it begin with. Those that the page
+# links to come first, in its order.
 FOLDERS = {
-    "algorithms": "algorithms/*",
-    "environments": "environments/*",
-    "decisions/README": "0*",
-    "lessons/index": "0*",
+    "algorithms": "algorithms/",
+    "environments": "environments/",
+    "decisions/README": "0",
+    "lessons/index": "0",
 }
 # In index.md, the place of the pages that it does not name.
 REST = "every-other-page"
@@ -18,7 +21,9 @@ REST = "every-other-page"
 def read(app: Sphinx, page: str, source: list[str]) -> None:
     """Add the list of pages to a page that begins a folder, and what is new to the first page."""
     if page in FOLDERS:
-        source[0] += f"\n```{{toctree}}\n:hidden:\n:glob:\n{FOLDERS[page]}\n```\n"
+        linked = re.findall(rf"\]\(({FOLDERS[page]}[\w-]+)\.md", source[0])
+        names = [*dict.fromkeys(linked), f"{FOLDERS[page]}*"]
+        source[0] += "\n```{toctree}\n:hidden:\n:glob:\n" + "\n".join(names) + "\n```\n"
     if page == "index":
         named = set(source[0].split())
         found = {name for name in app.env.found_docs if "/" not in name} - {"index"}

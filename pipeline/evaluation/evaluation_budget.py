@@ -12,6 +12,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
+from pipeline.evaluation.bracketed import bracketed_yardstick
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.train_spec import TrainSpec
 
@@ -47,6 +48,7 @@ class SampledEvaluator:
 
     def __init__(self, spec: TrainSpec, env: VecEnv) -> None:
         self.env = env
+        self.yardstick = bracketed_yardstick(spec)
         self.seed = spec.seed
         self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
         # Whoever says when to evaluate, or how long, gets that.
@@ -105,7 +107,7 @@ class SampledEvaluator:
             found = found.joined(evaluate(model, self.env, n_more, seed=None))
         self.n_steps += int(found.lengths.sum())
         self._usual_length = found.mean_length
-        return found
+        return found.measured_by(self.yardstick)
 
 
 def share_of(model: BaseAlgorithm) -> float:

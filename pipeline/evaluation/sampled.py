@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,29 +23,60 @@ KNOWN_LIBRARIES = ("agents", "stable_baselines3")
 # Where nothing that an agent does makes a difference, sums may differ by this much.
 ROUNDING = 1e-12
 
+# By so many standard errors a mean is above what no policy exceeds only where something is wrong.
+BEYOND_CHANCE = 6.0
+
 
 @dataclass(frozen=True)
 class Yardstick:
     """What returns on an environment are measured against.
 
     Attributes:
-        optimum: the highest expected return that any policy has under the time limit.
+        optimum: the highest expected return that any policy has under the time limit. Where that
+            is not known, a return that no policy exceeds.
         baseline: the highest of uniformly random actions and of each constant action.
+        at_least: where the optimum is not known, a return that a policy was seen to reach: the
+            optimum is bracketed by the two. None where it is known.
     """
 
     optimum: float
     baseline: float
+    at_least: float | None = None
 
     def gap(self, expected_return: float) -> float:
-        """How far a return stays behind the optimum."""
+        """How far a return stays behind the optimum, or of a bracket behind its upper end."""
         return self.optimum - expected_return
 
     def score(self, expected_return: float) -> float:
-        """The return on a scale where 1 is the optimum and 0 the best random or constant policy."""
+        """The return on a scale where 1 is the optimum and 0 the best random or constant policy.
+
+        Of a bracket it is measured by the upper end: between 0 and 1 it never says too much.
+        """
         rounding = ROUNDING * max(1.0, abs(self.optimum))
         if self.optimum - self.baseline <= rounding:
             return 1.0 if expected_return >= self.optimum - rounding else 0.0
         return (expected_return - self.baseline) / (self.optimum - self.baseline)
+
+    @property
+    def lower_end(self) -> Yardstick:
+        """What measures by the lower end of a bracket; of a known optimum the same."""
+        return self if self.at_least is None else Yardstick(self.at_least, self.baseline)
+
+    def figures(self, expected_return: float) -> dict[str, float]:
+        """How a return measures, as JSON; of a bracket by both of its ends."""
+        found = {
+            "optimum": self.optimum,
+            "baseline": self.baseline,
+            "gap": self.gap(expected_return),
+            "score": self.score(expected_return),
+        }
+        if self.at_least is not None:
+            found |= {
+                "optimum_at_least": self.at_least,
+                "gap_at_least": self.lower_end.gap(expected_return),
+                "score_at_most": self.lower_end.score(expected_return),
+            }
+        return found
 
 
 @dataclass(frozen=True)
@@ -93,6 +125,22 @@ class Evaluation:
         """Share of the episodes that succeed, if the environment says so."""
         return None if self.successes is None else float(self.successes.mean())
 
+    @property
+    def beats_optimum(self) -> bool:
+        """Whether the mean is above what no policy exceeds, by more than chance can explain.
+
+        Then the environment is not the one that the bracket is of, or the bracket is wrong.
+        """
+        if self.yardstick is None or self.yardstick.at_least is None:
+            return False
+        error = self.std_return / math.sqrt(max(len(self.returns) - 1, 1))
+        # Monitor rounds returns to six digits.
+        return self.mean_return - BEYOND_CHANCE * error > self.yardstick.optimum + 1e-6
+
+    def measured_by(self, yardstick: Yardstick | None) -> Evaluation:
+        """The same figures, with what to measure them against."""
+        return replace(self, yardstick=yardstick)
+
     def joined(self, more: Evaluation) -> Evaluation:
         """These episodes and further ones of the same agent, all of them sampled."""
         both = None
@@ -112,12 +160,9 @@ class Evaluation:
             "n_episodes": None if self.is_exact else len(self.returns),
         }
         if self.yardstick is not None:
-            figures |= {
-                "optimum": self.yardstick.optimum,
-                "baseline": self.yardstick.baseline,
-                "gap": self.yardstick.gap(self.mean_return),
-                "score": self.yardstick.score(self.mean_return),
-            }
+            figures |= self.yardstick.figures(self.mean_return)
+        if self.beats_optimum:
+            figures["beats_optimum"] = True
         return figures
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Literal
 
 from pipeline.errors import UserError
+from pipeline.file_digests import RECORD
 from pipeline.models.recorded_runs import run_in
 from pipeline.run_folder import INTERRUPTED, Run
 
@@ -27,7 +29,7 @@ def model_at(path: Path, which: Which = "final") -> Path:
         UserError: if there is none, or ``which`` asks for another than the path names.
     """
     with_suffix = path.with_name(f"{path.name}.zip") if path.name else path
-    if path.is_dir() and not with_suffix.is_file():
+    if path.is_dir() and (os.path.lexists(path / RECORD) or not with_suffix.is_file()):
         return model_of(run_in(path), which)
     if which != "final":
         raise UserError(

@@ -123,10 +123,11 @@ def _draw_evaluations(axes: Axes, steps: Floats, means: Floats) -> None:
 
 
 def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
-    lines = (
-        ("optimum", yardstick.optimum, "-"),
-        ("best random or constant policy", yardstick.baseline, ":"),
-    )
+    least = yardstick.at_least
+    lines = [("optimum" if least is None else "optimum, at most", yardstick.optimum, "-")]
+    if least is not None:
+        lines.append(("optimum, at least", least, "--"))
+    lines.append(("best random or constant policy", yardstick.baseline, ":"))
     for label, height, style in lines:
         axes.axhline(height, color=GREEN, linestyle=style, linewidth=1.2, label=label, zorder=1)
 

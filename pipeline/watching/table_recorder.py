@@ -109,6 +109,9 @@ class TableRecorder(BlockCallback):
             self._returns = np.zeros(self.model.n_envs)
             self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)
         self._obs = np.array(self.model._last_obs)
+        told = getattr(self.model, "last_steps", None)
+        if told is not None:  # so that no number of an earlier step is taken for one of the next
+            told["target"] = told["td_error"] = np.nan
 
     def _on_step(self) -> bool:
         if not self.is_full:

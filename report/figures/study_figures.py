@@ -91,8 +91,10 @@ def _draw_curve(axes: Axes, curve: Curve, mark: Mark, alpha: float = 0.2) -> Non
 
 
 def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
+    is_known = environment.optimum_at_least is None
     for label, height, style in (
-        ("optimum", environment.optimum, "-"),
+        ("optimum" if is_known else "optimum, at most", environment.optimum, "-"),
+        ("optimum, at least", environment.optimum_at_least, "--"),
         ("best random or constant policy", environment.baseline, ":"),
     ):
         if height is not None:
@@ -119,7 +121,11 @@ def draw_runs(
     title = environment.environment
     if metric in ("final", "best") and environment.optimum is not None:
         axes.axvline(environment.optimum, color=REFERENCE, linewidth=1)
-        title += "; the line is the optimum"
+        if environment.optimum_at_least is None:
+            title += "; the line is the optimum"
+        else:
+            axes.axvline(environment.optimum_at_least, color=REFERENCE, linewidth=1)
+            title += "; the optimum lies between the lines"
     axes.set_title(title, loc="left")
     axes.set_xlabel(f"{METRIC_WORDS[metric]}; mean, 95 % interval, each seed")
 

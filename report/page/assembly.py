@@ -103,6 +103,7 @@ def _data(report: Report, sections: list[Section]) -> dict[str, str]:
             {
                 "label": environment.environment,
                 "optimum": environment.optimum,
+                "optimum_at_least": environment.optimum_at_least,
                 "baseline": environment.baseline,
                 "agents": [agent.agent for agent in environment.agents],
             }

@@ -16,7 +16,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from report.ranking_cells import bar
-from report.wording import interval_alone, number
+from report.wording import interval_alone, number, optimum_words
 
 _WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
 
@@ -37,7 +37,12 @@ def templates() -> Environment:
         undefined=StrictUndefined,
     )
     environment.filters.update(
-        number=number, interval=interval_alone, p_value=p_value, bar=bar, breakable=breakable
+        number=number,
+        optimum=optimum_words,
+        interval=interval_alone,
+        p_value=p_value,
+        bar=bar,
+        breakable=breakable,
     )
     return environment
 

@@ -89,7 +89,7 @@ def test_global_generators_are_left_alone(name):
     assert states() == before
 
 
-@pytest.mark.parametrize("name", EXPLORERS)
+@pytest.mark.parametrize("name", ["qlearning", "sarsa", "expected_sarsa", "double_qlearning"])
 def test_learning_happens(name):
     explore = 1.0 if name == "double_qlearning" else 0.1
     model = make(

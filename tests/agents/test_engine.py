@@ -77,8 +77,26 @@ FACTORS = (
 STEPS = 6_000
 
 
+# Actions without probabilities are nothing to these; weighted means have a step size of their own.
+NEEDING_PROBABILITIES = {"expected_sarsa", "n_step_tree_backup", "off_policy_monte_carlo"}
+OTHER_STEP_SIZES = {"constant", "linear", "exponential"}
+# They differ in what they remember, for which these environments are enough.
+REMEMBERING = {
+    name
+    for name in FACTORS[1]
+    if name not in ("qlearning", "sarsa", "expected_sarsa", "double_qlearning")
+}
+ENOUGH_ENVS = {"slippery Warehouse", "FrozenLake"}
+
+
 def allowed(case):
-    return not ("expected_sarsa" in case and "gaussian" in case)
+    """Whether these levels of some factors can be combined, and are to be."""
+    levels = set(case)
+    return not (
+        ("gaussian" in levels and levels & NEEDING_PROBABILITIES)
+        or ("off_policy_monte_carlo" in levels and levels & OTHER_STEP_SIZES)
+        or (levels & REMEMBERING and levels & (set(ENVS) - ENOUGH_ENVS))
+    )
 
 
 def pairs(case):
@@ -123,6 +141,7 @@ def state_of(model):
         "observations": model._last_obs.tolist(),
         "episode starts": model._last_episode_starts.tolist(),
         "pending actions": model._next_actions.tolist(),
+        "memory": [array.tobytes() for array in model._memory],
         "steps": model.num_timesteps,
         "total": model._total_timesteps,
         "episodes": model._episode_num,

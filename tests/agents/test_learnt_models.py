@@ -382,6 +382,12 @@ def test_a_damaged_model_is_refused(name, array, value, tmp_path):
         type(agent).load(tmp_path / "agent.zip")
 
 
+def test_a_model_of_another_number_of_outcomes_is_refused(tmp_path):
+    make("dyna_q", "FrozenLake-v1", engine="interpreted").save(tmp_path / "agent")
+    with pytest.raises(ValueError, match=r"room for 1 outcomes of .* the settings ask for 3"):
+        load_algorithm("dyna_q").load(tmp_path / "agent.zip", outcomes_kept=3)
+
+
 def test_a_model_of_another_shape_is_refused():
     agent = make("dyna_q", "FrozenLake-v1", engine="interpreted")
     agent.policy.model_rewards = th.zeros(16, 4, 2, dtype=th.float64)
@@ -392,9 +398,17 @@ def test_a_model_of_another_shape_is_refused():
 @pytest.mark.parametrize(
     ("name", "arguments", "complaint"),
     [
-        ("dyna_q", {"planning_steps": -1}, "planning_steps must be a whole number from 0 to"),
+        (
+            "dyna_q",
+            {"planning_steps": -1},
+            "planning_steps must be a whole .* at least 0",
+        ),
         ("dyna_q", {"planning_steps": 2.5}, "planning_steps must be a whole number .*, not 2.5"),
-        ("dyna_q", {"outcomes_kept": 0}, "outcomes_kept must be a whole number from 1 to"),
+        (
+            "dyna_q",
+            {"outcomes_kept": 0},
+            "outcomes_kept must be a whole .* at least 1",
+        ),
         ("dyna_q", {"outcomes_kept": True}, "outcomes_kept must be a whole number .*, not True"),
         ("dyna_q", {"outcomes_kept": 10**7}, "at most 1562500 of each"),
         ("dyna_q_plus", {"kappa": -0.1}, "kappa must be at least 0"),
@@ -402,7 +416,8 @@ def test_a_model_of_another_shape_is_refused():
         ("prioritized_sweeping", {"threshold": -1.0}, "threshold must be at least 0"),
         ("prioritized_sweeping", {"planning_steps": 1e9}, "planning_steps must be a whole number"),
         ("r_max", {"gamma": 1.0, "value_bound": 1.0}, "gamma must be below 1"),
-        ("r_max", {"known_after": 0}, "known_after must be a whole number from 1 to"),
+        ("r_max", {"known_after": 0}, "known_after must be a whole number of at least 1, not 0"),
+        ("r_max", {"known_after": 10**30}, "known_after must be at most 100000000, not 1000"),
         ("r_max", {"tolerance": 0.0}, "tolerance must be above 0"),
     ],
 )

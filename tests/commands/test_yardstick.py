@@ -115,8 +115,8 @@ def test_help_has_examples_for_the_one_who_asks(type_command, command):
     [
         (["trian"], "unknown command 'trian': did you mean 'train'?"),
         (["trian", "--env", "X"], "unknown command 'trian': did you mean 'train'?"),
-        (["x"], "unknown command 'x': known are train, enjoy, compare, tune, inspect"),
-        ([], "which command? train, enjoy, compare, tune, inspect"),
+        (["x"], "unknown command 'x': known are train, enjoy, compare, tune, pack, inspect"),
+        ([], "which command? train, enjoy, compare, tune, pack, inspect"),
         (["--env", "train"], "unknown argument --env: known are -h, --help, --version"),
     ],
 )

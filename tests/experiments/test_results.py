@@ -16,7 +16,7 @@ from experiments.analysis import analyse
 from experiments.run_curves import CURVE_COLUMNS
 from experiments.seed_values import curves_by_agent, mean_curve, values_over_seeds
 from experiments.study_plan import plan
-from experiments.study_results import RUN_COLUMNS, EarlyResults, read_results
+from experiments.study_results import RUN_COLUMNS, EarlyResults, read_results, threshold_of
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
 from report.conclusions import conclusion, places_without_a_run
@@ -127,6 +127,7 @@ def test_the_columns_of_the_files_that_others_read():
         "success_rate",
         "exact",
         "optimum",
+        "optimum_at_least",
         "baseline",
         "gap",
         "score",
@@ -348,6 +349,55 @@ def test_agents_of_which_every_two_are_equivalent_make_one_sentence(tmp_path):
     assert "and expected_sarsa are best, and equivalent: return of the final policy 93" in text
     assert text.count("equivalent in") == 2
     assert "double_qlearning is better than qlearning (by 3)" in text
+
+
+def bracketed_results(tmp_path, ends, finals):
+    """Runs on CartPole whose optimum lies between two ends, and whose baseline is 20."""
+    study = study_of(environments=[UNKNOWN])
+    planned = plan(study, tmp_path)
+    low, high = ends
+    for run in planned:
+        value = finals[run.agent][run.seed]
+        figures = {"optimum": high, "optimum_at_least": low, "baseline": 20.0}
+        figures |= {"gap": high - value, "score": (value - 20) / (high - 20)}
+        final = {"mean_return": value, "std_return": 1.0, "mean_length": 10.0, "exact": False}
+        write_run(run, [(50, value / 2), (100, value)], known=False, final=final | figures)
+    return read_results(study, planned, tmp_path)
+
+
+def test_what_is_within_reach_goes_by_the_lower_end_of_a_bracket(tmp_path):
+    finals = {"qlearning": [400.0] * 4, "sarsa": [30.0] * 4}
+    results = bracketed_results(tmp_path, (420.0, 520.0), finals)
+    (environment,) = analyse(results).environments
+    assert (environment.optimum, environment.optimum_at_least) == (520, 420)
+    assert environment.margin == pytest.approx(0.02 * 400)
+    assert environment.threshold == 475, "the environment's own"
+    assert environment.agents[0].score.mean.point == pytest.approx(380 / 500)
+    assert set(results.summary["optimum_at_least"]) == {420.0}
+    text = said(results)
+    assert (
+        "return of the final policy 400, score 0.76; the optimum is 420 to 520 (bracketed)" in text
+    )
+    assert "MORE THAN" not in text
+
+
+def test_more_than_any_policy_can_reach_stands_in_the_conclusions(tmp_path):
+    finals = {"qlearning": [530.0, 531.0, 530.0, 531.0], "sarsa": [500.0] * 4}
+    text = said(bracketed_results(tmp_path, (420.0, 520.0), finals))
+    assert "qlearning has MORE THAN ANY POLICY CAN REACH, 520: the environment is not" in text
+
+
+@pytest.mark.parametrize(
+    ("env_id", "ends", "threshold"),
+    [
+        ("Pendulum-v1", {"optimum": -100.0, "optimum_at_least": -200.0}, -1200 + 0.95 * 1000),
+        ("CartPole-v1", {"optimum": 500.0, "optimum_at_least": 499.0}, 475.0),
+        ("FrozenLake-v1", {"optimum": 0.5}, -1200 + 0.95 * 1200.5),
+    ],
+)
+def test_what_counts_as_solved_beside_a_bracket(env_id, ends, threshold):
+    final = {**ends, "baseline": -1200.0}
+    assert threshold_of(study_of(), env_id, final) == pytest.approx(threshold)
 
 
 def test_an_environment_without_a_known_optimum(tmp_path):

@@ -38,6 +38,35 @@ def test_a_sled_takes_as_many_steps_as_worked_out():
         assert exact * 0.93 - 1 <= least <= exact
 
 
+def test_wind_that_is_stronger_than_the_engine_blows_at_the_greatest_speed():
+    windy = SLED._replace(pull_size=0.005, pull_rate=0.0)
+    cells = cells_of(windy, 400, 141)
+    costs = optimistic_costs(windy, cells)
+    # From -0.39 to 1 it takes twenty steps of 0.07; from the best place in each cell nineteen.
+    assert costs[cells.positions.searchsorted(-0.39) - 1, -1] == pytest.approx(19.5, abs=0.51)
+
+
+def test_the_last_step_costs_what_the_nearest_state_of_a_cell_does():
+    motion = MOTIONS["Pendulum-v1"]._replace(horizon=1)
+    cells = cells_of(motion, 20, 16)
+    costs = optimistic_costs(motion, cells)
+    for column, row in ((0, 0), (9, 8), (10, 7), (15, 3), (19, 15)):
+        x = min(abs(cells.positions[column] + near) for near in (0, cells.width))
+        v = min(abs(cells.speeds[row] + near) for near in (0, cells.height))
+        assert costs[column, row] == pytest.approx(x**2 + 0.1 * v**2, abs=1e-5)
+        assert costs[column, row] <= x**2 + 0.1 * v**2
+
+
+def test_a_planned_sled_takes_hardly_a_step_more_than_it_has_to():
+    plan = interpolated_costs(SLED, 200, 101, SLED.actions)
+    position, speed, n_steps = -0.1, 0.0, 0
+    while position < SLED.high:
+        n_steps += 1
+        action, _ = best_action(SLED, SLED.actions, plan[SLED.horizon - n_steps], position, speed)
+        position, speed = moved(SLED, position, speed, action)
+    assert n_steps <= steps_of_a_sled(1.1) + 1
+
+
 def test_finer_cells_bound_more_closely():
     motion = MOTIONS["MountainCar-v0"]
     bounds = []

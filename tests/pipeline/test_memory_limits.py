@@ -58,6 +58,7 @@ def test_bytes_of_an_observation(space, n_bytes):
         ({"n_envs": 100, "frame_stack": 10**6}, {}, "frame_stack 1,000,000 with n_envs 100"),
         ({}, {"buffer_size": 9, "batch_size": 10**9}, "batch_size"),
         ({}, {"n_delta": 10**9}, "n_delta"),
+        ({"n_envs": 8}, {"longest_episode": 10**7}, "longest_episode 10,000,000 with n_envs 8"),
         ({}, {"policy_kwargs": {"net_arch": [10**4, 10**4]}}, "network of policy_kwargs"),
         ({}, {"policy_kwargs": {"net_arch": {"pi": [64], "vf": [10**9]}}}, "network"),
         ({}, {"policy_kwargs": {"lstm_hidden_size": 10**4}}, "network"),

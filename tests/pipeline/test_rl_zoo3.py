@@ -17,6 +17,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.results_plotter import ts2xy
 
 import train
+from pipeline.packing.pack_files import pack
 from pipeline.run_folder import Run
 from tests.peers.peer_environment import peer_python
 
@@ -112,13 +113,20 @@ def run(tmp_path_factory):
     return Run.find(folder / "logs", "ppo", "Warehouse-v0")
 
 
+def _made(folder):
+    folder.mkdir(parents=True)
+    return folder
+
+
 @pytest.fixture(scope="module")
 def printed(run):
-    """What is printed when it reads the run, plays it, and plays the last checkpoint."""
+    """What is printed when it reads the run, plays it, its last checkpoint, and its pack."""
     folder = run.path.parent.parent
     words = ["--algo", "ppo", "--env", "Warehouse-v0", "-f", str(folder)]
     words += ["--no-render", "-n", "45", "--device", "cpu", "--gym-packages", "envs"]
-    plays = json.dumps([words, [*words, "--load-last-checkpoint"]])
+    pack(run.path, _made(folder / "packs" / "ppo") / "Warehouse-v0_1")
+    of_pack = [str(folder / "packs") if word == str(folder) else word for word in words]
+    plays = json.dumps([words, [*words, "--load-last-checkpoint"], of_pack])
     parts = python(READ + ENJOY, folder, "Warehouse-v0", plays).split("=====\n")
     return [part.splitlines() for part in parts]
 
@@ -140,11 +148,17 @@ def test_rl_zoo3_reads_a_run_folder(run, printed):
 
 def test_rl_zoo3_plays_a_run(run, printed):
     """Its own command, with the environment as our hyperparameters make it."""
-    _, *played = printed
+    _, *played, _ = printed
     for out, path in zip(played, (run.model_path, run.checkpoint_path(256)), strict=True):
         assert any(str(path) in line for line in out)
         lengths = [line for line in out if line.startswith("Episode Length")]
         assert lengths == ["Episode Length 15"] * 3
+
+
+def test_rl_zoo3_plays_a_pack(printed):
+    lengths = [line for line in printed[-1] if line.startswith("Episode Length")]
+    assert lengths == ["Episode Length 15"] * 3
+    assert any("packs" in line and "vecnormalize" not in line for line in printed[-1])
 
 
 def test_the_librarys_plots_read_our_monitors(run):

@@ -137,6 +137,54 @@ def test_an_episode_that_is_cut_off_still_bootstraps():
     assert 0.5 in cut["target"]
 
 
+class Line(gym.Env):
+    """Four cells in a row and one action, forward; each step earns 1, and the last cell ends it."""
+
+    observation_space = gym.spaces.Discrete(4)
+    action_space = gym.spaces.Discrete(1)
+
+    def reset(self, **options):
+        super().reset(**options)
+        self.cell = 0
+        return 0, {}
+
+    def step(self, action):
+        self.cell += 1
+        return self.cell, 1.0, self.cell == 3, False, {}
+
+
+def test_along_traces_several_entries_move_by_one_error():
+    """Step size 1/2, discount 1, lambda 1/2: errors 1, 1, 1; traces 1, then 1/2 and 1, ..."""
+    halves = {"learning_rate": 0.5, "gamma": 1.0, "trace_decay": 0.5}
+    _, recorder = watched(Line(), "sarsa_lambda", n_timesteps=3, **halves)
+    moves, changes = recorder.moves.rows, recorder.changes.rows
+    assert (moves["target"].tolist(), moves["td_error"].tolist()) == ([1.0] * 3, [1.0] * 3)
+    assert changes["step"].tolist() == [0, 1, 1, 2, 2, 2]
+    assert changes["entry"].tolist() == [0, 0, 1, 0, 1, 2]
+    assert changes["after"].tolist() == [0.5, 0.75, 0.5, 0.875, 0.75, 0.5]
+
+
+def test_of_several_steps_the_target_is_told_where_there_is_one():
+    """Two rewards of 1 make a target of 2; at the end two entries are moved, to 2 and to 1."""
+    _, recorder = watched(
+        Line(), "n_step_sarsa", n_timesteps=3, n_steps=2, learning_rate=0.5, gamma=1
+    )
+    moves, changes = recorder.moves.rows, recorder.changes.rows
+    assert np.array_equal(moves["target"], [np.nan, 2.0, np.nan], equal_nan=True)
+    assert np.array_equal(moves["td_error"], [np.nan, 2.0, np.nan], equal_nan=True)
+    assert changes["step"].tolist() == [1, 2, 2]
+    assert changes["entry"].tolist() == [0, 1, 2]
+    assert changes["after"].tolist() == [1.0, 1.0, 0.5]
+
+
+def test_whole_episodes_move_at_their_end():
+    _, recorder = watched(Line(), "monte_carlo", n_timesteps=6, learning_rate=0.5, gamma=1.0)
+    changes = recorder.changes.rows
+    assert changes["step"].tolist() == [2, 2, 2, 5, 5, 5]
+    assert changes["after"].tolist() == [1.5, 1.0, 0.5, 2.25, 1.5, 0.75]
+    assert np.isnan(recorder.moves.rows["target"]).all()
+
+
 def test_there_is_an_end_to_what_is_kept(monkeypatch):
     monkeypatch.setattr(table_recorder, "MOVES_UNASKED", 50)
     monkeypatch.setattr(table_recorder, "MOST_MOVES", 80)

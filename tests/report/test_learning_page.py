@@ -5,6 +5,7 @@ import gzip
 import json
 import re
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from rich.console import Console
@@ -13,7 +14,7 @@ from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
 from report.learning_page import learning_assembly, write_learning_page
-from report.learning_page.learning_data import exact_json
+from report.learning_page.learning_data import _layout_of, exact_json
 
 
 @pytest.fixture
@@ -65,6 +66,17 @@ def test_the_map_is_that_of_the_training(watch):
     settings = {"env_kwargs": {"desc": ["S.G"]}, "train_env_kwargs": {"desc": ["G.S"]}}
     data, _, _ = watch(settings=settings)
     assert data["layout"]["rows"] == ["G.S"]
+
+
+def test_where_observations_are_not_the_states_there_is_no_map():
+    class Mirrored(gym.ObservationWrapper):
+        def observation(self, obs):
+            return 15 - obs
+
+    env = gym.make("FrozenLake-v1")
+    assert _layout_of(env, 16).rows[0] == "S..."
+    assert _layout_of(Mirrored(env), 16) is None
+    assert _layout_of(env, 17) is None
 
 
 def test_without_a_map_states_are_numbers(watch):

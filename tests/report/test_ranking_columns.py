@@ -88,6 +88,14 @@ def test_the_lowest_regret_is_the_best(ranking, made_up):
     assert (orders["Score"], orders["Gap"]) == ("descending", "ascending")
 
 
+def test_the_gap_to_a_bracket_goes_from_one_end_to_the_other(made_up):
+    agent = made_up.agent("first", 90.0, final=made_up.estimate(93.0, 92.0, 95.0))
+    (gap,) = [column for column in COLUMNS if column.page == "Gap"]
+    place = made_up.environment([agent], optimum=100.0, optimum_at_least=97.0)
+    cell = gap.cell(Row(agent, place))
+    assert (cell.text, cell.note) == ("7", "2 to 8")
+
+
 def test_what_applies_to_no_agent_has_no_column(ranking, made_up):
     agent = made_up.agent(
         "alone",

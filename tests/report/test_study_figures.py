@@ -141,6 +141,13 @@ def test_the_optimum_and_the_baseline_policy_are_lines_across(curves_drawn):
         assert place.line("optimum")["colour"] == GREY
 
 
+def test_both_ends_of_a_bracket_are_lines_across(curves_drawn):
+    for place in curves_drawn(optimum_at_least=90.0):
+        assert place.line("optimum, at most")["y"] == [100, 100]
+        assert place.line("optimum, at least")["y"] == [90, 90]
+        assert place.line("optimum, at least")["style"] == "--"
+
+
 def test_where_the_optimum_is_not_known_no_line_stands_for_it(curves_drawn):
     left, right = curves_drawn(optimum=None, baseline=None)
     assert left.names == right.names == ["first", "second"]
@@ -228,6 +235,12 @@ def test_the_optimum_of_runs_is_drawn_where_they_can_reach_it(runs_drawn, metric
     assert place.labels == (f"{words}; mean, 95 % interval, each seed", "")
     if has_line:
         assert (place.lines[-1]["x"], place.lines[-1]["colour"]) == ([100, 100], GREY)
+
+
+def test_runs_are_drawn_beside_both_ends_of_a_bracket(runs_drawn):
+    place = runs_drawn(optimum_at_least=90.0)
+    assert [line["x"] for line in place.lines[6:]] == [[100, 100], [90, 90]]
+    assert place.title == "lake; the optimum lies between the lines"
 
 
 def test_runs_without_a_known_optimum(runs_drawn):

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from report.terminal_tables import print_episodes_table
-from report.wording import number, ordinal, seeds
+from report.wording import number, optimum_words, ordinal, seeds
 
 
 @pytest.mark.parametrize(
@@ -54,6 +54,19 @@ def test_how_many_seeds():
         "10 seeds",
         "0 to 1 seed",
     )
+
+
+@pytest.mark.parametrize(
+    ("ends", "text"),
+    [
+        ((None, None), "-"),
+        ((79.0, None), "79"),
+        ((-134.442, -140.856), "-140.9 to -134.4 (bracketed)"),
+        ((99.94951, 99.94921), "99.949 to 99.950 (bracketed)"),
+    ],
+)
+def test_the_optimum_or_between_what_it_lies(ends, text):
+    assert optimum_words(*ends) == text
 
 
 def test_episodes_stand_in_columns_that_end_on_one_line():

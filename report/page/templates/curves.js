@@ -20,7 +20,7 @@ report.section("curves", (root, _, place) => {
     const { linearUpTo: linear, onVariant } = place()[kind];
     // Nobody is to read returns of a variant against the optimum of the environment itself.
     const judged = report.page.environments[report.environment];
-    const environment = onVariant.length ? { ...judged, optimum: null, baseline: null } : judged;
+    const environment = onVariant.length ? { ...judged, optimum: null, optimum_at_least: null, baseline: null } : judged;
     const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
     const height = symlog?.height ?? ((value) => value);
     const curves = Object.entries(place()[kind][by]).filter(([label]) => isShown(label));

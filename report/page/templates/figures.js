@@ -139,12 +139,16 @@
     return traces;
   };
 
+  const optimumName = ({ optimum, optimum_at_least: least }) =>
+    least === null ? `optimum ${report.number(optimum)}` : `optimum between ${report.number(least)} and ${report.number(optimum)}`;
+
   // The optimum and the best random or constant policy as lines: across, or upright where the middle of the
   // horizontal axis is given, so that their names fall inside the figure and on no other name.
   report.references = (environment, height, middle = null) =>
     [
-      { name: "optimum", value: environment.optimum, dash: "solid", isUpper: true },
-      { name: "best random or constant policy", value: environment.baseline, dash: "dot", isUpper: false },
+      { name: optimumName(environment), value: environment.optimum, dash: "solid", isUpper: true },
+      { name: "", value: environment.optimum_at_least, dash: "dash", isUpper: true },
+      { name: `best random or constant policy ${report.number(environment.baseline)}`, value: environment.baseline, dash: "dot", isUpper: false },
     ]
       .filter(({ value }) => value !== null)
       .map(({ name, value, dash, isUpper }) => {
@@ -161,7 +165,7 @@
           type: "line",
           ...place,
           line: { color: report.css("--muted"), width: 1.4, dash },
-          label: { text: `${name} ${report.number(value)}`, textangle: 0, font: { size: 11, color: report.css("--muted") }, ...side },
+          label: { text: name, textangle: 0, font: { size: 11, color: report.css("--muted") }, ...side },
         };
       });
 

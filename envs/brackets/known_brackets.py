@@ -1,0 +1,99 @@
+"""Brackets that were worked out for environments of Gymnasium as they are by default.
+
+`benchmarks/optimum_brackets.py` writes them. One is claimed of an environment only if that is the
+class, with the constants and under the time limit, that it was worked out for, and if nothing
+around it changes rewards, actions or steps.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+from envs.known_models import TRANSPARENT_WRAPPERS, time_limit
+
+DATA = Path(__file__).with_name("brackets.json")
+
+# What an agent is shown makes no difference to what can be had.
+_OBSERVATION_HOMES = ("gymnasium.wrappers.", "envs.wrappers.")
+
+
+@dataclass(frozen=True)
+class OptimumBracket:
+    """What is known of the highest mean return that any policy has, over starts that are drawn.
+
+    Attributes:
+        lower: what a policy was seen to reach.
+        upper: what no policy exceeds.
+        baseline: the mean return of the best random or constant policy.
+    """
+
+    lower: float
+    upper: float
+    baseline: float
+
+
+def optimum_bracket(env: gym.Env[Any, Any]) -> OptimumBracket | None:
+    """The bracket of an environment, or None where there is none that holds for it."""
+    base = env.unwrapped
+    entry = known_entries().get(f"{type(base).__module__}:{type(base).__qualname__}", {})
+    found = entry.get(time_limit(env))
+    if found is None or not _is_plain(env) or constants_of(base) != found["constants"]:
+        return None
+    return OptimumBracket(found["lower"], found["upper"], found["baseline"]["mean"])
+
+
+def may_have_bracket(env_id: str) -> bool:
+    """Whether an environment is of a class that has brackets, without making it."""
+    registered = gym.registry.get(env_id.rpartition(":")[2])
+    return registered is not None and registered.entry_point in known_entries()
+
+
+@cache
+def known_entries() -> dict[str, dict[int | None, dict[str, Any]]]:
+    """What is stored, by class and time limit."""
+    found: dict[str, dict[int | None, dict[str, Any]]] = {}
+    for entry in json.loads(DATA.read_text(encoding="utf-8")).values():
+        found.setdefault(entry["class"], {})[entry["time_limit"]] = entry
+    return found
+
+
+def constants_of(base: gym.Env[Any, Any]) -> dict[str, Any]:
+    """The numbers, texts and lists that an environment's dynamics may depend on, by name.
+
+    Those of its class count too. What drawing needs, and what changes from step to step, do not.
+    """
+    named = {**_members(type(base)), **vars(base)}
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in sorted(named.items())
+        if isinstance(value, int | float | str | list | tuple) and not name.startswith(_NO_DYNAMICS)
+    }
+
+
+_NO_DYNAMICS = (
+    *("__", "_is_protocol", "_np_random", "render", "screen", "SCREEN", "isopen"),
+    *("state", "steps_beyond", "last_u"),
+)
+
+
+def _members(kind: type) -> dict[str, Any]:
+    return {name: value for each in reversed(kind.__mro__) for name, value in vars(each).items()}
+
+
+def _is_plain(env: gym.Env[Any, Any]) -> bool:
+    """Whether no wrapper, and nobody's own method, comes between agent and environment."""
+    while isinstance(env, gym.Wrapper):
+        kind = type(env)
+        only_shows = isinstance(env, gym.ObservationWrapper) and kind.__module__.startswith(
+            _OBSERVATION_HOMES
+        )
+        if not only_shows and f"{kind.__module__}.{kind.__qualname__}" not in TRANSPARENT_WRAPPERS:
+            return False
+        env = env.env
+    return not {"step", "reset"} & vars(env).keys()

@@ -1,0 +1,145 @@
+"""What a pack may not tell: paths of this machine, and so names of people and folders; secrets."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import re
+import zipfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path, PurePosixPath, PureWindowsPath
+from typing import Any
+
+from pipeline.errors import UserError
+from pipeline.run_folder import Run
+from safe_files.archives import read_members
+
+# Fields of a spec that name places or code of the machine that the run was done on.
+_PLACES: Mapping[str, Any] = {
+    "log_folder": "logs",
+    "tensorboard_log": None,
+    "trained_agent": None,
+    "watch_learning": None,
+    "user_modules": [],
+}
+# Fields of ``run.json`` that say what came out, and nothing of where.
+_TOLD = (
+    "state",
+    "record_version",
+    "env_name",
+    "versions",
+    "n_timesteps",
+    "final",
+    "best_mean_return",
+    "best_timesteps",
+    "best_episodes",
+    "engine",
+    "regret",
+    "pulls",
+)
+_DATE = (1980, 1, 1, 0, 0, 0)
+_SERIALIZED = re.compile(rb'":serialized:": "([A-Za-z0-9+/=]*)"')
+_SECRET = re.compile(r"passw|secret|token|credential|api_?key", re.IGNORECASE)
+_SHORTEST = 4  # letters of a path that is looked for: "/" is everywhere
+
+
+def without_places(value: Any) -> Any:
+    """Settings in which a path from the root, or from somebody's home, is the file's name alone."""
+    if isinstance(value, str):
+        return _name_alone(value)
+    if isinstance(value, dict):
+        return {key: without_places(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_places(item) for item in value]
+    return value
+
+
+def _name_alone(text: str) -> str:
+    windows = PureWindowsPath(text)
+    if windows.is_absolute() or windows.drive or text.startswith("~"):
+        return windows.name
+    return PurePosixPath(text).name if text.startswith("/") else text
+
+
+def record_to_tell(info: Mapping[str, Any]) -> dict[str, Any]:
+    """A ``run.json`` for others, without digests yet."""
+    spec = info["spec"]
+    told = {name: info[name] for name in _TOLD if name in info}
+    hyperparams = without_places(spec["hyperparams"])
+    known = {name: value for name, value in _PLACES.items() if name in spec}
+    return {**told, "spec": {**spec, **known, "hyperparams": hyperparams}}
+
+
+def check_secrets(settings: Any, place: str = "hyperparams") -> None:
+    """Refuse settings that look like something that nobody else should have.
+
+    Raises:
+        UserError: naming the key.
+    """
+    if isinstance(settings, dict):
+        for key, value in settings.items():
+            if isinstance(value, str) and value and _SECRET.search(str(key)):
+                raise UserError(
+                    f"{place}.{key} looks like a secret, and a pack holds all settings: train "
+                    "without it (an environment variable is in no run)"
+                )
+            check_secrets(value, f"{place}.{key}")
+    elif isinstance(settings, list | tuple):
+        for item in settings:
+            check_secrets(item, place)
+
+
+def zip_to_tell(content: bytes) -> bytes:
+    """A model's zip without the folder of its TensorBoard log; as it is where it names none."""
+    members = dict(read_members(content))
+    data = json.loads(members["data"])
+    if not data.get("tensorboard_log"):
+        return content
+    members["data"] = json.dumps({**data, "tensorboard_log": None}, indent=4).encode()
+    return zipped(members)
+
+
+def zipped(members: Mapping[str, bytes]) -> bytes:
+    """A zip of these members, the same bytes each time."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(zipfile.ZipInfo(name, _DATE), content)
+    return stream.getvalue()
+
+
+def check_untold(files: Mapping[str, bytes], run: Run) -> None:
+    """Look through all files for the paths of this machine; models are looked into.
+
+    Raises:
+        UserError: naming the file in which there is one.
+    """
+    places = _places_of(run)
+    for name, content in files.items():
+        for piece in _pieces(name, content):
+            for place in places:
+                if place in piece:
+                    raise UserError(
+                        f"{name} names {place.decode(errors='replace')!r}, a place on this "
+                        "machine: nothing was packed"
+                    )
+
+
+def _places_of(run: Run) -> list[bytes]:
+    """Folders that only this machine has: where the user and the run are at home, and modules."""
+    spec = run.recorded_spec()
+    named = [spec.get(name) for name in ("log_folder", "tensorboard_log", "trained_agent")]
+    named += [m.get("path") for m in spec.get("user_modules") or () if isinstance(m, dict)]
+    paths = [Path.home(), Path.cwd(), run.path.resolve().parent]
+    paths += [Path(text) for text in named if isinstance(text, str)]
+    texts = {str(path) for path in paths if path.is_absolute()}
+    return sorted(text.encode() for text in texts if len(text) >= _SHORTEST)
+
+
+def _pieces(name: str, content: bytes) -> Iterable[bytes]:
+    yield content
+    if name.endswith(".zip"):
+        for member in read_members(content).values():
+            yield member
+            yield from (base64.b64decode(text) for text in _SERIALIZED.findall(member))

@@ -1,0 +1,192 @@
+"""Brackets of optima: claimed for what they were worked out for alone, and to be had again."""
+
+import runpy
+import sys
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv, PendulumEnv
+from gymnasium.wrappers import ClipReward, FlattenObservation, RescaleAction, TimeLimit
+
+import train
+from envs.brackets.classic_motions import MOTIONS
+from envs.brackets.known_brackets import (
+    OptimumBracket,
+    known_entries,
+    may_have_bracket,
+    optimum_bracket,
+)
+from envs.wrappers import DiscretizeObservation, ScaleReward
+from mdp.pushed_motion import moved
+
+SCRIPT = Path(train.__file__).parent / "benchmarks" / "optimum_brackets.py"
+ENTRIES = {
+    name: entry
+    for limits in known_entries().values()
+    for entry in limits.values()
+    for name in [entry["id"]]
+}
+
+
+@pytest.fixture(scope="module")
+def benchmark():
+    sys.path.insert(0, str(SCRIPT.parent))
+    try:
+        yield runpy.run_path(str(SCRIPT))
+    finally:
+        sys.path.remove(str(SCRIPT.parent))
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_a_bracket_is_claimed_of_an_environment_as_it_is(name):
+    with gym.make(name) as env:
+        found, entry = optimum_bracket(env), ENTRIES[name]
+    assert found == OptimumBracket(entry["lower"], entry["upper"], entry["baseline"]["mean"])
+    assert found.baseline < found.lower < found.upper
+    assert found.lower < entry["played"]["mean"] <= found.upper
+    assert may_have_bracket(name)
+
+
+def test_ends_are_near_to_each_other():
+    """By the distance from the baseline to the lower end, which scores go by."""
+    widths = {
+        name: (entry["upper"] - entry["lower"]) / (entry["lower"] - entry["baseline"]["mean"])
+        for name, entry in ENTRIES.items()
+    }
+    assert set(widths) == {
+        "Acrobot-v1",
+        "CartPole-v1",
+        "MountainCar-v0",
+        "MountainCarContinuous-v0",
+        "Pendulum-v1",
+    }
+    assert widths.pop("Acrobot-v1") < 0.06
+    assert max(widths.values()) < 0.03
+
+
+ONE = np.ones(1, np.float32)
+
+
+class MyPendulum(PendulumEnv):
+    """Of the same name, and easier."""
+
+    def step(self, u):
+        obs, reward, *rest = super().step(u)
+        return obs, reward / 2, *rest
+
+
+class Repeat(gym.Wrapper):
+    """Does everything twice."""
+
+    def step(self, action):
+        self.env.step(action)
+        return self.env.step(action)
+
+
+def _with_gravity(env):
+    env.unwrapped.gravity = 5.0
+    return env
+
+
+def _with_own_step(env):
+    env.unwrapped.step = lambda action: MountainCarEnv.step(env.unwrapped, 2)
+    return env
+
+
+@pytest.mark.parametrize(
+    "make",
+    {
+        "gravity": lambda: gym.make("Pendulum-v1", g=5.0),
+        "goal": lambda: gym.make("MountainCar-v0", goal_velocity=0.1),
+        "rewards": lambda: gym.make("CartPole-v1", sutton_barto_reward=True),
+        "limit": lambda: gym.make("CartPole-v1", max_episode_steps=400),
+        "no limit": lambda: gym.make("CartPole-v1", max_episode_steps=-1),
+        "two limits": lambda: TimeLimit(gym.make("CartPole-v1"), 300),
+        "attribute": lambda: _with_gravity(gym.make("CartPole-v1")),
+        "own step": lambda: _with_own_step(gym.make("MountainCar-v0")),
+        "own class": lambda: TimeLimit(MyPendulum(), 200),
+        "scaled rewards": lambda: ScaleReward(gym.make("CartPole-v1"), 2.0),
+        "clipped rewards": lambda: ClipReward(gym.make("MountainCar-v0"), 0, 1),
+        "other actions": lambda: RescaleAction(gym.make("Pendulum-v1"), ONE - 2, ONE),
+        "frame skip": lambda: Repeat(gym.make("CartPole-v1")),
+        "no bracket": lambda: gym.make("FrozenLake-v1"),
+    }.items(),
+    ids=lambda item: item[0] if isinstance(item, tuple) else None,
+)
+def test_none_is_claimed_of_anything_else(make):
+    with make[1]() as env:
+        assert optimum_bracket(env) is None
+
+
+def test_constants_of_a_class_count(monkeypatch):
+    monkeypatch.setattr("gymnasium.envs.classic_control.AcrobotEnv.LINK_MASS_1", 0.5)
+    assert optimum_bracket(gym.make("Acrobot-v1")) is None
+
+
+def test_an_environment_of_ones_own_under_a_known_name_has_none():
+    former = gym.registry["Pendulum-v1"]
+    try:
+        with pytest.warns(UserWarning, match="Overriding"):
+            gym.register("Pendulum-v1", entry_point=MyPendulum, max_episode_steps=200)
+        assert not may_have_bracket("Pendulum-v1")
+        assert optimum_bracket(gym.make("Pendulum-v1")) is None
+    finally:
+        gym.registry["Pendulum-v1"] = former
+
+
+def test_what_is_shown_makes_no_difference():
+    seen = DiscretizeObservation(gym.make("CartPole-v1"), bins=4, dims=[0, 2])
+    assert optimum_bracket(seen) == optimum_bracket(gym.make("CartPole-v1")) is not None
+    assert optimum_bracket(FlattenObservation(gym.make("Pendulum-v1"))) is not None
+    assert optimum_bracket(TimeLimit(CartPoleEnv(), 500)) is not None
+
+
+def test_it_may_have_been_played_before():
+    env = gym.make("MountainCar-v0")
+    env.reset(seed=0)
+    env.step(2)
+    assert optimum_bracket(env) is not None
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_motions_are_those_of_gymnasium(name):
+    """From states in the whole range, at walls and the greatest speed too."""
+    motion, env, rng = MOTIONS[name], gym.make(name).unwrapped, np.random.default_rng(0)
+    env.reset(seed=0)
+    for _ in range(300):
+        position = rng.uniform(motion.low, motion.high)
+        speed = motion.most_speed * rng.uniform(-1, 1)
+        action = rng.choice(motion.actions)
+        env.state = np.array([position, speed])
+        given = np.array([action], np.float32) if motion.is_continuous else int(action) + 1
+        _, reward, terminated, _, _ = env.step(given)
+        expected = moved(motion, position, speed, action)
+        apart = np.abs(np.array(env.state) - expected)
+        if motion.is_circle:
+            apart[0] = abs((apart[0] + np.pi) % (2 * np.pi) - np.pi)
+        assert (apart <= max(motion.rounding, 1e-9) + 1e-7 * motion.is_continuous).all()
+        cost = motion.step_cost + motion.action_cost * action**2
+        cost += motion.position_cost * position**2 + motion.speed_cost * speed**2
+        assert terminated == (expected[0] >= motion.high)
+        gained = 100.0 if terminated and motion.final_cost else 0.0
+        assert reward == pytest.approx(gained - cost, abs=1e-5)
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_a_smaller_computation_fits_what_is_stored(name, benchmark):
+    """Its upper end is looser, and above what the stored policy got; never below the lower end."""
+    upper = benchmark["upper_end"](name, quick=True)
+    entry = ENTRIES[name]
+    assert upper >= entry["upper"] - 1e-9
+    assert upper >= entry["played"]["mean"]
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_the_policys_returns_can_be_had_again(name, benchmark):
+    policy = benchmark["policy_of"](name)
+    kept = ENTRIES[name]["played"]["first_returns"]
+    returns = benchmark["returns_of"](name, policy, len(kept), ENTRIES[name]["played"]["seed"])
+    # Another processor's arithmetic may take another of two actions that are all but as good.
+    assert returns == pytest.approx(kept, rel=0.02, abs=0.1)
