@@ -1,4 +1,4 @@
-"""The agents of docs/textbook-methods.md find a short way through the book's maze."""
+"""The agents from the book's later chapters find a short way through the book's maze."""
 
 import gymnasium as gym
 import pytest
