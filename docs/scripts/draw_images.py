@@ -2,8 +2,8 @@
 
 Everything in them is made by the version that is checked out: environments are rendered, agents are
 trained and their runs drawn by the code that users run. The picture of a study's page needs
-Chromium, and figures of the headline study need that study: without, they stay as they are. Names of
-pictures draw those alone.
+Chromium, and figures of the headline study need that study: without, they stay as they are. With
+names of pictures, only those are drawn.
 """
 
 from __future__ import annotations
