@@ -185,7 +185,7 @@ class Reinforce(SoftmaxAlgorithm):
         assert self.env is not None
         limits = [time_limit(env) or 0 for env in getattr(self.env, "envs", [])]
         longest = max(limits, default=0)
-        if not all(limits) or longest == 0:
+        if not all(limits):
             raise NotCompilable("episodes are kept, and there is no limit to their length")
         if self.n_envs * longest * self.policy.tiles.n_tilings > MOST_KEPT:
             raise NotCompilable(f"episodes are kept, and {longest:,} steps are too many for that")

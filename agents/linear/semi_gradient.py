@@ -18,7 +18,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from agents.common.exploration import EPSILON_GREEDY, action_probabilities, greedy_action
 from agents.common.schedules import epsilon_schedule
-from agents.common.setting_checks import check_epsilons
+from agents.common.setting_checks import check_epsilons, check_finite, settings_of
 from agents.common.signatures import ExplorationDecay, TieBreaking
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import next_uniform
@@ -129,6 +129,7 @@ class SemiGradientAlgorithm(TileAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_epsilons(self)
+        check_finite(settings_of(self, "initial_q"))
 
     def _initial_sums(self) -> Floats:
         return np.full(self.n_actions, float(self.initial_q))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import VecNormalize
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
@@ -265,6 +266,12 @@ def test_episodes_without_a_limit_are_interpreted():
     assert model.engine_in_use == (
         "interpreted: episodes are kept, and there is no limit to their length"
     )
+
+
+def test_environments_that_are_wrapped_together_are_interpreted():
+    env = VecNormalize(make_vec_env("ShortCorridor-v0", 1, seed=0), norm_obs=False)
+    model = load_algorithm("reinforce")(env=env, seed=0).learn(200)
+    assert model.engine_in_use == "interpreted: VecNormalize is not DummyVecEnv"
 
 
 # --- what is learnt, and kept --------------------------------------------------------------------
