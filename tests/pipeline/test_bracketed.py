@@ -1,12 +1,15 @@
 """Sampled returns measured by a bracket: by both ends, and where one holds alone."""
 
+import io
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from commands.playing_output import _print_measured
 from commands.run_output import describe
 from envs.brackets.known_brackets import OptimumBracket
 from pipeline.evaluation import bracketed
@@ -60,6 +63,15 @@ def test_more_than_any_policy_can_reach_is_said_aloud_and_not_clipped():
     assert impossible.summary()["beats_optimum"] is True
     assert impossible.summary()["score"] == pytest.approx(481 / 480)
     assert "THIS IS MORE THAN ANY POLICY CAN REACH" in describe(impossible)
+
+
+def test_what_is_played_is_measured_too():
+    console = Console(file=io.StringIO(), width=200)
+    show = SimpleNamespace(returns=[-700.0, -600.0], lengths=[200, 200])
+    _print_measured(console, spec_of(), show)
+    assert console.file.getvalue().startswith("optimum between -140.86 and -134.44, best random")
+    _print_measured(console, spec_of(env_kwargs={"g": 5.0}), show)
+    assert console.file.getvalue().count("\n") == 1
 
 
 @pytest.mark.parametrize(
