@@ -32,8 +32,9 @@ _FINAL_FIGURES = (
     "exact",
     "gap",
     "score",
-    "optimum_at_least",
 )
+# The last where the optimum is bracketed.
+_YARDSTICK = ("optimum", "baseline", "optimum_at_least")
 _MAPS = ("timesteps", "values", "actions", "optimal_values", "optimal_actions")
 _COLUMNS = ["r", "l", "t"]  # return, length, seconds since the beginning
 
@@ -143,8 +144,9 @@ def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
     for name, value in (given | figures).items():
         if not (value is None or _is_figure(value)):
             raise DamagedFileError(run.info_path, f"is damaged: {name} is no figure")
-    yardstick = [final[name] for name in ("optimum", "baseline") if name in final]
-    if len(yardstick) == 1 or not all(_is_figure(value) for value in yardstick):
+    known = tuple(name for name in _YARDSTICK if name in final)
+    is_whole = known in ((), _YARDSTICK[:2], _YARDSTICK)
+    if not is_whole or not all(_is_figure(final[name]) for name in known):
         raise DamagedFileError(run.info_path, "is damaged: it lacks the optimum's figures")
     _check_texts(run, info)
     return {**info, "final": final}

@@ -222,13 +222,16 @@ def threshold_of(study: StudySpec, env_id: str, final: dict[str, Any]) -> float 
 
     if study.threshold is not None:
         return study.threshold
-    registered = gym.spec(env_id.rpartition(":")[2]).reward_threshold
     # Of a bracket nobody knows whether its upper end can be reached.
     reachable = final.get("optimum_at_least", final.get("optimum"))
-    if reachable is not None and ("optimum_at_least" not in final or registered is None):
-        baseline = float(final["baseline"])
-        return baseline + 0.95 * (float(reachable) - baseline)
-    return None if registered is None else float(registered)
+    if "optimum_at_least" in final or reachable is None:
+        registered = gym.spec(env_id.rpartition(":")[2]).reward_threshold
+        if registered is not None:
+            return float(registered)
+    if reachable is None:
+        return None
+    baseline = float(final["baseline"])
+    return baseline + 0.95 * (float(reachable) - baseline)
 
 
 def _mean(values: Floats) -> float:

@@ -18,6 +18,7 @@ from report.pair_sentences import (
 )
 from report.speed_sentences import speed_sentences
 from report.wording import enumeration, interval, number, optimum_words, ordinal
+from verdicts import Estimate
 
 MOST_FIGURES = 3  # agents whose figures stand in a line
 
@@ -188,13 +189,18 @@ def _on_the_impossible(study: StudySpec, environment: EnvironmentAnalysis) -> It
     most = environment.optimum
     if environment.optimum_at_least is None or most is None:
         return
-    names = [a.agent for a in environment.agents if a.final.low > most + abs(most) * 1e-6]
+    names = [a.agent for a in environment.agents if _surely(a.final) > most + abs(most) * 1e-6]
     if names:
         verb = "has" if len(names) == 1 else "have"
         yield (
             f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, {number(most)}: the "
             "environment is not the one that the bracket is of, or the bracket is wrong."
         )
+
+
+def _surely(value: Estimate) -> float:
+    """What a mean is above by six standard errors: by three times what its interval says."""
+    return value.point - 3 * (value.point - value.low)
 
 
 def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:

@@ -13,7 +13,7 @@ from report.conclusions import conclusion, none_has_learnt
 from report.markdown import MARKDOWN
 from report.markup_language import MarkupLanguage
 from report.seed_sentence import seed_sentence
-from report.wording import interval, number, seeds
+from report.wording import enumeration, interval, number, seeds
 from verdicts import Verdict
 
 # Against the agent whose median run is the highest: shown equivalent or itself, undecided, worse.
@@ -63,6 +63,7 @@ def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
     agents = [agent for environment in analysis.environments for agent in environment.agents]
     if all(_has_score(study, agent) for agent in agents):
         what = "Score of the median run: 1 is the optimum, 0 the best random or constant policy."
+        what += _on_brackets(analysis)
     else:
         what = f"{METRIC_WORDS[study.metric].capitalize()}: the median run."
     extreme = "lowest" if study.metric in COSTS else "highest"
@@ -73,6 +74,13 @@ def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
     return text
+
+
+def _on_brackets(analysis: StudyAnalysis) -> str:
+    names = [e.environment for e in analysis.environments if e.optimum_at_least is not None]
+    if not names:
+        return ""
+    return f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
 
 
 def _cells(

@@ -25,6 +25,8 @@ ROUNDING = 1e-12
 
 # By so many standard errors a mean is above what no policy exceeds only where something is wrong.
 BEYOND_CHANCE = 6.0
+# Of fewer episodes that cannot be said: all of them may have begun where returns are high.
+FEWEST_TO_TELL = 10
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,9 @@ class Evaluation:
         """
         if self.yardstick is None or self.yardstick.at_least is None:
             return False
-        error = self.std_return / math.sqrt(max(len(self.returns) - 1, 1))
+        if len(self.returns) < FEWEST_TO_TELL:
+            return False
+        error = self.std_return / math.sqrt(len(self.returns) - 1)
         # Monitor rounds returns to six digits.
         return self.mean_return - BEYOND_CHANCE * error > self.yardstick.optimum + 1e-6
 

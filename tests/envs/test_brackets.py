@@ -69,6 +69,14 @@ def test_ends_are_near_to_each_other():
 ONE = np.ones(1, np.float32)
 
 
+def test_the_document_says_what_is_stored():
+    text = (SCRIPT.parents[1] / "docs" / "continuous.md").read_text()
+    for name, entry in ENTRIES.items():
+        low, high, base = entry["lower"], entry["upper"], entry["baseline"]["mean"]
+        apart = 100 * (high - low) / (low - base)
+        assert f"| `{name}` | {low:.2f} | {high:.2f} | {apart:.1f} % | {base:.1f} |\n" in text
+
+
 class MyPendulum(PendulumEnv):
     """Of the same name, and easier."""
 

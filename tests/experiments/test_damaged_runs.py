@@ -155,6 +155,8 @@ def test_a_record_that_says_nothing_is_damage_and_no_other_run(copied, record):
         {"final": {"mean_return": "much"}},
         {"final": {"mean_return": 1.0, "optimum": 2.0}},
         {"final": {"optimum": None, "baseline": 1.0}},
+        {"final": {"mean_return": 1.0, "optimum_at_least": 1.0}},
+        {"final": {"optimum": 2.0, "baseline": 0.0, "optimum_at_least": "high"}},
         {"seconds": "long"},
         {"cpu_seconds": "long"},
         {"n_timesteps": [1]},

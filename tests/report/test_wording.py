@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from report.terminal_tables import print_episodes_table
+from report.verdict_table import headline
 from report.wording import number, optimum_words, ordinal, seeds
 
 
@@ -67,6 +68,17 @@ def test_how_many_seeds():
 )
 def test_the_optimum_or_between_what_it_lies(ends, text):
     assert optimum_words(*ends) == text
+
+
+def test_whose_scores_are_by_a_bracket_is_said_below_the_table(made_up):
+    agents = [made_up.agent("a", 90.0)]
+    places = [
+        made_up.environment(agents),
+        made_up.environment(agents, "hill", optimum_at_least=90.0),
+    ]
+    text = headline(made_up.analysis(places, ["a"]))
+    assert "policy. On hill the optimum is bracketed: 1 is the upper end. Bold" in text
+    assert "bracketed" not in headline(made_up.analysis(places[:1], ["a"]))
 
 
 def test_episodes_stand_in_columns_that_end_on_one_line():
