@@ -15,6 +15,7 @@ from agents import ALGORITHMS
 # What stands around an environment, and a plain script would have to put there too.
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 _LIBRARIES = ("stable_baselines3", "sb3_contrib")
+_DEEP = {"dqn", "double_dqn", "deep_qlearning"}
 # Agents of this project whose model files are the library's, where they go by no action masks.
 _OF_THE_LIBRARY = {"dqn": "DQN", "ppo": "PPO", "a2c": "A2C"}
 
@@ -71,17 +72,18 @@ def _front_matter(record: Mapping[str, Any]) -> str:
         yaml.safe_dump(
             {
                 "library_name": "stable-baselines3",
-                "tags": [
-                    env,
-                    "deep-reinforcement-learning",
-                    "reinforcement-learning",
-                    "stable-baselines3",
-                ],
+                "tags": [env, *_kind(spec), "reinforcement-learning", "stable-baselines3"],
                 "model-index": [{"name": spec["algo"], "results": [place]}],
             },
             sort_keys=False,
         )
     )
+
+
+def _kind(spec: Mapping[str, Any]) -> list[str]:
+    """What hubs call agents with networks."""
+    is_deep = spec["algo"] in _DEEP or plain_class(spec) is not None
+    return ["deep-reinforcement-learning"] if is_deep else []
 
 
 def _metrics(final: Mapping[str, Any]) -> list[tuple[str, str, Any]]:

@@ -180,7 +180,7 @@ def tables_of(agent: BaseAlgorithm) -> dict[str, Floats]:
     tables = {
         name: buffer.numpy()
         for name, buffer in agent.policy.named_buffers()
-        if buffer.is_floating_point()
+        if buffer.is_floating_point() and buffer.numel() > 0
     }
     return dict(sorted(tables.items(), key=lambda item: not has_actions(agent, item[1])))
 

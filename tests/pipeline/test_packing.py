@@ -76,7 +76,7 @@ def test_the_card_says_what_the_run_came_to(packed, runs):
     final = json.loads((runs["table"].path / "run.json").read_text())["final"]
     data, text = front_matter(folder)
     assert data["library_name"] == "stable-baselines3"
-    assert "FrozenLake-v1" in data["tags"]
+    assert data["tags"] == ["FrozenLake-v1", "reinforcement-learning", "stable-baselines3"]
     (result,) = data["model-index"][0]["results"]
     assert data["model-index"][0]["name"] == "qlearning"
     assert result["task"]["type"] == "reinforcement-learning"
@@ -99,6 +99,7 @@ def test_the_card_says_what_the_run_came_to(packed, runs):
 def test_sampled_figures_are_called_so(packed):
     data, text = front_matter(packed("dqn"))
     assert "mean of 4 sampled episodes" in text
+    assert "deep-reinforcement-learning" in data["tags"]
     assert json.loads((packed("dqn", "other") / "results.json").read_text())["n_eval_episodes"] == 4
     (result,) = data["model-index"][0]["results"]
     assert {"mean_reward", "mean_return"} <= {metric["type"] for metric in result["metrics"]}

@@ -6,6 +6,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+import torch as th
 from rich.console import Console
 from stable_baselines3.common.env_util import make_vec_env
 
@@ -16,7 +17,13 @@ from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
 from pipeline.watching import table_recorder, watch_choice
-from pipeline.watching.table_recorder import NO_STATE, TERMINATED, TRUNCATED, TableRecorder
+from pipeline.watching.table_recorder import (
+    NO_STATE,
+    TERMINATED,
+    TRUNCATED,
+    TableRecorder,
+    tables_of,
+)
 
 LAKE = "FrozenLake-v1"
 
@@ -216,6 +223,15 @@ def test_bandits_are_watched_in_their_tables(env_id, algo):
 def episodes_of(folder):
     rows = (folder / "0.monitor.csv").read_text().splitlines()[2:]
     return [row.split(",")[:2] for row in rows]
+
+
+def test_tables_of_nothing_are_left_out_and_one_for_states_and_actions_comes_first():
+    agent = load_algorithm("qlearning")(env=LAKE, seed=0)
+    table = agent.policy.q_tables
+    del agent.policy._buffers["q_tables"]
+    for name, buffer in [("none", th.zeros(0, 4)), ("states", th.zeros(16)), ("q_tables", table)]:
+        agent.policy.register_buffer(name, buffer)
+    assert [*tables_of(agent)] == ["q_tables", "states"]
 
 
 def done(spec):
