@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import secrets
 import shutil
 import stat
 import tempfile
@@ -50,10 +51,10 @@ def pack(run_folder: Path, target: Path) -> Path:
         with replacing(target) as draft:
             draft.write_bytes(zipped(dict(sorted(files.items()))))
         return target
-    draft = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".tmp", dir=target.parent))
+    draft = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
+    draft.mkdir()
     try:
         _write(draft, files)
-        draft.chmod(0o755)
         settle(draft)
         put_in_place(draft, target)
     finally:

@@ -35,6 +35,7 @@ def write_learning_page(spec: TrainSpec, recorder: TableRecorder | MapRecorder, 
         path: the file, which is replaced.
     """
     if isinstance(recorder, MapRecorder):
+        recorder.record()  # as the agent is at the end, where that was not evaluated
         write_text(path, _render(spec, maps_data(spec, recorder)))
         return
     n_steps = len(recorder.steps)

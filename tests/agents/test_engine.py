@@ -15,7 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 import envs  # noqa: F401  # registers the environments
-from agents import load_algorithm
+from agents import ALGORITHMS, load_algorithm
 from agents.common.callback_horizons import (
     BlockCallback,
     EpisodeBudget,
@@ -65,10 +65,15 @@ STEP_SIZES = {
     "exponential": ExponentialSchedule(0.8, 0.01),
     "average": "sample_average",
 }
+# Those that learn a model or go by bonuses are in test_learnt_models and test_optimism.
+ELSEWHERE = {"dyna_q", "dyna_q_plus", "prioritized_sweeping", "r_max", "qlearning_ucb"}
 FACTORS = (
     tuple(ENVS),
-    # Agents with a loop of their own have tests of their own: each is compiled for each world.
-    ("qlearning", "sarsa", "expected_sarsa", "double_qlearning"),
+    tuple(
+        name
+        for name, entry in ALGORITHMS.items()
+        if entry.family == "tabular" and name not in ELSEWHERE
+    ),
     tuple(EXPLORATION),
     tuple(STEP_SIZES),
     ("random", "first"),

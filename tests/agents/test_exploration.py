@@ -11,6 +11,7 @@ from agents.common.exploration import (
     EPSILON_GREEDY,
     GAUSSIAN_NOISE,
     action_probabilities,
+    action_probability,
     boltzmann_action,
     choose_action,
     draws_per_choice,
@@ -103,3 +104,17 @@ def test_expected_value_is_the_mean_under_the_probabilities(values, rate):
 def test_noise_has_no_probabilities():
     with pytest.raises(ValueError, match="closed-form"):
         action_probabilities(GAUSSIAN_NOISE, VALUES[None], 1.0, random_ties=True)
+
+
+@pytest.mark.parametrize("random_ties", [True, False])
+@pytest.mark.parametrize(("strategy", "rate"), [(EPSILON_GREEDY, 0.3), (BOLTZMANN, 0.7)])
+def test_one_probability_is_that_of_the_matrix(strategy, rate, random_ties):
+    # Ties between the best, between others, and between all.
+    for row in ([1.0, 3.0, 3.0, 0.0], [5.0, 2.0, 2.0, 1.0], [4.0] * 4, [0.0, 1.0, 2.0, 9.0]):
+        values = np.array(row)
+        expected = action_probabilities(strategy, values[None], rate, random_ties=random_ties)[0]
+        found = [
+            action_probability(strategy, values, rate, float(random_ties), action)
+            for action in range(4)
+        ]
+        np.testing.assert_allclose(found, expected, rtol=1e-14)

@@ -15,6 +15,7 @@ DISCRETE = spaces.Discrete(4)
 BOX = spaces.Box(-1, 1, (4,))
 PLANNING = ["value_iteration", "policy_iteration", "optimal"]
 TABULAR = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]
+TILED = [name for name, entry in ALGORITHMS.items() if entry.family == "linear"]
 DEEP_Q = ["dqn", "double_dqn", "deep_qlearning"]
 CONTRIB = ["qrdqn", "tqc", "crossq", "trpo", "ars", "ppo_lstm", "ppo_mask"]
 # What learns on any observation and acts in Discrete spaces, in the order of the table.
@@ -47,15 +48,15 @@ def test_an_unknown_name():
     [
         (
             "CartPole-v1",
-            [*NETWORKS, "random", "angle"],
+            [*TILED, *NETWORKS, "random", "angle"],
         ),
         (
             "FrozenLake-v1",
-            [*TABULAR, *NETWORKS, *PLANNING, "random"],
+            [*TABULAR, *TILED, *NETWORKS, *PLANNING, "random"],
         ),
         ("MountainCarContinuous-v0", [*CONTINUOUS, "random"]),
         # Four numbers are observed in CartPole, two here.
-        ("MountainCar-v0", [*NETWORKS, "random"]),
+        ("MountainCar-v0", [*TILED, *NETWORKS, "random"]),
         ("Blackjack-v1", []),
     ],
 )
@@ -68,6 +69,7 @@ def test_which_agents_fit(env_id, names):
 def test_masks_make_one_more_fit():
     assert fitting_algorithms(DISCRETE, DISCRETE, masks=True) == [
         *TABULAR,
+        *TILED,
         *NETWORKS,
         "ppo_mask",
         *PLANNING,

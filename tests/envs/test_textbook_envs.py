@@ -300,7 +300,7 @@ def test_corners_of_the_sea_have_noise_where_it_is_rough() -> None:
 
 
 # An agent that plans has to see where it is.
-@pytest.mark.parametrize("env_id", LIMITS.keys() - {"ShortCorridor-v0"})
+@pytest.mark.parametrize("env_id", sorted(LIMITS.keys() - {"ShortCorridor-v0"}))
 def test_an_agent_that_plans_reaches_the_optimum(env_id) -> None:
     env = gym.make(env_id, max_episode_steps=30)
     model, states = transition_model(env), np.arange(env.observation_space.n)

@@ -63,6 +63,12 @@ TRAININGS = [
     (GRID, "dyna_q_plus", 600, {"engine": "interpreted"}),
     (GRID, "prioritized_sweeping", 600, {"initial_q_std": 1.0, "n_envs": 2}),
     (GRID, "r_max", 600, {"known_after": 3, "value_bound": 1.0}),
+    (GRID, "semi_gradient_sarsa", 600, {"engine": "compiled", "n_envs": 3}),
+    ("MountainCar-v0", "semi_gradient_q", 600, {"engine": "interpreted"}),
+    (GRID, "actor_critic", 600, {"gamma_power": True, "n_envs": 2}),
+    # Cut off in the middle of episodes.
+    (LEFT_RIGHT, "reinforce", 600, {"engine": "compiled"}),
+    (GRID, "reinforce", 600, {"engine": "interpreted", "n_envs": 2}),
     (GRID, "value_iteration", 300, {}),
     (GRID, "policy_iteration", 300, {}),
     (GRID, "optimal", 300, {}),

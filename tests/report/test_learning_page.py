@@ -101,6 +101,12 @@ def test_without_a_table_the_policy_in_every_state(watch):
     assert [value is not None for value in data["moments"][0]["values"]] == reachable.tolist()
 
 
+def test_the_beginning_and_the_end_are_there_without_evaluations(watch):
+    data, _, training = watch("FrozenLake-v1", "value_iteration", 64, eval_freq=-1)
+    assert [moment["timesteps"] for moment in data["moments"]] == [0, 64]
+    assert data["moments"][-1]["return"] == training.watch.moments[-1][2][0] > 0.5
+
+
 def test_a_page_is_no_larger_than_three_megabytes(watch, monkeypatch):
     _, text, training = watch("Taxi-v4", n_timesteps=2000)
     assert len(text) < learning_assembly.MOST_BYTES
