@@ -84,20 +84,26 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "double_qlearning": _tabular(
         "double_q_learning:DoubleQLearning", "double Q-learning on two tables"
     ),
-    "n_step_sarsa": _tabular("n_step_sarsa:NStepSARSA", "n-step SARSA on a table"),
-    "n_step_tree_backup": _tabular("tree_backup:NStepTreeBackup", "n-step tree backup on a table"),
-    "sarsa_lambda": _tabular("sarsa_lambda:SARSALambda", "SARSA(lambda): traces on a table"),
-    "q_lambda": _tabular("q_lambda:QLambda", "Watkins's Q(lambda): traces on a table"),
-    "monte_carlo": _tabular("monte_carlo:MonteCarlo", "on-policy Monte Carlo on a table"),
+    "n_step_sarsa": _tabular("episodes.n_step_sarsa:NStepSARSA", "n-step SARSA on a table"),
+    "n_step_tree_backup": _tabular(
+        "episodes.tree_backup:NStepTreeBackup", "n-step tree backup on a table"
+    ),
+    "sarsa_lambda": _tabular(
+        "episodes.sarsa_lambda:SARSALambda", "SARSA(lambda): traces on a table"
+    ),
+    "q_lambda": _tabular("episodes.q_lambda:QLambda", "Watkins's Q(lambda): traces on a table"),
+    "monte_carlo": _tabular("episodes.monte_carlo:MonteCarlo", "on-policy Monte Carlo on a table"),
     "off_policy_monte_carlo": _tabular(
-        "off_policy_monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
+        "episodes.off_policy_monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
     ),
-    "dyna_q": _tabular("dyna_q:DynaQ", "Q-learning that plans on a learnt model"),
-    "dyna_q_plus": _tabular("dyna_q_plus:DynaQPlus", "Dyna-Q that tries again what is long ago"),
+    "dyna_q": _tabular("models.dyna_q:DynaQ", "Q-learning that plans on a learnt model"),
+    "dyna_q_plus": _tabular(
+        "models.dyna_q_plus:DynaQPlus", "Dyna-Q that tries again what is long ago"
+    ),
     "prioritized_sweeping": _tabular(
-        "prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
+        "models.prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
     ),
-    "r_max": _tabular("r_max:RMax", "planning, with the unknown taken for the best"),
+    "r_max": _tabular("models.r_max:RMax", "planning, with the unknown taken for the best"),
     "qlearning_ucb": _tabular(
         "q_learning_ucb:QLearningUCB", "Q-learning with upper confidence bounds"
     ),

@@ -8,8 +8,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.tabular.sweeping_model import NONE
-from agents.tabular.sweeping_policy import _are_lists, _is_queue
+from agents.tabular.models.sweeping_model import NONE
+from agents.tabular.models.sweeping_policy import _are_lists, _is_queue
 from agents.tabular.temporal_difference import learn_from_all
 from envs.known_models import transition_model
 from mdp import TransitionModel, value_iteration

@@ -8,8 +8,8 @@ import numpy as np
 
 from agents.common.exploration import expected_value, highest_value
 from agents.common.setting_checks import check_option
-from agents.tabular.learning_in_turn import place_of, probability_of
-from agents.tabular.step_windows import WindowAlgorithm
+from agents.tabular.episodes.learning_in_turn import place_of, probability_of
+from agents.tabular.episodes.step_windows import WindowAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, exploration_rate, values_at
 from agents.tabular.value_tables import Room
 from mdp.machine_code import inlined

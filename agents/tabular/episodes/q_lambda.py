@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from agents.common.exploration import highest_value
-from agents.tabular.eligibility_traces import TraceAlgorithm
+from agents.tabular.episodes.eligibility_traces import TraceAlgorithm
 from agents.tabular.q_learning import best_next_value
 from agents.tabular.temporal_difference import TabularAgent, values_at
 from mdp.machine_code import inlined

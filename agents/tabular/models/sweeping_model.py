@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from agents.tabular.learnt_models import note_outcome
+from agents.tabular.models.learnt_models import note_outcome
 from mdp.array_types import Bools, Floats, Ints
 from mdp.machine_code import inlined
 

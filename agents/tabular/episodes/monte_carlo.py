@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from agents.tabular.episode_records import RecordAlgorithm
+from agents.tabular.episodes.episode_records import RecordAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, choose, move_towards
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from agents.tabular.model_policy import ModelPolicy
-from agents.tabular.sweeping_model import NONE, SweepingModel
+from agents.tabular.models.model_policy import ModelPolicy
+from agents.tabular.models.sweeping_model import NONE, SweepingModel
 
 
 class SweepingPolicy(ModelPolicy):

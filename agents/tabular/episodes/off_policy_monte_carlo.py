@@ -7,9 +7,9 @@ from typing import Any, ClassVar, NamedTuple
 from stable_baselines3.common.policies import BasePolicy
 
 from agents.common.exploration import greedy_action, highest_value
-from agents.tabular.episode_records import RecordAlgorithm
-from agents.tabular.importance_policy import ImportanceTablePolicy
-from agents.tabular.learning_in_turn import place_of, probability_of
+from agents.tabular.episodes.episode_records import RecordAlgorithm
+from agents.tabular.episodes.importance_policy import ImportanceTablePolicy
+from agents.tabular.episodes.learning_in_turn import place_of, probability_of
 from agents.tabular.temporal_difference import TabularAgent, act_on_values, values_at
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 
 from agents.common.setting_checks import check_at_least, check_finite, settings_of
-from agents.tabular.dyna_q import DynaQ
-from agents.tabular.learnt_models import add_pair, note_outcome
-from agents.tabular.model_policy import ModelPolicy
+from agents.tabular.models.dyna_q import DynaQ
+from agents.tabular.models.learnt_models import add_pair, note_outcome
+from agents.tabular.models.model_policy import ModelPolicy
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import action_at, room_at
 from mdp.array_types import Bools, Floats, Ints

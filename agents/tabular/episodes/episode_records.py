@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from agents.common.setting_checks import check_whole, settings_of
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.learning_algorithm import StepSize
-from agents.tabular.learning_in_turn import NOTHING_LEARNT, EpisodicAlgorithm
+from agents.tabular.episodes.learning_in_turn import NOTHING_LEARNT, EpisodicAlgorithm
 from agents.tabular.temporal_difference import TabularAgent
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from agents.tabular.eligibility_traces import TraceAlgorithm
+from agents.tabular.episodes.eligibility_traces import TraceAlgorithm
 from agents.tabular.sarsa import commit_to_next_action, committed_value
 
 

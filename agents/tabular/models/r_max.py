@@ -8,9 +8,14 @@ from typing import Any, ClassVar
 import numpy as np
 
 from agents.common.setting_checks import check_above_zero, check_finite, check_whole, settings_of
-from agents.tabular.counted_models import CountedModel, count_outcome, note_known_state, replan
-from agents.tabular.model_keeping import ModelKeeper
-from agents.tabular.model_policy import MOST_OUTCOMES, ModelPolicy
+from agents.tabular.models.counted_models import (
+    CountedModel,
+    count_outcome,
+    note_known_state,
+    replan,
+)
+from agents.tabular.models.model_keeping import ModelKeeper
+from agents.tabular.models.model_policy import MOST_OUTCOMES, ModelPolicy
 from agents.tabular.optimistic_algorithm import OptimisticAlgorithm
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import best_value

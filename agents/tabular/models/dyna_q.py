@@ -10,9 +10,9 @@ from agents.common.setting_checks import check_whole, settings_of
 from agents.common.step_sizes import step_size
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import next_uniform
-from agents.tabular.learnt_models import add_pair, n_kept, note_outcome
-from agents.tabular.model_keeping import MOST_PLANNING, ModelKeeper
-from agents.tabular.model_policy import MOST_OUTCOMES
+from agents.tabular.models.learnt_models import add_pair, n_kept, note_outcome
+from agents.tabular.models.model_keeping import MOST_PLANNING, ModelKeeper
+from agents.tabular.models.model_policy import MOST_OUTCOMES
 from agents.tabular.q_learning import QLearning
 from agents.tabular.temporal_difference import TabularAgent, update
 from agents.tabular.value_tables import best_value

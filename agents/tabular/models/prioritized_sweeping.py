@@ -8,9 +8,9 @@ import numpy as np
 
 from agents.common.setting_checks import check_at_least, check_finite, check_whole, settings_of
 from agents.common.step_sizes import step_size
-from agents.tabular.model_keeping import MOST_PLANNING, ModelKeeper
-from agents.tabular.sweeping_model import NONE, enqueue, most_urgent, remember_step
-from agents.tabular.sweeping_policy import SweepingPolicy
+from agents.tabular.models.model_keeping import MOST_PLANNING, ModelKeeper
+from agents.tabular.models.sweeping_model import NONE, enqueue, most_urgent, remember_step
+from agents.tabular.models.sweeping_policy import SweepingPolicy
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import best_value
 from mdp.machine_code import inlined

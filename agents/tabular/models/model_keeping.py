@@ -6,7 +6,7 @@ from typing import Any, ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
-from agents.tabular.model_policy import ModelPolicy
+from agents.tabular.models.model_policy import ModelPolicy
 from agents.tabular.q_table_policy import QTablePolicy
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 

@@ -10,7 +10,7 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
-from agents.tabular.learnt_models import LearntModel
+from agents.tabular.models.learnt_models import LearntModel
 from agents.tabular.q_table_policy import QTablePolicy
 
 MOST_OUTCOMES = 10**8  # 1.7 GB

@@ -1,0 +1,1 @@
+"""Methods on tables that learn a model of the environment, and plan on it."""
