@@ -164,3 +164,39 @@ def best_left_out(reward, discount, terminated, next_values, epsilon):
 )
 def test_targets(target, kind, said):
     assert checker.check_target(target, kind).startswith(said)
+
+
+MEANS = [0.2, 0.9, 0.5]
+ARMS = [0, 1, 2, 0, 1]
+
+
+@pytest.mark.parametrize(
+    ("regret", "said"),
+    [
+        (np.cumsum([0.7, 0.0, 0.4, 0.7, 0.0]), "Right."),
+        (..., "Not done yet."),
+        (np.ones(3), "The shape has to be (5,)"),
+        ([0.7, 0.0, 0.4, 0.7, 0.0], "Regret never falls, but yours does at pull 2."),
+        (np.cumsum([0.7, 0.1, 0.4, 0.7, 0.1]), "A pull of the best arm loses nothing"),
+        (np.cumsum([1.0, 0.0, 0.4, 0.0, 0.0]), "Pulls of arm 0 add different amounts."),
+        (np.cumsum([0.2, 0.0, 0.4, 0.2, 0.0]), "A pull of arm 0 adds the wrong amount"),
+    ],
+)
+def test_regret(regret, said):
+    assert checker.check_regret(MEANS, ARMS, regret).startswith(said)
+
+
+@pytest.mark.parametrize(
+    ("index", "said"),
+    [
+        (lambda mean, n, t: mean + np.sqrt(2 * np.log(t) / n), "Right."),
+        (lambda mean, n, t: None, "It cannot be called or gives no number"),
+        (lambda mean, n, t: np.sqrt(2 * np.log(t) / n), "If the mean rises by 0.1"),
+        (lambda mean, n, t: mean, "The index has to lie above the mean"),
+        (lambda mean, n, t: mean + np.log(t) / n, "With four times as many pulls"),
+        (lambda mean, n, t: mean + np.sqrt(2 * t / n), "The bonus has to grow with all pulls"),
+        (lambda mean, n, t: mean + np.sqrt(np.log(t) / n), "The form is right, but a factor"),
+    ],
+)
+def test_indices(index, said):
+    assert checker.check_index(index).startswith(said)

@@ -68,7 +68,7 @@ def fade(traces: Traces, i: int, factor: float, state: int, action: int) -> floa
         size = traces.sizes[i, k] * factor
         if traces.states[i, k] == state and traces.actions[i, k] == action:
             found = size
-        elif size > SMALLEST_TRACE:
+        elif abs(size) > SMALLEST_TRACE:
             traces.states[i, n_left] = traces.states[i, k]
             traces.actions[i, n_left] = traces.actions[i, k]
             traces.sizes[i, n_left] = size
@@ -103,7 +103,7 @@ def learn_along_traces(agent: TabularAgent, env: Any, progress: Any, i: int) -> 
     factor = settings.gamma * settings.trace_decay * trace_kept(agent, env)
     earlier = fade(traces, i, factor, env.obs, env.action)
     n_others = traces.lengths[i]
-    has_past = n_others > 0 or earlier > 0.0
+    has_past = n_others > 0 or earlier != 0.0
     late = value - traces.expected[i] if settings.trace_kind == DUTCH and has_past else 0.0
     for k in range(n_others):
         change = (td_error + late) * traces.sizes[i, k]

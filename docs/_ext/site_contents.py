@@ -22,11 +22,12 @@ def read(app: Sphinx, page: str, source: list[str]) -> None:
     """Add the list of pages to a page that begins a folder, and what is new to the first page."""
     if page in FOLDERS:
         linked = re.findall(rf"\]\(({FOLDERS[page]}[\w-]+)\.md", source[0])
-        folder = page[: page.rfind("/") + 1]
-        there = [name.removeprefix(folder) for name in sorted(app.env.found_docs)]
-        rest = [name for name in there if name.startswith(FOLDERS[page])]
-        names = dict.fromkeys([*linked, *rest])
-        source[0] += "\n```{toctree}\n:hidden:\n" + "\n".join(names) + "\n```\n"
+        above = page.rpartition("/")[0]
+        start = f"{above}/" * bool(above)
+        inside = [name.removeprefix(start) for name in app.env.found_docs if name.startswith(start)]
+        others = sorted(name for name in inside if name.startswith(FOLDERS[page]))
+        names = "\n".join(dict.fromkeys([*linked, *others]))
+        source[0] += f"\n```{{toctree}}\n:hidden:\n{names}\n```\n"
     if page == "index":
         named = set(source[0].split())
         found = {name for name in app.env.found_docs if "/" not in name} - {"index"}

@@ -201,6 +201,61 @@ def fault_of_mean(told: Callable[..., float], values: Floats, slopes: Floats) ->
     return RIGHT
 
 
+def check_regret(means: Any, arms: Any, regret: Any) -> str:
+    """Whether numbers are the regret after each pull, in the expected rewards.
+
+    Args:
+        means: the expected reward of each arm, shape (K,).
+        arms: which arm was pulled, shape (T,).
+        regret: the answer, summed up over the pulls so far, shape (T,).
+    """
+    pulled, worth = np.asarray(arms), np.asarray(means, dtype=float)
+    wrong = fault_of_array(regret, pulled.shape, "one number for each pull")
+    if wrong:
+        return wrong
+    steps = np.diff(np.asarray(regret, dtype=float), prepend=0.0)
+    if (steps < -TOLERANCE).any():
+        return (
+            f"Regret never falls, but yours does at pull {int((steps < -TOLERANCE).argmax()) + 1}."
+        )
+    if (np.abs(steps[worth[pulled] == worth.max()]) > TOLERANCE).any():
+        return "A pull of the best arm loses nothing: it must not add anything."
+    for arm in np.unique(pulled):
+        own = steps[pulled == arm]
+        if np.ptp(own) > TOLERANCE:
+            return (
+                f"Pulls of arm {arm} add different amounts. Expected rewards count, not those that "
+                "chance has paid."
+            )
+        if abs(own[0] - (worth.max() - worth[arm])) > TOLERANCE:
+            return f"A pull of arm {arm} adds the wrong amount: what would the best arm have paid?"
+    return RIGHT
+
+
+def check_index(index: Callable[..., float]) -> str:
+    """Whether a function can be the index of UCB1, tried on numbers drawn at random.
+
+    Args:
+        index: called with the mean of an arm, the number of its pulls, and that of all pulls.
+    """
+    try:
+        usual, better = float(index(0.4, 10, 100)), float(index(0.5, 10, 100))
+        tried, later = float(index(0.4, 40, 100)), float(index(0.4, 10, 10_000))
+    except (TypeError, ValueError) as fault:
+        return f"It cannot be called or gives no number: {fault}"
+    if abs(better - usual - 0.1) > TOLERANCE:
+        return "If the mean rises by 0.1, the index has to rise by as much."
+    if not usual > 0.4:
+        return "The index has to lie above the mean: where is the bonus?"
+    if abs((usual - 0.4) - 2 * (tried - 0.4)) > TOLERANCE:
+        return "With four times as many pulls of the arm its bonus has to be half as large."
+    if abs((later - 0.4) - np.sqrt(2) * (usual - 0.4)) > TOLERANCE:
+        return "The bonus has to grow with all pulls, but slowly: by the root of their logarithm."
+    if abs(float(index(0.0, 1, np.e**2)) - 2.0) > 1e-3:
+        return "The form is right, but a factor is not: what stands before the logarithm in UCB1?"
+    return RIGHT
+
+
 def probabilities(model: TransitionModel, policy: Any) -> Floats:
     """A policy as probabilities, shape (S, A)."""
     given = np.asarray(policy)

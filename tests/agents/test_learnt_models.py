@@ -189,7 +189,7 @@ def test_the_largest_error_comes_first():
     rewards = [3.0, -7.0, 1.0, 5.0, 2.0, -4.0, 6.0]
     for obs, reward in enumerate(rewards):
         taught.step(obs, 0, reward, 7, terminated=True)
-    taught.step(1, 0, -0.5, 7, terminated=True)  # as urgent as before, but another reward
+    taught.step(6, 0, -0.5, 7, terminated=True)  # as urgent as before, but another reward
     taught.agent.planning_steps = 1
     taught.workspace = taught.agent._make_workspace(taught.agent.rng, 1)
     order = []
@@ -198,7 +198,7 @@ def test_the_largest_error_comes_first():
         taught.step(7, 0, 0.0, 7, terminated=True)
         order.append(int(np.flatnonzero(taught.table[:, 0] != before)[0]))
     assert order == [1, 6, 3, 5, 0, 4, 2]
-    assert taught.table[:, 0].tolist() == [3.0, -0.5, 1.0, 5.0, 2.0, -4.0, 6.0, 0.0]
+    assert taught.table[:, 0].tolist() == [3.0, -7.0, 1.0, 5.0, 2.0, -4.0, -0.5, 0.0]
 
 
 def test_a_changed_outcome_changes_what_leads_where():

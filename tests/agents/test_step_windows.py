@@ -99,9 +99,14 @@ def test_two_steps_by_hand():
     fed = Fed("n_step_sarsa", table, learning_rate=0.5, gamma=0.5, n_steps=2)
     fed.step(0, 0, 1, 1)
     assert fed.table.tolist() == table
+    assert fed.agent.mean_td_error == 0
     assert fed.step(1, 0, 2, 2)[0, 0] == 7
+    assert fed.agent.mean_td_error == 6
     # The end: 2 + .5 * 4 = 4 from state 1 on, half-way from 0 on; 4 from state 2 on.
     assert fed.step(2, 0, 4, 0, "terminated").tolist() == [[7, 0], [2, 0], [6, 0]]
+    # Another episode's first step is not learnt from: the last errors, 4 and 4, go on standing.
+    fed.step(0, 0, 1, 1)
+    assert fed.agent.mean_td_error == 4
     # A greedy tree: in state 1 action 1 is best with 6, so that action 0 tells nothing beyond.
     table = [[10, 0], [0, 6], [8, 0]]
     fed = Fed(
