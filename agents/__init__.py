@@ -5,13 +5,9 @@ compared, before anything heavy is paid for.
 """
 
 from agents.algorithm_entries import AlgorithmEntry
+from agents.known_algorithms import ALGORITHMS
 from agents.old_names import install
-from agents.registry import (
-    ALGORITHMS,
-    fitting_algorithms,
-    load_algorithm,
-    register,
-)
+from agents.registry import fitting_algorithms, load_algorithm, register
 
 install()
 
