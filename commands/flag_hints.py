@@ -65,6 +65,10 @@ HYPERPARAMETERS = {
     *("action_noise", "policy_delay", "target_policy_noise", "target_noise_clip", "zero_policy"),
     *("use_sde_at_warmup", "top_quantiles_to_drop_per_net", "n_critic_updates", "cg_max_steps"),
     *("cg_damping", "line_search_shrinking_factor", "line_search_max_iter", "sub_sampling_factor"),
+    *("trace_decay", "trace_type", "longest_episode", "every_visit", "target_policy", "n_steps"),
+    *("planning_steps", "outcomes_kept", "kappa", "threshold", "known_after", "value_bound"),
+    *("tolerance", "horizon", "bonus_scale", "n_tilings", "n_tiles", "low", "high"),
+    *("value_step_size", "initial_value", "initial_preferences", "gamma_power"),
     *("mask_actions", "n_delta", "n_top", "delta_std", "alive_bonus_offset", "n_eval_episodes"),
 }
 

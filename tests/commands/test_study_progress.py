@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-import commands.study_progress as module
+from commands import live_progress, study_progress
 from commands.study_progress import StudyProgress
 from experiments.launching import RunFailure
 from experiments.study_plan import plan
@@ -21,10 +21,11 @@ from pipeline import signs_of_life
 def clock(monkeypatch):
     """A clock that stands until it is told to go on."""
     fake = SimpleNamespace(now=1000.0)
-    for place in (module, signs_of_life):
+    for place in (study_progress, live_progress, signs_of_life):
         monkeypatch.setattr(place, "time", SimpleNamespace(monotonic=lambda: fake.now))
     # Nothing beats by itself.
-    monkeypatch.setattr(module, "Heartbeat", lambda *_: SimpleNamespace(start=skip, stop=skip))
+    still = SimpleNamespace(start=skip, stop=skip)
+    monkeypatch.setattr(live_progress, "Heartbeat", lambda *_: still)
     return fake
 
 
