@@ -68,7 +68,7 @@ HYPERPARAMETERS = {
     *("trace_decay", "trace_type", "longest_episode", "every_visit", "target_policy", "n_steps"),
     *("planning_steps", "outcomes_kept", "kappa", "threshold", "known_after", "value_bound"),
     *("tolerance", "horizon", "bonus_scale", "n_tilings", "n_tiles", "low", "high"),
-    *("value_step_size", "initial_value", "initial_preferences", "gamma_power"),
+    *("value_step_size", "initial_preferences", "gamma_power"),
     *("mask_actions", "n_delta", "n_top", "delta_std", "alive_bonus_offset", "n_eval_episodes"),
 }
 
