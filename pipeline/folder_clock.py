@@ -54,12 +54,19 @@ def _now_in(folder: Path) -> float:
 
 def remove_remains(root: Path) -> None:
     """Remove what processes that were killed have left half written, in a folder or one below."""
-    for path in [*root.glob(".*.tmp"), *root.glob("*/.*.tmp")]:
-        with contextlib.suppress(OSError):
-            if _FOR_AN_INSTANT.fullmatch(path.name) and (
-                seconds_silent(path) > _SECONDS_OF_AN_INSTANT
-            ):
-                if path.is_dir():
-                    path.rmdir()
-                else:
-                    path.unlink()
+    for folder in (root, *(root / name for name in _names_in(root))):
+        for name in filter(_FOR_AN_INSTANT.fullmatch, _names_in(folder)):
+            path = folder / name
+            with contextlib.suppress(OSError):
+                if seconds_silent(path) > _SECONDS_OF_AN_INSTANT:
+                    if path.is_dir():
+                        path.rmdir()
+                    else:
+                        path.unlink()
+
+
+def _names_in(folder: Path) -> list[str]:
+    """What lies in a folder; nothing where it is none, or has gone meanwhile, as others' do."""
+    with contextlib.suppress(OSError):
+        return os.listdir(folder)
+    return []
