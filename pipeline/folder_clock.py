@@ -68,5 +68,5 @@ def remove_remains(root: Path) -> None:
 def _names_in(folder: Path) -> list[str]:
     """What lies in a folder; nothing where it is none, or has gone meanwhile, as others' do."""
     with contextlib.suppress(OSError):
-        return os.listdir(folder)
+        return [path.name for path in folder.iterdir()]
     return []

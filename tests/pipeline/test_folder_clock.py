@@ -1,8 +1,8 @@
 """What was left half written goes; what others are at, and what goes meanwhile, is no trouble."""
 
 import os
+from pathlib import Path
 
-from pipeline import folder_clock
 from pipeline.folder_clock import remove_remains
 
 REMAINS = f".x.{16 * '0'}.tmp"
@@ -32,15 +32,16 @@ def test_old_remains_go_and_all_else_stays(tmp_path):
 def test_a_folder_may_go_while_it_is_looked_through(tmp_path, monkeypatch):
     """As the grave of a lock does, when another process has dug it."""
     (tmp_path / GRAVE).mkdir()
-    list_names = os.listdir
+    list_all = Path.iterdir
 
     def going(folder):
-        names = list_names(folder)
-        if GRAVE in names:
+        found = list(list_all(folder))
+        if tmp_path / GRAVE in found:
             (tmp_path / GRAVE).rmdir()
-        return names
+        return iter(found)
 
-    monkeypatch.setattr(folder_clock.os, "listdir", going)
+    monkeypatch.setattr(Path, "iterdir", going)
     remove_remains(tmp_path)
     remove_remains(tmp_path / "nowhere")
+    monkeypatch.undo()
     assert list(tmp_path.iterdir()) == []
