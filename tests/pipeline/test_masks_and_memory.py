@@ -122,11 +122,10 @@ def test_an_environment_without_masks_is_refused():
     (line,) = str(caught.value).splitlines()
     assert line.startswith(
         "ppo_mask does not fit CartPole-v1: it needs to be told which actions are valid, by a "
-        "method action_masks() or by info['action_mask']; fitting agents: "
+        "method action_masks() or by info['action_mask']; fitting agents: semi_gradient_sarsa, "
+        "semi_gradient_q, actor_critic, reinforce, dqn, "
     )
-    fitting = line.partition("fitting agents: ")[2].split(", ")
-    assert "dqn" in fitting
-    assert "ppo_mask" not in fitting
+    assert "ppo_mask" not in line.partition("fitting agents")[2]
 
 
 def test_a_masked_policy_is_the_plain_one_on_what_is_valid():
