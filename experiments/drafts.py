@@ -176,7 +176,8 @@ def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
 def make_folder(path: Path) -> None:
     """Make a folder and those above it, also while another run removes those that are empty."""
     for _ in range(1000):
-        with contextlib.suppress(FileNotFoundError):
+        # Also a folder that is there, but no longer when it is looked at, "exists".
+        with contextlib.suppress(FileNotFoundError, FileExistsError):
             path.mkdir(parents=True, exist_ok=True)
             return
-    path.mkdir(parents=True)
+    path.mkdir(parents=True, exist_ok=True)

@@ -275,6 +275,26 @@ def test_a_folder_is_made_while_another_run_removes_it(tmp_path, monkeypatch):
     make_folder(tmp_path / "a" / "b")
 
 
+def test_a_folder_is_made_that_another_run_removes_as_soon_as_it_is_found(tmp_path, monkeypatch):
+    folder, is_dir = tmp_path / "a", Path.is_dir
+    folder.mkdir()
+
+    def vanishing(path):
+        folder.rmdir()
+        monkeypatch.setattr(Path, "is_dir", is_dir)
+        return False
+
+    monkeypatch.setattr(Path, "is_dir", vanishing)
+    make_folder(folder)
+    assert folder.is_dir()
+
+
+def test_a_file_where_a_folder_should_be_is_an_error(tmp_path):
+    (tmp_path / "a").touch()
+    with pytest.raises(FileExistsError):
+        make_folder(tmp_path / "a")
+
+
 def test_a_folder_that_can_never_be_made_is_an_error(tmp_path, monkeypatch):
     def never(path, *args, **kwargs):
         raise FileNotFoundError("never")
