@@ -47,7 +47,7 @@ examples:
   python compare.py studies/warehouse-learning-rate.yml --until-decided
   python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
 
-The same command again does the runs that are missing, and no other.
+The same command again does the missing runs, and no others.
 """
 
 
@@ -60,7 +60,7 @@ def build_parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
-    add("study", nargs="?", metavar="STUDY.yml", help="a study file, or the name of one of ours")
+    add("study", nargs="?", metavar="STUDY.yml", help="a study file, or the name of a shipped one")
     add("--env", nargs="+", default=[], metavar="ID", help="environments")
     add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (train --list has them)")
     add("--seeds", type=SEEDS, metavar="N", help="how many seeds (default: the study's, or 10)")
@@ -68,14 +68,14 @@ def build_parser() -> argparse.ArgumentParser:
         "--first-seed",
         type=FIRST_SEED,
         metavar="N",
-        help="the first of them (default: the study's, or 0)",
+        help="the first of these seeds (default: the study's, or 0)",
     )
     add(
         "--until-decided",
         action="store_true",
-        help="more seeds for agents in undecided pairs, at looks that are settled beforehand",
+        help="give agents in undecided pairs more seeds, at looks that are fixed beforehand",
     )
-    add("--max-seeds", type=SEEDS, metavar="N", help="how many seeds that may take (default: 50)")
+    add("--max-seeds", type=SEEDS, metavar="N", help="the most seeds for that (default: 50)")
     add("-n", "--n-timesteps", type=COUNT, metavar="N", help="environment steps of each run")
     add("--n-episodes", type=COUNT, metavar="N", help="episodes instead of steps")
     add(
@@ -92,7 +92,7 @@ def build_parser() -> argparse.ArgumentParser:
         nargs="+",
         default=[],
         metavar="[AGENT:]YAML",
-        help="hyperparameters from another file; of several agents, say whose: dqn:mine.yml",
+        help="hyperparameters from another file; with several agents, for which: dqn:mine.yml",
     )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add(
@@ -125,13 +125,18 @@ def _add_run_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("runs")
     add_place_flags(group)
     add = group.add_argument
-    add("--run-timeout", type=RUN_TIMEOUT, metavar="TIME", help="end a run after, say, 10m")
-    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes, say, 4GB")
-    add("--repair", action="store_true", help="do damaged runs again; their folders are kept")
+    add(
+        "--run-timeout",
+        type=RUN_TIMEOUT,
+        metavar="TIME",
+        help="end a run after this time, e.g. 10m",
+    )
+    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes more, e.g. 4GB")
+    add("--repair", action="store_true", help="do damaged runs again; the old folders are kept")
     add(
         "--replace",
         action="store_true",
-        help="do finished runs of other settings again; their folders are kept",
+        help="do finished runs with other settings again; the old folders are kept",
     )
 
 
@@ -149,12 +154,12 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         type=COUNT_OR_NONE,
         default=0,
         metavar="N",
-        help="film an episode every N of them",
+        help="film one episode after every N episodes",
     )
     add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
-    add("-f", "--log-folder", type=filled, default="logs/studies", help="folder above all studies")
+    add("-f", "--log-folder", type=filled, default="logs/studies", help="folder of all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
-    add("--no-report", action="store_true", help="tables alone: no figures and no page")
+    add("--no-report", action="store_true", help="only tables: no figures and no page")
 
 
 def main() -> int:

@@ -52,7 +52,7 @@ def build_parser() -> argparse.ArgumentParser:
     add(
         "model",
         nargs="?",
-        help="path of a model zip, a run folder or a pack, instead of looking for a run",
+        help="path of a model zip, a run folder or a pack (default: a run is looked for)",
     )
     add("--algo", type=filled, help="agent (default: ppo, or what the zip's run folder says)")
     add(
@@ -60,7 +60,7 @@ def build_parser() -> argparse.ArgumentParser:
         type=filled,
         help="environment id (default: CartPole-v1, or what the run folder says)",
     )
-    add("-f", "--folder", type=filled, default="logs", help="folder above all runs (default: logs)")
+    add("-f", "--folder", type=filled, default="logs", help="folder of all runs (default: logs)")
     add(
         "--exp-id",
         type=RUN_NUMBER,
@@ -68,7 +68,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="number of the run (default: 0, the newest; -1 for FOLDER/ALGO/ENV.zip itself)",
     )
-    add("--load-best", action="store_true", help="the model that evaluated best in training")
+    add("--load-best", action="store_true", help="the model with the best evaluation in training")
     add(
         "--load-checkpoint",
         type=COUNT_OR_NONE,
@@ -79,7 +79,7 @@ def build_parser() -> argparse.ArgumentParser:
     add(
         "--vec-normalize",
         metavar="FILE",
-        help="statistics of VecNormalize (default: those that lie with the model)",
+        help="statistics of VecNormalize (default: those saved with the model)",
     )
     add("--device", default="auto", help="torch device (default: auto)")
     add("--num-threads", type=THREADS, default=1, help="torch threads (1); -1 leaves it to torch")
@@ -89,7 +89,14 @@ def build_parser() -> argparse.ArgumentParser:
 
 def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("playing").add_argument
-    add("-n", "--n-timesteps", type=STEPS, default=-1, metavar="N", help="stop after so many steps")
+    add(
+        "-n",
+        "--n-timesteps",
+        type=STEPS,
+        default=-1,
+        metavar="N",
+        help="stop after this many steps",
+    )
     add(
         "--n-episodes",
         type=COUNT,
@@ -112,7 +119,7 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
     add(
         "--render",
         choices=["human", "ansi", "none"],
-        help="how to watch (default: human where there is a display, else none)",
+        help="how to watch (default: human if there is a display, else none)",
     )
     add("--no-render", action="store_const", const="none", dest="render", help="--render none")
     add(
@@ -122,7 +129,7 @@ def _add_playing_flags(parser: argparse.ArgumentParser) -> None:
         help="pictures a second of --render ansi on a terminal (default: 4)",
     )
     add("--record", type=filled, metavar="FILE", help="write a film, .gif or .mp4")
-    add("--reward-log", metavar="DIR", help="write the returns there too, as Monitor's CSV files")
+    add("--reward-log", metavar="DIR", help="also write the returns there, as Monitor's CSV files")
     add("--verbose", type=VERBOSITY, default=1, help="0 for no output (default: 1)")
     add("--norm-reward", action="store_true", help="returns of rewards as training normalised them")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")

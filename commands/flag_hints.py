@@ -32,8 +32,8 @@ INSTEAD: Mapping[str, str] = {
         ),
         _SEARCH,
     ),
-    "--n-evaluations": "it is not said in numbers but in steps between them: --eval-freq",
-    "--trial-id": "trials are not read here: what tune finds is a file for --conf-file, winner.yml",
+    "--n-evaluations": "they are not counted here: give the steps between them, --eval-freq",
+    "--trial-id": "trials are not read here: tune writes a file for --conf-file, winner.yml",
     **dict.fromkeys(
         (
             "--track",
@@ -45,8 +45,8 @@ INSTEAD: Mapping[str, str] = {
         ),
         _NO_WANDB,
     ),
-    "--trust": "it is not needed: whatever is loaded is read as data, and nothing in it is run",
-    "--truncate-last-trajectory": "it is not a choice here: the library's default, true, holds",
+    "--trust": "it is not needed: every file is read as data, and nothing in it is run",
+    "--truncate-last-trajectory": "it cannot be changed: it is always true, the library's default",
 }
 
 # Arguments of constructors that are flags.

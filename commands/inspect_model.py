@@ -19,10 +19,10 @@ SUSPICIOUS = 1
 def build_parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = OneLineParser(
-        description="What a zip of a model holds, and what in it is suspicious. Nothing is run.",
-        epilog="Exit code: 0 where nothing is suspicious, 1 where something is, 2 for no model.",
+        description="Print what a model zip contains and what is suspicious. Nothing in it is run.",
+        epilog="Exit code: 0 if nothing is suspicious, 1 if something is, 2 if it is no model.",
     )
-    parser.add_argument("model", metavar="ZIP", help="of Stable-Baselines3, or of these agents")
+    parser.add_argument("model", metavar="ZIP", help="zip of an agent of Stable-Baselines3 or ours")
     return parser
 
 

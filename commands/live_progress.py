@@ -65,7 +65,7 @@ class LiveProgress(ABC):
             self.look()
             self.live.stop()
         if isinstance(error, KeyboardInterrupt):
-            self.say(f"{self.figures()}; the same command goes on")
+            self.say(f"{self.figures()}; the same command continues")
 
     def look(self) -> None:
         """Show how far it is, also while nothing ends."""

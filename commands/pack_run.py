@@ -33,7 +33,7 @@ def build_parser() -> argparse.ArgumentParser:
         help="folder to make, or .zip to write (default: a folder named after agent, environment "
         "and seed)",
     )
-    add("--check", action="store_true", help="hold every file of a pack against its digest instead")
+    add("--check", action="store_true", help="compare every file of a pack with its digest instead")
     return parser
 
 

@@ -51,7 +51,7 @@ def add_place_flags(group: argparse._ArgumentGroup) -> None:
     add(
         "--insecure-cluster",
         action="store_true",
-        help="also on one that is open to its network without TLS: whoever reaches it can run code",
+        help="also on a cluster without TLS: anybody who can connect to it can run code",
     )
 
 
@@ -77,7 +77,7 @@ def place_of(
     if args.cluster is not None:
         return _cluster(args, root, command, limits, say)
     if args.insecure_cluster:
-        raise UserError("--insecure-cluster says something of a cluster: give --cluster too")
+        raise UserError("--insecure-cluster belongs to --cluster: give --cluster too")
     from experiments.launching import available_cores, local_launcher
 
     n_workers = max(args.jobs, 0) or available_cores()
@@ -109,7 +109,7 @@ def _cluster(
 ) -> Place:
     for library in ("distributed", "cryptography", "dask_jobqueue"):
         if importlib.util.find_spec(library) is None:
-            raise UserError("--cluster takes Dask: pip install 'rl-yardstick[cluster]'")
+            raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'")
     from experiments.cluster.clusters import checked_cluster
 
     cluster = checked_cluster(args.cluster, args.insecure_cluster)
@@ -141,7 +141,7 @@ def _check_jobs(cluster: Cluster, n_jobs: int) -> None:
 
     if isinstance(cluster, JobQueue):
         if n_jobs < 1:
-            raise UserError(f"{cluster.file}: say how many runs are to go at once: --jobs N")
+            raise UserError(f"{cluster.file}: say how many runs to do at once: --jobs N")
     elif n_jobs > 0:
         raise UserError("--jobs is for this machine or a queue of jobs; a cluster has its workers")
 

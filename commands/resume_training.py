@@ -92,7 +92,7 @@ def _check_given(args: argparse.Namespace) -> None:
     for action in parser._actions:
         if action.dest in typed and action.dest not in allowed:
             flag = action.option_strings[-1]
-            raise UserError(f"{flag} cannot be given with --resume: it is as the run has it")
+            raise UserError(f"{flag} cannot be given with --resume: the run has its own")
 
 
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
@@ -143,8 +143,8 @@ def _carried_out(
             tell_changes(run, spec, say)
             keeping = go_on(run, StateKeeping(args.save_state_every, stays=args.keep_state), say)
         if keeping.state is None:
-            say("no state was saved: the run begins anew")
+            say("no state was saved: the run begins again")
         else:
-            say(f"going on from step {keeping.state.note['steps']:,}")
+            say(f"continuing from step {keeping.state.note['steps']:,}")
         training = prepare(spec, console, {}, command_line(), run, keeping)
     return training, carry_out(training)

@@ -104,7 +104,7 @@ def conclude(
         say(console, f"{runs} of an earlier version recorded no digests: damage may go unseen")
     n_missing = len(planned) - len(results.finished)
     if n_missing > len(failures) + len(results.left_out):
-        say(console, f"{n_missing} of {len(planned)} runs are missing; the same command goes on")
+        say(console, f"{n_missing} of {len(planned)} runs are missing; the same command continues")
     return 1 if n_missing else 0
 
 

@@ -47,7 +47,7 @@ def study_spec(args: argparse.Namespace) -> StudySpec:
 
 def _check_output(args: argparse.Namespace) -> None:
     if args.max_seeds is not None and not args.until_decided:
-        raise UserError("--max-seeds is how far --until-decided may go: give both, or --seeds")
+        raise UserError("--max-seeds belongs to --until-decided: give both, or --seeds")
     for flag in ("quick", "replace"):
         if args.until_decided and getattr(args, "is_quick" if flag == "quick" else flag):
             raise UserError(f"--until-decided and --{flag} do not go together: give one of them")

@@ -20,7 +20,7 @@ from commands.parsing import MODULES_HELP, OneLineParser, as_called, program_nam
 
 WATCHED = whole_number(1, besides={0: "those of the first 5,000 steps"})
 
-# The flags of a run that was cut off, by the names of their values.
+# The flags of an interrupted run, by the names of their values.
 RESUMING = ("resume", "resume_or_start", "save_state_every", "keep_state")
 
 EPILOG = """\
@@ -53,35 +53,34 @@ def build_parser() -> argparse.ArgumentParser:
 
 
 def _add_resuming_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("a run that was cut off").add_argument
+    add = parser.add_argument_group("continuing an interrupted run").add_argument
     add(
         "--resume",
         nargs="?",
         const="",
         metavar="RUN",
-        help="go on with this run folder, or with the newest of --algo and --env that is not "
-        "finished, to the result that it would have had undisturbed; budget, seed and settings "
-        "are the run's",
+        help="continue this run, or the newest unfinished one of --algo and --env, to the same "
+        "result as without the interruption; budget, seed and settings are those of the run",
     )
     add(
         "--resume-or-start",
         action="store_true",
-        help="go on with the newest run of these very settings, begin one where there is none, and "
-        "do nothing where it is finished: for scripts that a queue starts again",
+        help="continue the newest run with exactly these settings, begin one if there is none, and "
+        "do nothing if it is finished: for scripts that a queue starts again",
     )
     add(
         "--save-state-every",
         type=save_interval,
         default="auto",
         metavar="N",
-        help="save what to go on from every so often: 30s, 5m, 5000 (steps), never, or auto, "
-        "which takes about 2%% of the time (default)",
+        help="how often to save the state from which --resume continues: 30s, 5m, 5000 (steps), "
+        "never, or auto, which takes about 2%% of the time (default)",
     )
-    add("--keep-state", action="store_true", help="leave it in the folder of a finished run")
+    add("--keep-state", action="store_true", help="keep the state of a finished run")
 
 
 def _add_training_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("how long, and on what settings").add_argument
+    add = parser.add_argument_group("budget and settings").add_argument
     add("-n", "--n-timesteps", type=BUDGET, default=-1, metavar="N", help="environment steps")
     add("--n-episodes", type=BUDGET, default=-1, metavar="N", help="episodes instead of steps")
     add("--seed", type=SEED, default=-1, help="seed of everything (default: a random one)")
@@ -106,7 +105,7 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="KEY:VALUE",
-        help="environment arguments for evaluation alone",
+        help="environment arguments for evaluation only",
     )
     add(
         "--gym-packages",
@@ -121,9 +120,9 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         "--trained-agent",
         default="",
         metavar="ZIP",
-        help="go on with this agent (a zip or run folder) for -n further steps, in a new run "
-        "folder: its statistics, replay buffer, step counter and schedules go on, and "
-        "hyperparameters are those given here, or of the file",
+        help="train this agent (zip or run folder) for -n further steps, in a new run folder; its "
+        "statistics, replay buffer, step counter and schedules continue; hyperparameters are those "
+        "given here or in the file",
     )
     add("--vec-env", choices=["dummy", "subproc"], default="dummy", help="kind of VecEnv")
     add("--device", default="auto", help="torch device (default: auto)")
@@ -137,13 +136,19 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         "--eval-episodes",
         type=COUNT,
         metavar="N",
-        help="episodes of each, the final one too (default: as few as will do, up to 20, at the "
-        "end up to 100)",
+        help="episodes of each evaluation, the final one too (default: as few as are precise "
+        "enough, up to 20, at the end up to 100)",
     )
-    add("--n-eval-envs", type=COUNT, default=10, metavar="N", help="environments for it (10)")
+    add(
+        "--n-eval-envs",
+        type=COUNT,
+        default=10,
+        metavar="N",
+        help="environments to evaluate on (10)",
+    )
     add("--save-freq", type=INTERVAL, default=-1, metavar="N", help="steps between checkpoints")
-    add("--save-replay-buffer", action="store_true", help="save it too, where the agent has one")
-    add("-f", "--log-folder", type=filled, default="logs", help="folder above all runs (logs)")
+    add("--save-replay-buffer", action="store_true", help="save it too, if the agent has one")
+    add("-f", "--log-folder", type=filled, default="logs", help="folder of all runs (logs)")
     add("-uuid", "--uuid", action="store_true", help="add a unique id to the run folder's name")
     add("-tb", "--tensorboard-log", default="", metavar="DIR", help="write TensorBoard logs there")
     add(
@@ -159,7 +164,7 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         default=1,
         help="0 silent, 1 progress and summary (default), 2 the library's tables as well",
     )
-    add("-P", "--progress", action="store_true", help="a live bar even without a terminal")
+    add("-P", "--progress", action="store_true", help="a progress bar even without a terminal")
     add(
         "--watch-learning",
         type=filled,

@@ -28,7 +28,7 @@ examples:
   python tune.py --env CartPole-v1 --algo dqn --seeds-per-trial 10 --objective lower
   python tune.py --env Taxi-v4 --algo qlearning --sampler grid --storage journal:shared/taxi.log
 
-The same command again goes on with what is there; several at once share the work.
+The same command again continues the search; several at once share the work.
 """
 
 
@@ -36,8 +36,8 @@ def build_parser() -> argparse.ArgumentParser:
     """The flags; those of runs mean what they mean to train and compare, the others to rl_zoo3."""
     parser = OneLineParser(
         prog=program_name(),
-        description="Search for an agent's hyperparameters, each setting judged over several "
-        "seeds; run the best again on other seeds, and write down what is not worse than before.",
+        description="Search for an agent's hyperparameters: judge each setting over several seeds, "
+        "run the best again on other seeds, and save a setting that is better there.",
         epilog=as_called(EPILOG),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -68,25 +68,33 @@ def _add_search_flags(parser: argparse.ArgumentParser) -> None:
         type=SEEDS,
         default=5,
         metavar="N",
-        help="seeds that each is judged over (5)",
+        help="seeds of each trial (5)",
     )
-    add("--first-seed", type=FIRST_SEED, default=0, metavar="N", help="the first of them (0)")
+    add(
+        "--first-seed", type=FIRST_SEED, default=0, metavar="N", help="the first of these seeds (0)"
+    )
     add(
         "--objective",
         choices=OBJECTIVES,
         default="mean",
-        help="how: by their mean (default), their interquartile mean, or their lower quartile",
+        help="which figure of a trial's runs counts: mean (default), interquartile mean, or lower "
+        "quartile",
     )
     add(
         "--metric",
         choices=FIGURES,
-        help="what of a run (default: score, the final policy's return between the best random or "
-        "constant policy, 0, and the optimum, 1, or the return where no optimum is known; on "
-        "bandits: regret); steps and seconds count until the threshold",
+        help="which figure of a run counts (default: score, the final policy's return between the "
+        "best random or constant policy, 0, and the optimum, 1; the return if no optimum is known; "
+        "on bandits regret); steps and seconds count until the threshold",
     )
     add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
     add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
-    add("--pruner", choices=tuple(PRUNERS), default="auto", help="what ends hopeless trials (auto)")
+    add(
+        "--pruner",
+        choices=tuple(PRUNERS),
+        default="auto",
+        help="rule that ends hopeless trials (auto)",
+    )
     add(
         "--n-startup-trials",
         type=whole_number(0, 100_000),
@@ -98,14 +106,14 @@ def _add_search_flags(parser: argparse.ArgumentParser) -> None:
         "--search-space",
         type=filled,
         metavar="YAML",
-        help="what to choose between (default: search_spaces/AGENT.yml)",
+        help="the values to choose from (default: search_spaces/AGENT.yml)",
     )
     add("--seed", type=whole_number(0, 2**32 - 1), default=0, help="seed of the search (0)")
     add(
         "--timeout",
         type=RUN_TIMEOUT,
         metavar="TIME",
-        help="begin no further run after, say, 50m; then comes the re-test",
+        help="begin no more runs after this time, e.g. 50m; then comes the re-test",
     )
 
 
@@ -116,15 +124,15 @@ def _add_retest_flags(parser: argparse.ArgumentParser) -> None:
         type=whole_number(0, 100),
         default=3,
         metavar="K",
-        help="run the best K again on other seeds, beside the shipped settings (3; 0 for none)",
+        help="run the best K settings and the shipped ones again on other seeds (3; 0 for none)",
     )
-    add("--retest-seeds", type=SEEDS, default=20, metavar="N", help="on how many other seeds (20)")
+    add("--retest-seeds", type=SEEDS, default=20, metavar="N", help="how many other seeds (20)")
     add(
         "--first-retest-seed",
         type=FIRST_SEED,
         default=1000,
         metavar="N",
-        help="the first of them (1000)",
+        help="the first of these seeds (1000)",
     )
 
 
@@ -140,14 +148,19 @@ def _add_run_flags(parser: argparse.ArgumentParser) -> None:
         metavar="KEY:VALUE",
         help="hyperparameters of every trial, which are not searched, e.g. engine:compiled",
     )
-    add("-conf", "--conf-file", type=filled, metavar="YAML", help="begin with another file's entry")
+    add("-conf", "--conf-file", type=filled, metavar="YAML", help="start from another file's entry")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add("--gym-packages", nargs="+", type=filled, default=[], metavar="MODULE", help=MODULES_HELP)
     add("--eval-freq", type=COUNT, metavar="N", help="steps between two evaluations")
-    add("--eval-episodes", type=COUNT, metavar="N", help="episodes of each that is sampled (20)")
+    add("--eval-episodes", type=COUNT, metavar="N", help="episodes of a sampled evaluation (20)")
     add_place_flags(group)
-    add("--run-timeout", type=RUN_TIMEOUT, metavar="TIME", help="end a run after, say, 10m")
-    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes, say, 4GB")
+    add(
+        "--run-timeout",
+        type=RUN_TIMEOUT,
+        metavar="TIME",
+        help="end a run after this time, e.g. 10m",
+    )
+    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes more, e.g. 4GB")
 
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:
@@ -156,25 +169,25 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         "--storage",
         type=filled,
         metavar="WHERE",
-        help="keep trials there: journal:FILE, sqlite:///FILE, postgresql://..., grpc://HOST:PORT "
-        "(default: a SQLite file in the tuning's folder)",
+        help="where trials are: journal:FILE, sqlite:///FILE, postgresql://..., grpc://HOST:PORT "
+        "(default: a SQLite file in the search's folder)",
     )
     add(
         *("--name", "--study-name"),
         dest="name",
         type=folder_name,
-        help="name of the tuning and its folder (default: ENV_AGENT)",
+        help="name of the search and its folder (default: ENV_AGENT)",
     )
     add(
         *("-f", "--log-folder", "--optimization-log-path"),
         dest="log_folder",
         type=filled,
         default="logs/tuning",
-        help="folder above all tunings (logs/tuning)",
+        help="folder of all searches (logs/tuning)",
     )
     add(
         *("--no-report", "--no-optim-plots"),
         dest="no_report",
         action="store_true",
-        help="tables alone: no figures and no page",
+        help="only tables: no figures and no page",
     )

@@ -150,9 +150,9 @@ def _check_same(root: Path, there: Design, now: Design) -> None:
     ]
     if differences:
         raise UserError(
-            f"{root}: when to look was settled before the first look and cannot change "
+            f"{root}: the looks were fixed before the first of them and cannot change "
             f"({'; '.join(differences)}): --name NAME makes another study, and without "
-            "--until-decided this one grows by hand"
+            "--until-decided you can add seeds to this one by hand"
         )
 
 
@@ -168,7 +168,7 @@ def _check_runs(root: Path, looks: Looks, evidence: Evidence) -> None:
         same = [name for name, n in there.runs.items() if now.runs[name] == n]
         if any(now.digests[name] != there.digests[name] for name in same):
             raise UserError(
-                f"{root}: on {evidence.environment}, runs that were looked at are others now: "
+                f"{root}: on {evidence.environment}, runs have changed since they were looked at: "
                 "--name NAME makes another study"
             )
 

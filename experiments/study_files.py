@@ -227,7 +227,7 @@ def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[
         if n_agents > MOST_AGENTS:
             place = document.at(*keys)
             raise UserError(
-                f"{place}: {n_agents:,} agents by here; a study has {MOST_AGENTS:,} at most"
+                f"{place}: {n_agents:,} agents up to here; a study has {MOST_AGENTS:,} at most"
             )
         agents += swept(agent, sweep)
     return tuple(agents)
@@ -241,7 +241,7 @@ def _conf_file(document: _Document, entry: Mapping[str, Any], keys: Keys) -> Pat
     place = f"{document.at(*keys, 'conf_file')}: conf_file"
     path = document.path.parent / str(coerce(given, str, place))
     if entry.get("tuned") is False:
-        raise UserError(f"{place} says where to begin, and tuned: false not to: leave one out")
+        raise UserError(f"{place} and tuned: false contradict each other: leave one out")
     if not path.is_file():
         raise UserError(f"{place}: there is no file {path}")
     return path

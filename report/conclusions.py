@@ -222,7 +222,7 @@ def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
         n = len(look.design.sizes)
         looks = "1 look that was" if n == 1 else f"{n} looks that were"
         yield (
-            f"Agents got more seeds until they were decided, at up to {looks} settled beforehand: "
+            f"Agents got more seeds until they were decided, at up to {looks} fixed beforehand: "
             f"claims at {level} each."
         )
     elif look.number > 1:

@@ -18,7 +18,7 @@ def look_sentences(looks: Looks) -> list[str]:
     told = [f"These runs have been looked at {times}."]
     if looks.design is not None:
         sizes = [f"{size:,}" for size in looks.design.sizes]
-        told.append(f"Settled before the first of them: looks at {enumeration(sizes)} seeds.")
+        told.append(f"Fixed before the first of them: looks at {enumeration(sizes)} seeds.")
     return [*told, *map(_on, looks.taken)]
 
 

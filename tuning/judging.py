@@ -76,7 +76,7 @@ def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> flo
     threshold, name = row.get("threshold"), tuning.figure
     if threshold is None:
         raise UserError(
-            f"--metric {name}: nobody says which return is to be reached on "
+            f"--metric {name}: no threshold is known on "
             f"{tuning.environment.env_id}; give --threshold"
         )
     figures = evaluations.figures

@@ -59,7 +59,7 @@ def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
         return "journal"
     name = scheme[0].partition("+")[0].lower()
     if name not in (*_DATABASES, _GRPC):
-        raise UserError(f"--storage: {shown(without_secret(given))} is none: {KNOWN}")
+        raise UserError(f"--storage: {shown(without_secret(given))} is no storage: {KNOWN}")
     return "proxy" if name == _GRPC else "database"
 
 

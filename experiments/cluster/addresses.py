@@ -119,8 +119,8 @@ def check_address(address: str, has_certificates: bool, is_told: bool) -> None:
         )
     if scheme == "tcp" and not is_loopback(address) and not is_told:
         raise UserError(
-            f"--cluster {address}: whoever reaches a scheduler without TLS can run code as you; "
-            "use tls://, or say --insecure-cluster where the network is yours alone"
+            f"--cluster {address}: without TLS, anybody who can connect to a scheduler can run "
+            "code as you; use tls://, or give --insecure-cluster if the network is yours alone"
         )
 
 

@@ -110,8 +110,8 @@ class Connection:
                 reason = one_line(error)
             time.sleep(_SECONDS_BETWEEN_LOOKS)
         raise ClusterGoneError(
-            f"--cluster: the scheduler is gone for {SECONDS_WITHOUT_SCHEDULER:.0f} s ({reason}); "
-            "what is done stays, and the same command goes on"
+            f"--cluster: there was no scheduler for {SECONDS_WITHOUT_SCHEDULER:.0f} s ({reason}); "
+            "finished runs are kept, and the same command continues"
         )
 
     def _connected(self) -> Client:

@@ -69,7 +69,7 @@ def find_policy(path: Path) -> PolicyFile:
         check_recorded(spec, run.path)
     algo = hand_written_algorithm(model) or spec.get("algo")
     if not isinstance(algo, str):
-        raise UserError(f"{path} lies in no run folder: what agent it holds is not known")
+        raise UserError(f"{path} is in no run folder: its agent is not known")
     recorded = spec.get("hyperparams")
     settings = recorded if isinstance(recorded, dict) else {}
     changed = next((key for key in _OBSERVATION_SETTINGS if settings.get(key)), None)

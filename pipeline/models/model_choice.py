@@ -163,7 +163,7 @@ def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
     env_id = request.env_id or recorded.env_id
     if algo is None or env_id is None:
         missing = "--algo" if algo is None else "--env"
-        raise UserError(f"{path} lies in no run folder: say what it is with {missing}")
+        raise UserError(f"{path} is in no run folder: say what it is with {missing}")
     check_algorithm(algo)
     check_env_id(env_id)
     return ChosenModel(file, _spec(algo, env_id, recorded, request), run)

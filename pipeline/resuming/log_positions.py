@@ -46,7 +46,7 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, P
         if not path.is_file() or _position(path, position[0])[:2] != tuple(position)[:2]:
             raise UserError(
                 f"{path} is not as the run left it: it cannot go on from its state; remove "
-                f"{run_folder / STATE_FOLDER} to begin the run anew"
+                f"{run_folder / STATE_FOLDER} to begin the run again"
             )
     for path in [*_monitor_files(run_folder), *_event_files(log_folder)]:
         name = path.name if path.parent == run_folder else str(path)

@@ -78,7 +78,7 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
             reason = error.strerror if isinstance(error, OSError) else error
             reasons.append(f"{path}: {reason}")
     if reasons and not found:
-        raise UserError(f"{reasons[0]}; remove {folder} to begin the run anew")
+        raise UserError(f"{reasons[0]}; remove {folder} to begin the run again")
     for reason in reasons:
         tell(f"{reason}; the state before it is taken")
     return max(found, key=lambda state: int(state.note["number"]), default=None)

@@ -255,7 +255,7 @@ class StateSaver(StopAtSafeMoment):
         except NotRestorableError as error:
             raise UserError(
                 f"{self.run.state_path} does not fit what the run's settings make today: {error}; "
-                "remove it to begin the run anew"
+                "remove it to begin the run again"
             ) from error
         put_back(self.modules, roots["modules"])
         set_generators(roots["generators"])

@@ -36,7 +36,7 @@ def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
         if _may_go_on(run):
             return run
     there = f"all {len(runs)} are finished" if runs else "there is none at all"
-    raise UserError(f"no run of {algo} on {name} in {log_folder} was cut off: {there}")
+    raise UserError(f"no run of {algo} on {name} in {log_folder} was interrupted: {there}")
 
 
 def run_of_spec(spec: TrainSpec, any_seed: bool) -> Run | None:

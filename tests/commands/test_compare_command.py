@@ -356,7 +356,7 @@ def test_ctrl_c_ends_with_130_and_goes_on_afterwards(type_command, folder):
     assert process.returncode == 130
     assert err == "compare.py: interrupted\n"
     assert "0 of 2 runs" in out
-    assert "the same command goes on" in out
+    assert "the same command continues" in out
     wait_for(lambda: not any(map(is_alive, started)))
     assert not study.exists()
     (folder / "mark").touch()
@@ -375,7 +375,7 @@ def test_other_signals_do_what_ctrl_c_does(folder, number, to_all):
     assert process.returncode == 128 + number
     assert err == f"compare.py: ended by {number.name}\n"
     assert "0 of 2 runs" in out
-    assert "the same command goes on" in out
+    assert "the same command continues" in out
     wait_for(lambda: not any(map(is_alive, started)))
     assert not study.exists()
 

@@ -203,7 +203,7 @@ def test_a_library_zip_from_elsewhere_is_judged(type_command, folder, tmp_path):
         "--logged", "second.csv", "--policy", str(run / "ReplayBandit-v0.zip")
     )
     assert code == 2
-    assert "lies in no run folder: what agent it holds is not known" in err
+    assert "is in no run folder: its agent is not known" in err
 
 
 def test_agents_that_observe_something_else_are_refused(folder, tmp_path):

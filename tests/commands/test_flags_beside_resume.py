@@ -39,7 +39,7 @@ def test_every_flag_beside_resume(type_in_own_folder, own_folder, flag, value):
     words = [flag] if value is None else [flag, value]
     code, _, said = type_in_own_folder("train.py", "--resume", "run", *words)
     assert (code, said.count("\n")) == (2, 1)
-    refusal = f"{flag} cannot be given with --resume: it is as the run has it"
+    refusal = f"{flag} cannot be given with --resume: the run has its own"
     assert (refusal in said) == (flag not in ALLOWED), said
     assert not list((own_folder / "run").iterdir())
 
@@ -47,4 +47,4 @@ def test_every_flag_beside_resume(type_in_own_folder, own_folder, flag, value):
 def test_which_run_is_said_by_its_folder_or_by_its_agent_and_environment(type_in_own_folder):
     code, _, said = type_in_own_folder("train.py", "--algo", "ppo", "--resume")
     assert (code, said.count("\n")) == (2, 1)
-    assert "no run of ppo on CartPole-v1 in logs was cut off" in said
+    assert "no run of ppo on CartPole-v1 in logs was interrupted" in said

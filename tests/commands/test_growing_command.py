@@ -129,7 +129,7 @@ def test_runs_that_fail_are_tried_once_and_do_not_hold_a_study_up(type_command, 
     [
         (["--until-decided", "--quick"], "--until-decided and --quick do not go together"),
         (["--until-decided", "--replace"], "--until-decided and --replace do not go together"),
-        (["--max-seeds", 9], "--max-seeds is how far --until-decided may go"),
+        (["--max-seeds", 9], "--max-seeds belongs to --until-decided"),
         (["--until-decided", "--max-seeds", 5], "--max-seeds is 5, the study begins with 6 seeds"),
     ],
 )

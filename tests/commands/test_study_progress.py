@@ -135,7 +135,7 @@ def test_a_study_that_is_interrupted_says_how_to_go_on(clock):
         interrupted()
     assert file.getvalue().splitlines() == [
         "1 of 8 runs in 2 h 3 min, about 14 h 22 min left",
-        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left; the same command goes on",
+        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left; the same command continues",
     ]
 
 

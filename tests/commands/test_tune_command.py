@@ -108,7 +108,7 @@ def test_the_same_command_again_does_nothing_and_says_the_same(folder, type_comm
         (["--env", "FrozenLake-v1", "--algo", "qlerning"], "did you mean 'qlearning'?"),
         ([*WORDS[:4], "--search-space", "none.yml"], "--search-space: there is no file none.yml"),
         ([*WORDS[:4], "--first-seed", "998"], "seed 1000 is one of the search and of the re-test"),
-        ([*WORDS[:4], "--storage", "redis://u:secret@h"], "--storage: 'redis://u:***@h' is none"),
+        ([*WORDS[:4], "--storage", "redis://u:secret@h"], "--storage: 'redis://u:***@h' is no"),
         ([*WORDS[:4], "-params", "gama:0.9"], "did you mean 'gamma'?"),
         ([*WORDS[:4], "-n", "9", "--n-episodes", "9"], "give -n or --n-episodes, not both"),
         ([*WORDS[:6], "--sampler", "grid", "--trials", "3"], "give more trials"),

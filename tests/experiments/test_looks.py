@@ -313,7 +313,7 @@ def test_after_a_look_by_hand_the_settled_ones_share_what_is_left(tmp_path):
 def test_what_was_settled_cannot_change(tmp_path, study, most, words):
     grow(study_of(*THREE), tmp_path, most=40)
     before = (tmp_path / FILE).read_bytes()
-    with pytest.raises(UserError, match="settled before the first look") as refusal:
+    with pytest.raises(UserError, match="looks were fixed before the first") as refusal:
         settled_looks(study, tmp_path, most)
     assert words in str(refusal.value)
     assert (tmp_path / FILE).read_bytes() == before
@@ -330,7 +330,7 @@ def test_nothing_is_settled_that_could_not_be(tmp_path):
 def test_runs_that_were_looked_at_and_are_others_now_are_refused(tmp_path):
     study = study_of(*THREE)
     grow(study, tmp_path, most=40, steps=2)
-    with pytest.raises(UserError, match="on lake, runs that were looked at are others now"):
+    with pytest.raises(UserError, match="on lake, runs have changed since they were looked at"):
         grow(study, tmp_path, ends={**ENDS, "sarsa": [99, *ENDS["sarsa"][1:]]})
     # One that is missing now makes no such claim, nor one that was missing then.
     grow(study, tmp_path, ends={**ENDS, "sarsa": [None, *ENDS["sarsa"][1:]]}, steps=1)
@@ -349,7 +349,7 @@ def test_verdicts_say_with_how_many_seeds_and_how_many_looks_they_were_found(tmp
     assert text.count(", with 10 seeds)") == 2
     assert "sarsa is undecided against expected_sarsa (difference " in text
     assert ", with 40 seeds" in text
-    assert "up to 4 looks that were settled beforehand: claims at 1.1 % each." in text
+    assert "up to 4 looks that were fixed beforehand: claims at 1.1 % each." in text
     assert "missing" not in text
     # What was decided is what was said of those seeds then.
     first = analyse(results_of(study, tmp_path), looks={"lake": steps[0][0].standing})

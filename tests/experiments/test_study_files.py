@@ -82,7 +82,7 @@ MISTAKES = {
     "settings and none": (
         "environments: [Taxi-v4]\nagents:\n  dqn:\n    conf_file: lakes.yml\n    tuned: false\n",
         4,
-        "says where to begin, and tuned: false not to",
+        "and tuned: false contradict each other",
     ),
     "file of settings that is none": (
         "environments: [Taxi-v4]\nagents:\n  dqn: {conf_file: [a]}\n",
@@ -264,7 +264,7 @@ def test_a_sweep_has_each_combination_once(sweep):
 def test_a_sweep_is_counted_before_it_is_made(read):
     values = f"[{', '.join(map(str, range(100)))}]"
     sweep = ", ".join(f"{name}: {values}" for name in "abcdef")
-    with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents by here; .* 10,000 at most"):
+    with pytest.raises(UserError, match=r":4: 1,000,000,000,001 agents up to here; .* 10,000 at"):
         read(f"environments: [Taxi-v4]\nagents:\n  sarsa:\n  qlearning:\n    sweep: {{{sweep}}}\n")
 
 

@@ -170,7 +170,7 @@ def test_a_run_without_a_number(zoo, tmp_path):
 
 
 REFUSED = {
-    "without a word": ((), {}, "lies in no run folder: say what it is with --algo"),
+    "without a word": ((), {}, "is in no run folder: say what it is with --algo"),
     "other shapes": (
         (),
         {"algo": "a2c", "env_id": "CartPole-v1"},

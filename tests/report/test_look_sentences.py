@@ -32,5 +32,5 @@ def test_looks_that_were_settled_are_named():
     taken = tuple(look(0.015, planned=True, a=size) for size in (5, 8, 12))
     lines = look_sentences(Looks(taken, design))
     assert lines[0] == "These runs have been looked at 3 times."
-    assert lines[1] == "Settled before the first of them: looks at 5, 8 and 12 seeds."
+    assert lines[1] == "Fixed before the first of them: looks at 5, 8 and 12 seeds."
     assert len(lines) == 5

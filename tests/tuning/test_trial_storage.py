@@ -21,7 +21,7 @@ def test_the_kinds(given, kind):
 
 
 def test_what_is_no_storage_is_refused_without_its_password():
-    with pytest.raises(UserError, match=r"'redis://u:\*\*\*@h' is none: a file for a journal, "):
+    with pytest.raises(UserError, match=r"'redis://u:\*\*\*@h' is no storage: a file for a "):
         kind_of("redis://u:secret@h")
 
 
