@@ -9,8 +9,8 @@ from typing import Any
 
 from pipeline.errors import UserError
 from pipeline.files import replacing, sync_folders
-from pipeline.resuming.source_digest import source_digest
 from pipeline.resuming.state_folder import state_file, state_files
+from pipeline.source_digest import source_digest
 from snapshots.recording import Snapshot
 from snapshots.snapshot_files import BadSnapshotError, read_snapshot, write_snapshot
 from snapshots.user_key import user_key
