@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import _thread
 import argparse
-import signal
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -22,7 +20,7 @@ from commands.flag_values import (
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
-from commands.places import Place, add_place_flags, held, place_of
+from commands.places import Place, add_place_flags, give_way, held, place_of
 from commands.streams import go_on_unread
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
@@ -179,7 +177,7 @@ def _compare(args: argparse.Namespace) -> int:
 
     study = study_spec(args)
     from commands.terminal import table_console
-    from experiments.child_processes import end_server, stop_all
+    from experiments.fork_server import end_server
     from experiments.run_limits import RunLimits
     from experiments.study_plan import plan
     from pipeline.folder_lock import folder_lock
@@ -193,13 +191,7 @@ def _compare(args: argparse.Namespace) -> int:
     )
     planned = plan(study, root)
     console.print(study.title, style="bold", markup=False, highlight=False)
-
-    def stop() -> None:
-        say(f"{root}: another driver has taken this one for dead; this one stops")
-        stop_all()
-        _thread.interrupt_main(signal.SIGTERM)
-
-    with folder_lock(root, stop, say):
+    with folder_lock(root, partial(give_way, root, say), say):
         try:
             if args.until_decided:
                 return _grow_study(args, study, root, console, place)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import _thread
 import argparse
 import contextlib
 import importlib.util
+import signal
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -86,7 +88,7 @@ def place_of(
 
 
 def _start_server(planned: Sequence[PlannedRun]) -> None:
-    from experiments.child_processes import start_server
+    from experiments.fork_server import start_server
 
     start_server(_warm_ups(planned))  # it imports the libraries while this process does
 
@@ -159,3 +161,12 @@ def held(launchers: Launchers) -> Iterator[Launchers]:
             yield there[0]
 
         yield again
+
+
+def give_way(root: Path, say: Callable[[str], object]) -> None:
+    """Stop, since another driver does the study in this folder."""
+    from experiments.child_processes import stop_all
+
+    say(f"{root}: another driver has taken this one for dead; this one stops")
+    stop_all()
+    _thread.interrupt_main(signal.SIGTERM)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import _thread
 import shlex
-import signal
 from functools import partial
 from pathlib import Path
 
 from rich.console import Console
 
 from commands.parsing import called_as
+from commands.places import give_way
 from commands.study_output import conclude, do_missing, read, say
 from commands.tune_how import How
 from commands.tune_output import (
@@ -21,7 +20,6 @@ from commands.tune_output import (
     print_winner,
 )
 from commands.tune_progress import TuningProgress
-from experiments.child_processes import stop_all
 from experiments.drafts import remove_dead_drafts
 from experiments.study_plan import plan
 from experiments.study_results import EarlyResults
@@ -92,8 +90,8 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
         _write_down(console, place, how, None)
         return 0
     root = place.root / FOLDER
-    lost = partial(_give_way, console, root)
-    with folder_lock(root, lost, partial(say, console)):
+    tell = partial(say, console)
+    with folder_lock(root, partial(give_way, root, tell), tell):
         code, outcome = _retested(console, place, how, ranked, candidates)
         winner = next((c for c in candidates if _is(c, outcome)), None)
         path = None
@@ -158,9 +156,3 @@ def _retested(
     with doing(console, "judging the winner") as activity:
         analysis = analyse(results, activity.at, take_looks(results))
         return code, concluded(place.tuning, ranked, candidates, analysis)
-
-
-def _give_way(console: Console, root: Path) -> None:
-    say(console, f"{root}: another driver has taken this one for dead; this one stops")
-    stop_all()
-    _thread.interrupt_main(signal.SIGTERM)

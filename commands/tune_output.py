@@ -62,7 +62,15 @@ def print_outcome(console: Console, place: OpenTuning, outcome: Outcome) -> None
         title=f"re-test on the seeds {held_out.start} to {held_out.stop - 1}",
         title_justify="left",
     )
-    for heading in ("settings", "in the search", "on other seeds", "95 % interval", "is", "runs"):
+    for heading in (
+        "settings",
+        "in the search",
+        "on other seeds",
+        "95 % interval",
+        "is",
+        "runs",
+        "failed",
+    ):
         table.add_column(heading)
     for each in outcome.retested:
         table.add_row(*_cells(each))
@@ -87,6 +95,7 @@ def _cells(each: Retested) -> list[str]:
         ends,
         each.verdict,
         str(each.n_runs),
+        "" if each.n_failed is None else str(each.n_failed),
     ]
 
 

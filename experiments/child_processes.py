@@ -2,48 +2,29 @@
 
 `supervise` runs a function in a child process and waits for it; any executor whose workers
 can call it launches a study. Here that is a pool of threads, each with one child at a time. A child
-is a fresh one, or for tasks that may share a process, the one that the thread had before. On
-Linux the children are forked from a server that has imported the heavy libraries once. Windows
-cannot fork, and on macOS a process that has used its libraries should not: there each child begins
-anew, and imports for some seconds.
+is a fresh one, or for tasks that may share a process, the one that the thread had before. What it
+begins from is in `fork_server`.
 """
 
 from __future__ import annotations
 
 import contextlib
-import logging
-import multiprocessing
-import os
-import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import ForkingPickler
-from pathlib import Path
 from typing import Any
 
+from experiments import fork_server
 from experiments.awaited_child import DIED, RAISED, RETURNED, awaited, kill
 from experiments.run_limits import RunLimits
-from experiments.task_in_child import LEFT_TO_SUPERVISOR, answer_from_child
+from experiments.task_in_child import answer_from_child
 from pipeline.stopping import current
-
-PRELOADED = ["experiments.fork_server_imports"]
-
-# One thread in each process: small networks are slower with more, and runs go side by side.
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-
-START_METHOD = "spawn" if sys.platform in ("win32", "darwin") else "forkserver"
-# Set for the server alone, which takes it away again.
-WARM_UPS = "YARDSTICK_WARM_UPS"
-OUR_OWN = "yardstick"
 
 SECONDS_TO_START = 0.3  # that a server takes to fork, once it has imported
 NO_LIMITS = RunLimits()
 
-_log = logging.getLogger(__name__)
-_context: Any = multiprocessing.get_context(START_METHOD)
 _children: set[BaseProcess] = set()
 _idle: dict[int, _Child] = {}  # by thread
 _lock = threading.Lock()
@@ -120,11 +101,12 @@ class _Child:
     """A child process, and what goes to it and comes from it."""
 
     def __init__(self) -> None:
-        self.answers, sender = _context.Pipe(duplex=False)
-        self.last_words, writer = _context.Pipe(duplex=False)
-        given, self.tasks = _context.Pipe(duplex=False)
+        context = fork_server.context
+        self.answers, sender = context.Pipe(duplex=False)
+        self.last_words, writer = context.Pipe(duplex=False)
+        given, self.tasks = context.Pipe(duplex=False)
         theirs = (sender, writer, given)
-        self.process = _context.Process(target=answer_from_child, args=theirs, daemon=True)
+        self.process = context.Process(target=answer_from_child, args=theirs, daemon=True)
         try:
             with _lock:
                 if _stopping.is_set():
@@ -190,11 +172,11 @@ def _end_idle() -> None:
 
 def _start(child: BaseProcess) -> None:
     """Start a child; from a new server, where somebody has killed the one there was."""
-    if _context.get_start_method() != "forkserver":
+    if fork_server.context.get_start_method() != "forkserver":
         child.start()
         return
     for _ in range(8):
-        _ensure_fork_server()
+        fork_server.ensure_fork_server()
         with contextlib.suppress(EOFError, OSError):
             child.start()
             return
@@ -226,75 +208,18 @@ def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
 
 def be_ready(warm_ups: str = "[]") -> None:
     """Start what children begin from, and let them be started, also after `stop_all`."""
-    start_server(warm_ups)
+    fork_server.start_server(warm_ups)
     _stopping.clear()
-
-
-def start_server(warm_ups: str = "[]") -> None:
-    """Start what children begin from, in the background: start it early to have it sooner.
-
-    Args:
-        warm_ups: what it is to compile once for all runs, see `experiments.warm_ups`.
-    """
-    for name in THREAD_VARIABLES:
-        os.environ.setdefault(name, "1")
-    # Python would look in the folder where the command is typed before everywhere else, and take a
-    # module of the user's that lies there for one of ours, or of its own.
-    os.environ.setdefault("PYTHONSAFEPATH", OUR_OWN)
-    paths = [str(Path(__file__).resolve().parents[1])]
-    paths += os.environ.get("PYTHONPATH", "").split(os.pathsep)
-    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, dict.fromkeys(paths)))
-    if _context.get_start_method() == "forkserver":
-        _start_fork_server(warm_ups)
-
-
-def _start_fork_server(warm_ups: str) -> None:
-    """Start the process that children are forked from."""
-    os.environ[WARM_UPS] = warm_ups
-    _context.set_forkserver_preload(PRELOADED)
-    _ensure_fork_server()
-
-
-def _ensure_fork_server() -> None:
-    """Start it where it is not there; signals to all processes at once leave it as it is."""
-    if sys.platform != "win32":
-        from multiprocessing import forkserver, resource_tracker
-
-        # It lets SIGINT through again after its own start, so that has to come first.
-        resource_tracker.ensure_running()
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, LEFT_TO_SUPERVISOR)
-        try:
-            pid = _server_pid()
-            forkserver.ensure_running()
-            if pid is not None and _server_pid() != pid:
-                _log.warning("the process that runs are forked from was killed; it is started anew")
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _server_pid() -> int | None:
-    """The process that children are forked from, where there is one."""
-    server = getattr(sys.modules.get("multiprocessing.forkserver"), "_forkserver", None)
-    pid = getattr(server, "_forkserver_pid", None)
-    return pid if isinstance(pid, int) else None
 
 
 def stop_all() -> None:
     """End all children, and let none be started any more."""
     _stopping.set()
     if not _lock.acquire(timeout=SECONDS_TO_START):
-        end_server()  # one is being started, by a server that is still importing
+        fork_server.end_server()  # one is being started, by a server that is still importing
         _lock.acquire()
     try:
         for child in _children:
             kill(child)
     finally:
         _lock.release()
-
-
-def end_server() -> None:
-    """End the process that children are forked from, whatever it is at."""
-    pid = _server_pid()
-    if sys.platform != "win32" and pid is not None:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)

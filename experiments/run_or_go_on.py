@@ -24,7 +24,8 @@ def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
     Args:
         planned: the run.
         draft: its folder. It is there where another process has left it: the run goes on from its
-            state if that is whole and of these very settings, and else begins anew.
+            state if that is whole, of these very settings, and saved by these very sources, and
+            else begins anew.
         command: the command that asked for the study.
     """
     run = Run(draft, planned.run.env_name)
@@ -51,9 +52,11 @@ def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:
     if planned.is_batch or not holds_state(run.path) or not planned.is_of(run):
         return anew
     try:
-        return go_on(run, StateKeeping(), _say_to_nobody)
+        keeping = go_on(run, StateKeeping(), _say_to_nobody)
     except UserError:  # it is damaged, or another user's
         return anew
+    is_ours = keeping.state is None or keeping.state.is_of_these_sources
+    return keeping if is_ours else anew
 
 
 def _begin_anew(planned: PlannedRun, run: Run) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.reliability import ON_THE_SCALE
 from experiments.study_spec import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
 from report.pair_sentences import (
+    failed_runs,
     on_unreliable,
     oriented_pairs,
     pair_sentences,
@@ -30,17 +31,19 @@ class Conclusion:
     Attributes:
         lead: who is best, and how that stands to the optimum.
         pairs: every verdict, with figures; several in a sentence.
+        failed: whose runs failed, to stand beside verdicts that are shown as signs; may be empty.
         notes: failures, how soon agents arrive, training on variants, what is missing, and how
             often the runs have been looked at.
     """
 
     lead: str
     pairs: tuple[str, ...]
+    failed: str
     notes: tuple[str, ...]
 
     @property
     def everything(self) -> tuple[str, ...]:
-        """All sentences."""
+        """All sentences; those on pairs say who failed."""
         return (self.lead, *self.pairs, *self.notes)
 
 
@@ -49,6 +52,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
     return Conclusion(
         lead=" ".join(_lead(study, environment)),
         pairs=tuple(pair_sentences(study, environment)),
+        failed=_on_failed(environment),
         notes=(
             *on_unreliable(environment),
             *speed_sentences(environment),
@@ -58,6 +62,13 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
             *_on_looks(environment),
         ),
     )
+
+
+def _on_failed(environment: EnvironmentAnalysis) -> str:
+    failed = failed_runs(environment, [agent.agent for agent in environment.agents])
+    if failed and any(pair.verdict == "equivalent" for pair in environment.pairs):
+        return f"{failed}: what is equivalent is so in the typical run."
+    return f"{failed}." if failed else ""
 
 
 def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
@@ -90,8 +101,9 @@ def _standing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[st
     same = {frozenset((pair.first, pair.second)) for pair in decided} - set(map(frozenset, better))
     ahead = [name for name in names if not any((other, name) in better for other in names)]
     first = [agent for agent in environment.agents if agent.agent in ahead]
+    but = _but_failed(environment, ahead)
     if len(names) == 1:
-        yield f"{names[0]}: {_figure(study, environment, first[0])}."
+        yield f"{names[0]}: {_figure(study, environment, first[0])}{but}."
     elif not decided:
         yield _nothing_decided(study, environment)
     elif not ahead:
@@ -99,12 +111,14 @@ def _standing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[st
     elif len(ahead) == 1:
         others = [name for name in names if name not in ahead and (ahead[0], name) not in better]
         doubt = f"; against {enumeration(others)} it is undecided" if others else ""
-        yield f"{ahead[0]} is best: {_figure(study, environment, first[0])}{doubt}."
+        yield f"{ahead[0]} is best: {_figure(study, environment, first[0])}{doubt}{but}."
     elif all(frozenset((a, b)) in same for a in ahead for b in ahead if a != b):
+        where = " in the typical run" if but else ""
         figure = _figure(study, environment, first[0])
-        yield f"{enumeration(ahead)} are best, and equivalent: {figure}."
+        yield f"{enumeration(ahead)} are best, and equivalent{where}: {figure}{but}."
     else:
-        yield f"Best is {_alternatives(first)}: that is undecided{_optimum(study, environment)}."
+        figures = f"{_alternatives(first)}: that is undecided{_optimum(study, environment)}"
+        yield f"Best is {figures}{but}."
 
 
 def _nothing_decided(study: StudySpec, environment: EnvironmentAnalysis) -> str:
@@ -115,7 +129,12 @@ def _nothing_decided(study: StudySpec, environment: EnvironmentAnalysis) -> str:
     names = _equal_to(top, environment)
     verb = "has" if len(names) == 1 else "have"
     so_far = f"{verb} the {_extreme(study)} mean so far: {_figure(study, environment, top)}"
-    return f"Undecided: {why}. {enumeration(names)} {so_far}."
+    return f"Undecided: {why}. {enumeration(names)} {so_far}{_but_failed(environment, names)}."
+
+
+def _but_failed(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
+    failed = failed_runs(environment, names)
+    return f"; {failed}" if failed else ""
 
 
 def _alternatives(agents: list[AgentAnalysis]) -> str:

@@ -108,14 +108,23 @@ def _shown_with(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison
 
 
 def _failed_more(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
-    """The failures of two agents, where some runs of an agent failed and most did not."""
-    counts = [environment.failures.get(name) for name in (pair.first, pair.second)]
-    told = [
-        f"{count.n_failed} of {count.n} runs of {name} failed"
-        for name, count in zip((pair.first, pair.second), counts, strict=True)
-        if count is not None and 0 < 2 * count.n_failed <= count.n
-    ]
-    return "; " + enumeration(told) if told else ""
+    """The failures of two agents, but of an agent most of whose runs failed."""
+    counts = {name: environment.failures.get(name) for name in (pair.first, pair.second)}
+    few = [name for name, count in counts.items() if count and 2 * count.n_failed <= count.n]
+    told = failed_runs(environment, few)
+    return f"; {told}" if told else ""
+
+
+def failed_runs(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
+    """Of agents, those of which runs failed, and how many; empty where none did."""
+    counts = {name: environment.failures.get(name) for name in names}
+    return enumeration(
+        [
+            f"{count.n_failed} of {count.n} runs of {name} failed"
+            for name, count in counts.items()
+            if count is not None and count.n_failed
+        ]
+    )
 
 
 def on_unreliable(environment: EnvironmentAnalysis) -> Iterable[str]:

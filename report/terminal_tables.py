@@ -57,6 +57,8 @@ def _print_conclusion(console: Console, study: StudySpec, environment: Environme
     if says_more(environment):
         console.print(_matrix(environment))
         say(LEGEND)
+        if said.failed:
+            say(said.failed)
     elif len(environment.agents) == 2:
         for sentence in said.pairs:
             say(sentence)

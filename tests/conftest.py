@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import hypothesis
 import pytest
 
-from experiments.child_processes import PRELOADED
+from experiments.fork_server import PRELOADED
 from pipeline.stopping import SIGNALS
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.

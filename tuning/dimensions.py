@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cached_property
@@ -137,13 +137,3 @@ def _comparable(value: object) -> object:
     if isinstance(value, DottedName):
         return value.name
     return (bool, value) if isinstance(value, bool) else value
-
-
-def flat_items(mapping: Mapping[str, Any], names: tuple[str, ...]) -> Iterator[tuple[str, Any]]:
-    """The values under dotted names; what is not there is `LEFT_OUT`."""
-    for name in names:
-        outer, _, inner = name.partition(".")
-        value = mapping.get(outer, LEFT_OUT)
-        if inner:
-            value = value.get(inner, LEFT_OUT) if isinstance(value, Mapping) else LEFT_OUT
-        yield name, value

@@ -16,11 +16,11 @@ from pipeline.errors import UserError
 from tuning.judging import judged
 from tuning.pruning import is_hopeless
 from tuning.samplers import make_sampler
-from tuning.search_spaces import read_search_space
+from tuning.search_spaces import read_search_space, steps_aside
 from tuning.study_opening import open_study
 from tuning.suggesting import Suggestions
 from tuning.trial_queue import TrialQueue, figures_of, turn
-from tuning.trial_runs import shipped_run
+from tuning.trial_runs import check_entry, shipped_run
 from tuning.trial_storage import open_storage
 from tuning.tuning_spec import AUTO, TuningSpec
 
@@ -92,6 +92,8 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
     suggestions = Suggestions(tuning, space, run.spec.saved_hyperparams)
     if not suggestions.n_free:
         raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
+    for settings in steps_aside(suggestions.space, suggestions.first):
+        check_entry(tuning, root, suggestions.merged(settings))
     n_trials = suggestions.n_trials
     asked = tuning.identity(suggestions.shipped, _as_json(suggestions))
     with _made(root):

@@ -107,6 +107,8 @@ class Retested:
         interval: the mean of the scores there, or of what was asked for instead, with its interval.
         verdict: on it beside the settings that the search began with; empty for these.
         n_runs: how many runs there are.
+        n_failed: how many of them got less than half as far as the best typical run; None where
+            nothing says what that is.
     """
 
     label: str
@@ -116,6 +118,7 @@ class Retested:
     interval: Estimate
     verdict: str
     n_runs: int
+    n_failed: int | None
 
 
 @dataclass(frozen=True)
@@ -125,8 +128,8 @@ class Outcome:
     Attributes:
         retested: the settings that the search began with, then the others, the best in the search
             first.
-        winner: of the others, the best on the other seeds, where it is better there than those that
-            the search began with, and no verdict says otherwise; None where all are.
+        winner: of the others that ran on all other seeds, the best there, where it is better than
+            those that the search began with, and no verdict says otherwise; None where none is.
         optimism: by how much the best of the search was better there than on the other seeds; None
             where it was not run again.
         reason: why there is no winner; empty where there is one.
@@ -195,7 +198,13 @@ def _retested(
         interval=_interval(tuning, agent),
         verdict="" if number == 0 else _verdict(environment, label),
         n_runs=0 if agent is None else agent.n_runs,
+        n_failed=_n_failed(environment, label),
     )
+
+
+def _n_failed(environment: EnvironmentAnalysis | None, label: str) -> int | None:
+    count = None if environment is None else environment.failures.get(label)
+    return None if count is None else count.n_failed
 
 
 def _figures(tuning: TuningSpec, runs: Sequence[PlannedRun]) -> list[float]:
@@ -237,11 +246,14 @@ def _verdict(environment: EnvironmentAnalysis | None, label: str) -> str:
 
 
 def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested | None, str]:
-    """The best on other seeds, unless it is no better there than what the search began with."""
+    """The best on other seeds, unless it is no better there than what the search began with.
+
+    Where runs of it failed it is out: those that are left are the luckier ones.
+    """
     shipped, *others = retested
-    there = [each for each in others if each.held_out is not None]
+    there = [each for each in others if each.n_runs >= tuning.retest_seeds]
     if not there:
-        return None, "none was run again"
+        return None, "none has run on all other seeds"
     sign = -1 if tuning.is_cost else 1
     best = max(there, key=lambda each: sign * (each.held_out or 0.0))
     if shipped.held_out is None:

@@ -14,15 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError, shown
 from pipeline.settings.hyperparam_entries import override
-from pipeline.settings.literals import DottedName, parse_literal
 from pipeline.settings.strict_yaml import read_yaml
-from tuning.dimensions import LEFT_OUT, Pick, flat_items, same
+from tuning.dimensions import LEFT_OUT, Pick, same
+from tuning.flat_settings import flat_items, nested, with_mappings
+from tuning.number_ranges import spread
 from tuning.space_checks import check_against_agent, defaults_of
-from tuning.space_entries import Conditional, check_order, read_conditional
+from tuning.space_entries import Conditional, check_names, check_order, read_conditional
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
     from optuna.trial import BaseTrial
+
+# Of a range; so many that hardly any whole numbers are as far apart.
+_PARTS = 98
 
 _FOLDER = Path(__file__).resolve().parents[1] / "search_spaces"
 
@@ -54,11 +58,11 @@ class SearchSpace:
             trial: of Optuna; a FixedTrial does too. Only what exists under what was chosen before
                 is asked for.
         """
-        return _nested(self._chosen(lambda name, ends: _ask(trial, name, ends)))
+        return nested(self._chosen(lambda name, ends: _ask(trial, name, ends)))
 
     def at(self, params: Mapping[str, Any]) -> dict[str, Any]:
         """The settings under parameters, of which there may be more than those that exist."""
-        return _nested(self._chosen(lambda name, _: params[name]))
+        return nested(self._chosen(lambda name, _: params[name]))
 
     def _chosen(self, pick: Pick) -> dict[str, Any]:
         """Flat settings."""
@@ -136,7 +140,7 @@ class SearchSpace:
             shipped: the entry before.
             settings: what `suggest` returned.
         """
-        kept = _with_mappings(shipped, self.keys)
+        kept = with_mappings(shipped, self.keys)
         for key in self.keys:
             outer, _, inner = key.partition(".")
             if inner and isinstance(kept.get(outer), dict):
@@ -152,7 +156,7 @@ class SearchSpace:
         return {key: value for key, value in override(kept, changes).items() if value != {}}
 
     def _flat(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        given = dict(flat_items(_with_mappings(settings, self.keys), self.keys))
+        given = dict(flat_items(with_mappings(settings, self.keys), self.keys))
         return {
             key: self.defaults.get(key, LEFT_OUT) if value is LEFT_OUT else value
             for key, value in given.items()
@@ -178,11 +182,30 @@ def read_search_space(algo: str, env_id: str, path: Path | str | None = None) ->
     entries = {name: read_conditional(name, value, where) for name, value in said.items()}
     if not entries:
         raise UserError(f"{where}: there is nothing to search for {algo}")
+    check_names(entries, where)
     check_order(entries, where)
     space = SearchSpace(entries, {})
     space = replace(space, defaults=defaults_of(algo, space.keys))
     check_against_agent(algo, corners(space), where)
+    _check_between(algo, space, where)
     return space
+
+
+def _check_between(algo: str, space: SearchSpace, where: str) -> None:
+    """Make sure that an agent takes what lies between the ends of ranges, too.
+
+    Raises:
+        UserError: where it needs whole numbers, and the ends are not written as such.
+    """
+    from optuna.distributions import FloatDistribution
+
+    for name, kind in space.distributions().items():
+        if isinstance(kind, FloatDistribution):
+            between = _with_one(space, _ends(space)[0], name, spread(kind, _PARTS)[1])
+            try:
+                check_against_agent(algo, [between], where)
+            except UserError as error:
+                raise UserError(f"{error}: write low and high without a point") from error
 
 
 def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
@@ -204,14 +227,31 @@ def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
 
 def corners(space: SearchSpace) -> Iterator[dict[str, Any]]:
     """Settings at the ends of the space: all low, all high, and each end and word by itself."""
-    grid = space.grid(2)
-    lowest, highest = ({name: ends[i] for name, ends in grid.items()} for i in (0, -1))
+    lowest, highest = _ends(space)
     yield space.at(lowest)
     yield space.at(highest)
-    for changed, values in grid.items():
-        needed = _needed(space, changed)
+    yield from steps_aside(space, lowest)
+
+
+def steps_aside(space: SearchSpace, params: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+    """Settings that differ from those under the parameters by one end or word."""
+    base = {**_ends(space)[0], **params}  # with those that exist under other conditions
+    for changed, values in space.grid(2).items():
         for value in values:
-            yield space.at({**lowest, **needed, changed: value})
+            yield _with_one(space, base, changed, value)
+
+
+def _ends(space: SearchSpace) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The lowest and the highest parameters."""
+    grid = space.grid(2)
+    return {name: v[0] for name, v in grid.items()}, {name: v[-1] for name, v in grid.items()}
+
+
+def _with_one(
+    space: SearchSpace, params: Mapping[str, Any], changed: str, value: Any
+) -> dict[str, Any]:
+    """Settings under the parameters but for one, with the words under which that one is there."""
+    return space.at({**params, **_needed(space, changed), changed: value})
 
 
 def _needed(space: SearchSpace, param: str) -> dict[str, Any]:
@@ -245,35 +285,3 @@ def _ask(trial: BaseTrial, name: str, distribution: BaseDistribution) -> Any:
         case CategoricalDistribution():
             return trial.suggest_categorical(name, distribution.choices)
     raise TypeError(distribution)
-
-
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Flat settings as a file holds them."""
-    nested: dict[str, Any] = {}
-    for key, value in flat.items():
-        outer, _, inner = key.partition(".")
-        if value is LEFT_OUT:
-            continue
-        if inner:
-            nested.setdefault(outer, {})[inner] = value
-        else:
-            nested[outer] = value
-    return nested
-
-
-def _with_mappings(settings: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:
-    """The settings, with mappings that are written as texts read where keys lead into them."""
-    outer = {key.partition(".")[0] for key in keys if "." in key}
-    return {
-        key: _plain(parse_literal(value, key)) if key in outer and isinstance(value, str) else value
-        for key, value in settings.items()
-    }
-
-
-def _plain(value: Any) -> Any:
-    """Names of classes as the texts that a file holds."""
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value.name if isinstance(value, DottedName) else value

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -13,14 +14,16 @@ from tuning.dimensions import Choice, Dimension, Word, is_word
 from tuning.number_ranges import FORMS, NumberRange, Scale
 
 _RANGE: Mapping[str, Any] = {
-    "low": int | float,
-    "high": int | float,
+    "low": float,
+    "high": float,
     "scale": Scale,
     "forms": list[Any],
     "final_share": list[float],
     "when": dict[str, Any],
 }
 _CHOICE: Mapping[str, Any] = {"choices": dict[str, Any] | list[Any], "when": dict[str, Any]}
+# What would make the task another one, so that the easiest would win.
+_TASK = ("env_kwargs", "eval_env_kwargs")
 _SETS: Mapping[str, Any] = {"sets": dict[str, dict[str, Any]], "when": dict[str, Any]}
 
 
@@ -61,7 +64,7 @@ def read_conditional(name: str, said: Any, where: str) -> Conditional:
     checked = check_arguments(said, _parameters(known), place, "key")
     when = {other: _words(words, f"{place}: when") for other, words in _when(checked)}
     if known is _RANGE:
-        return Conditional(_number_range(name, checked, place), when)
+        return Conditional(_number_range(name, _with_whole_ends(checked, said), place), when)
     options = checked["sets"] if known is _SETS else _options(name, checked["choices"], place)
     if len(options) < 2:
         raise UserError(f"{place}: there must be two values at least to choose from")
@@ -98,6 +101,12 @@ def _options(name: str, choices: Any, place: str) -> dict[Word, dict[str, Any]]:
     return {value: {name: value} for value in choices}
 
 
+def _with_whole_ends(checked: Mapping[str, Any], said: Mapping[str, Any]) -> dict[str, Any]:
+    """What was checked, with the ends of a range whole where both are written so."""
+    ends = {end: said[end] for end in ("low", "high") if isinstance(said.get(end), int)}
+    return {**checked, **(ends if len(ends) == 2 else {})}
+
+
 def _number_range(name: str, checked: Mapping[str, Any], place: str) -> NumberRange:
     for end in ("low", "high"):
         if end not in checked:
@@ -107,7 +116,7 @@ def _number_range(name: str, checked: Mapping[str, Any], place: str) -> NumberRa
     forms = tuple(checked.get("forms", ("constant",)))
     _check_forms(forms, place)
     share = tuple(checked.get("final_share", (0.001, 1.0)))
-    if len(share) != 2 or not 0 < share[0] < share[1]:
+    if len(share) != 2 or not 0 < share[0] < share[1] < math.inf:
         raise UserError(f"{place}: final_share must be two numbers above 0, the smaller one first")
     return NumberRange(
         name,
@@ -121,8 +130,10 @@ def _number_range(name: str, checked: Mapping[str, Any], place: str) -> NumberRa
 
 
 def _check_ends(low: float, high: float, scale: Scale, place: str) -> None:
-    if not low < high:
-        raise UserError(f"{place}: low must be below high, unlike {shown(low)} and {shown(high)}")
+    if not -math.inf < low < high < math.inf:
+        raise UserError(
+            f"{place}: low must be below high, and both finite: not {shown(low)} and {shown(high)}"
+        )
     if scale in {"log", "powers_of_two"} and low <= 0:
         raise UserError(f"{place}: scale {scale} needs low above 0, not {shown(low)}")
     if scale == "log_below_one" and high >= 1:
@@ -139,6 +150,28 @@ def _check_forms(forms: tuple[Any, ...], place: str) -> None:
     for form in forms:
         if not is_word(form):
             raise UserError(f"{place}: forms are words and single values, not {shown(form)}")
+
+
+def check_names(entries: Mapping[str, Conditional], where: str) -> None:
+    """Make sure that nothing is chosen twice, and that the task is not chosen at all.
+
+    Raises:
+        UserError: naming the setting or parameter.
+    """
+    deciders: dict[str, str] = {}
+    for name, entry in entries.items():
+        keys = entry.dimension.keys
+        task = next((key for key in keys if key.partition(".")[0] in _TASK), None)
+        if task is not None:
+            raise UserError(
+                f"{where}: {task} is what settings are judged on, and not searched: give it by "
+                "--env-kwargs, or search train_env_kwargs"
+            )
+        decided = keys if not entry.when else ()  # under conditions it may be one or the other
+        for key in (*decided, *entry.dimension.distributions()):
+            other = deciders.setdefault(key, name)
+            if other != name:
+                raise UserError(f"{where}: {other} and {name} both decide {key}: leave one out")
 
 
 def check_order(entries: Mapping[str, Conditional], where: str) -> None:

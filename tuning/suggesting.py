@@ -31,12 +31,16 @@ class Suggestions:
         tuning: what is asked for.
         space: what may be chosen, as its file says.
         shipped: the entry as it is without the search, with what the user has fixed.
+
+    Attributes:
+        space: with the shipped settings inside.
+        first: the parameters of these.
     """
 
     def __init__(self, tuning: TuningSpec, space: SearchSpace, shipped: Mapping[str, Any]) -> None:
         self.tuning, self.shipped = tuning, dict(shipped)
         self.space = space.including(self.shipped)
-        self._first = self.space.params_of(self.shipped)
+        self.first = self.space.params_of(self.shipped)
         self._fixed = self._settled()
 
     def _settled(self) -> dict[str, Any]:
@@ -46,7 +50,7 @@ class Suggestions:
         for entry in self.space.entries.values():
             if set(entry.dimension.keys) <= given:
                 names = entry.dimension.distributions()
-                settled |= {name: self._first[name] for name in names if name in self._first}
+                settled |= {name: self.first[name] for name in names if name in self.first}
         return settled
 
     @property
@@ -100,7 +104,7 @@ class Suggestions:
     def params(self, number: int) -> dict[str, Any]:
         """Parameters of a trial that are settled before any sampler is asked."""
         if number == 0:
-            return self._first
+            return self.first
         if self.tuning.sampler == "grid":
             return self.grid[number - 1]
         return self._fixed
@@ -110,5 +114,9 @@ class Suggestions:
         suggested = self.space.suggest(trial)
         if trial.number == 0:
             return self.shipped
+        return self.merged(suggested)
+
+    def merged(self, suggested: Mapping[str, Any]) -> dict[str, Any]:
+        """The hyperparameters with what is suggested, and what the user has fixed."""
         entry = self.space.merged(self.shipped, suggested)
         return layered(entry, self.tuning.agent.settings)

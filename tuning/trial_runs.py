@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.planned_runs import PlannedRun
-from experiments.study_plan import plan
+from experiments.study_plan import check_settings, plan
 from experiments.study_spec import AgentSpec
 from pipeline.json_text import json_text
 from tuning.tuning_spec import TuningSpec
@@ -30,13 +30,29 @@ def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
     return plan(replace(tuning.study, n_seeds=1), root)[0]
 
 
+def check_entry(tuning: TuningSpec, root: Path, entry: Mapping[str, Any]) -> None:
+    """Make sure that the agent can be made with settings of the space.
+
+    Raises:
+        UserError: naming the setting, and what it must be.
+    """
+    where = "its space" if tuning.search_space is None else str(tuning.search_space)
+    agent = replace(_agent(tuning, tuning.agent.algo, entry), where=where)
+    study = replace(tuning.study, agents=(agent,), n_seeds=1)
+    check_settings(study, plan(study, root))
+
+
 def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
     """One run of a trial.
 
     Raises:
         UserError: if an agent cannot be trained so.
     """
-    agent = AgentSpec(name_of(entry), tuning.agent.algo, dict(entry), tuned=False)
+    agent = _agent(tuning, name_of(entry), entry)
     study = replace(tuning.study, agents=(agent,), first_seed=seed, n_seeds=1)
     (planned,) = plan(study, root)
     return planned
+
+
+def _agent(tuning: TuningSpec, label: str, entry: Mapping[str, Any]) -> AgentSpec:
+    return AgentSpec(label, tuning.agent.algo, dict(entry), tuned=False)

@@ -66,4 +66,5 @@ def _held_out(tuning: TuningSpec, each: Retested) -> str:
         return text
     of_what = interval_of(tuning)
     ends = f"{found.low:.4g} to {found.high:.4g}"
-    return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs)"
+    failed = f", {each.n_failed} of them failed" if each.n_failed else ""
+    return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs{failed})"

@@ -18,16 +18,15 @@ from distributed.scheduler import KilledWorker
 
 from experiments.child_processes import NO_LIMITS
 from experiments.cluster.addresses import Cluster, JobQueue, LocalWorkers
-from experiments.cluster.answers import FAILED, STOPPED, UNFIT, RefusedAnswerError, unpacked
 from experiments.cluster.clusters import opened
 from experiments.cluster.connections import Connection
+from experiments.cluster.endings import Ending, ending_of
 from experiments.cluster.orders import LEAVING, Probe, RunOrder, probing, version
-from experiments.cluster.receiving import check_in_place, receive
 from experiments.cluster.sent_runs import SentRun
 from experiments.cluster.tasks import do_order
 from experiments.cluster.working import Supervisors
 from experiments.drafts import run_name
-from experiments.launching import Launcher, RunFailure, failed, failure_log
+from experiments.launching import Launcher, RunFailure
 from experiments.planned_runs import PlannedRun
 from experiments.run_limits import RunLimits
 from pipeline.errors import UserError, one_line
@@ -178,7 +177,7 @@ class ClusterLauncher:
         with self._lock:
             self._sent.pop(sent.key, None)
             if sent.is_given_up:
-                self._settle(sent, sent.reason)
+                self._settle(sent, Ending(sent.reason))
                 return
             sent.n_sent += 1
             sent.key = f"{run_name(sent.planned)}-{secrets.token_hex(8)}"
@@ -212,7 +211,9 @@ class ClusterLauncher:
             except Exception:  # noqa: BLE001  # of whatever kind, from the scheduler: it is lost
                 sent.worker = None
             else:
-                if self._is_settled(sent, content):
+                ending = ending_of(sent, content, self._probe.root)
+                if ending is not None:
+                    self._settle(sent, ending)
                     return
         elif task.status == "error":
             error = task.exception()
@@ -226,40 +227,11 @@ class ClusterLauncher:
             self.connection.lose(task.client)
         self._send(sent)
 
-    def _is_settled(self, sent: SentRun, content: object) -> bool:
-        """Whether an answer is the end of a run; what it leaves is in its place then."""
-        try:
-            answer = unpacked(content)
-            if answer.kind == FAILED:
-                self._settle(sent, answer.reason, answer.details)
-                return True
-            if answer.kind == UNFIT:
-                raise UserError(f"--cluster: {answer.reason}: start it anew, from the same folder")
-            if answer.kind == STOPPED:
-                sent.worker = None
-                return False
-            if answer.files is None:
-                check_in_place(sent.planned)
-            else:
-                receive(sent.planned, self._probe.root, answer.files)
-        except RefusedAnswerError as error:
-            sent.refuse(one_line(error))
-            return False
-        except OSError as error:  # the disk is full
-            self._settle(sent, one_line(error))
-            return True
-        self._settle(sent)
-        return True
-
-    def _settle(self, sent: SentRun, reason: str = "", details: str = "") -> None:
+    def _settle(self, sent: SentRun, ending: Ending) -> None:
         """Tell whoever waits for a run that it is done, or how it failed."""
         with self._lock:
             self._sent.pop(sent.key, None)
-        root, failure = self._probe.root, None
-        if reason:
-            failure = failed(sent.planned, root, reason, details or f"{reason}\n")
-        else:
-            failure_log(root, sent.planned).unlink(missing_ok=True)
+        failure = ending.written_down(sent.planned, self._probe.root)
         with contextlib.suppress(Exception):
             sent.task.release()
         if not sent.future.done():
@@ -281,7 +253,7 @@ class ClusterLauncher:
                     self._receivers.submit(self._guarded, sent, self._give_up)
 
     def _give_up(self, sent: SentRun) -> None:
-        self._settle(sent, sent.reason)
+        self._settle(sent, Ending(sent.reason))
         with contextlib.suppress(Exception):
             sent.task.cancel()
 

@@ -17,6 +17,7 @@ import yaml
 
 from experiments.planned_runs import PlannedRun
 from experiments.run_limits import RunLimits
+from pipeline.source_digest import source_digest
 from pipeline.train_spec import TrainSpec
 
 # The topics of what workers tell drivers, besides answers: who has begun what, and who leaves.
@@ -26,8 +27,6 @@ LEAVING = "yardstick-leaving"
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
-_ROOT = Path(__file__).resolve().parents[2]
-_SOURCES = ("safe_files", "snapshots", "mdp", "envs", "agents", "pipeline", "experiments")
 _LIBRARIES = ("gymnasium", "numpy", "numba", "stable-baselines3", "torch")
 
 
@@ -138,9 +137,5 @@ def probing(root: Path) -> Iterator[Probe]:
 def version() -> str:
     """Of the sources that runs depend on, and of the libraries: workers of another do none."""
     lines = [f"{name} {importlib.metadata.version(name)}" for name in _LIBRARIES]
-    lines.append(f"python {platform.python_version()}")
-    for package in _SOURCES:
-        for path in sorted((_ROOT / package).rglob("*.py")):
-            content = hashlib.sha256(path.read_bytes()).hexdigest()
-            lines.append(f"{path.relative_to(_ROOT).as_posix()} {content}")
+    lines += [f"python {platform.python_version()}", source_digest("experiments")]
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]

@@ -11,7 +11,7 @@ from typing import Any
 
 from distributed import Worker, WorkerPlugin, get_worker
 
-from experiments import child_processes
+from experiments import child_processes, fork_server
 from experiments.child_processes import StoppedError, TaskFailedError
 from experiments.cluster.answers import DONE, FAILED, STOPPED, UNFIT, Answer, files_in, packed
 from experiments.cluster.orders import LEAVING, RunOrder, version
@@ -46,7 +46,7 @@ class Supervisors(WorkerPlugin):
         """End what is under way: it leaves its state where it can be reached."""
         worker.log_event(LEAVING, {"at": worker.address})
         child_processes.stop_all()
-        child_processes.end_server()
+        fork_server.end_server()
 
 
 @dataclass(frozen=True)

@@ -91,8 +91,8 @@ def _metrics(final: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
     if not final:
         return []
     told = f"{final['mean_return']:.2f} +/- {final['std_return']:.2f}"
-    names = ("mean_return", "optimum", "gap", "score", "success_rate")
-    exact = [(name, name.replace("_", " "), final.get(name)) for name in names]
+    names = {"mean_return": "mean return", **_measured(final), "success_rate": "success rate"}
+    exact = [(name, label, final.get(name)) for name, label in names.items()]
     return [("mean_reward", "mean_reward", told), *(row for row in exact if row[2] is not None)]
 
 
@@ -109,12 +109,28 @@ def _figures(record: Mapping[str, Any]) -> str:
         ("its standard deviation over episodes", final["std_return"]),
         ("mean length of an episode", final["mean_length"]),
         ("success rate", final.get("success_rate")),
-        ("optimum", final.get("optimum")),
         ("best random or constant policy", final.get("baseline")),
-        ("gap to the optimum", final.get("gap")),
-        ("score (1: optimum, 0: best random or constant policy)", final.get("score")),
+        *((label, final.get(name)) for name, label in _measured(final).items()),
     ]
     return _table([*rows, ("how", how)])
+
+
+def _measured(final: Mapping[str, Any]) -> dict[str, str]:
+    """What the figures are called that hold the return against the optimum."""
+    if "optimum_at_least" not in final:
+        return {
+            "optimum": "optimum",
+            "gap": "gap to the optimum",
+            "score": "score (1: optimum, 0: best random or constant policy)",
+        }
+    return {
+        "optimum_at_least": "optimum, bracketed: what a policy was shown to reach",
+        "optimum": "optimum, bracketed: what no policy exceeds",
+        "gap_at_least": "gap to the bracket's lower end",
+        "gap": "gap to the bracket's upper end",
+        "score": "score (1: the bracket's upper end, 0: best random or constant policy)",
+        "score_at_most": "score with 1 at the bracket's lower end",
+    }
 
 
 def _bandit_figures(record: Mapping[str, Any]) -> str:

@@ -10,11 +10,13 @@ from typing import Any
 from pipeline.errors import UserError
 from pipeline.files import replacing, sync_folders
 from pipeline.resuming.state_folder import state_file, state_files
+from pipeline.source_digest import source_digest
 from snapshots.recording import Snapshot
 from snapshots.snapshot_files import BadSnapshotError, read_snapshot, write_snapshot
 from snapshots.user_key import user_key
 
 APPLICATION = "yardstick"
+SOURCES = "sources"
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,11 @@ class SavedState:
 
     snapshot: Snapshot
     note: dict[str, Any]
+
+    @property
+    def is_of_these_sources(self) -> bool:
+        """Whether what goes on from it does what the training did that saved it."""
+        return self.note.get(SOURCES) == source_digest()
 
 
 def state_key() -> bytes:
@@ -54,7 +61,8 @@ def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, An
     key = state_key()
     folder.mkdir(exist_ok=True)
     with replacing(state_file(folder, number)) as draft:
-        write_snapshot(draft, snapshot, {**note, "number": number}, key)
+        whole_note = {**note, "number": number, SOURCES: source_digest()}
+        write_snapshot(draft, snapshot, whole_note, key)
     sync_folders(folder)
 
 

@@ -252,10 +252,12 @@ class StateSaver(StopAtSafeMoment):
         try:
             restore(state.snapshot, roots, moved)
             read_back(self.training_env, self.run.path, state.note.get("episodes", {}))
-        except NotRestorableError as error:
+        except Exception as error:
+            if state.is_of_these_sources and not isinstance(error, NotRestorableError):
+                raise
             raise UserError(
-                f"{self.run.state_path} does not fit what the run's settings make today: {error}; "
-                "remove it to begin the run again"
+                f"{self.run.state_path} does not fit what the run's settings make today: "
+                f"{one_line(error)}; remove it to begin the run again"
             ) from error
         put_back(self.modules, roots["modules"])
         set_generators(roots["generators"])

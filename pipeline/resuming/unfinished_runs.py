@@ -120,6 +120,11 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
     else:
         if state.note["spec"] != settings_digest(run.recorded_spec()):
             raise UserError(f"{run.state_path} holds the state of a run of other settings")
+        if not state.is_of_these_sources:
+            tell(
+                f"{run.state_path} was saved by other sources of Yardstick, so that the result may "
+                "differ; remove it to begin the run anew"
+            )
         cut_back(run.path, state.note["log_folder"], state.note["files"])
     return replace(keeping, state=state, goes_on=True, was_cut_off=True)
 

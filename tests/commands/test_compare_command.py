@@ -458,9 +458,9 @@ from commands.compare_agents import main
 from commands.parsing import run_command
 
 if __name__ == "__main__":
-    from experiments import child_processes
+    from experiments import child_processes, fork_server
 
-    child_processes._context = multiprocessing.get_context("spawn")
+    fork_server.context = multiprocessing.get_context("spawn")
     run_command(main)
 """
 

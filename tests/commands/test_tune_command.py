@@ -113,10 +113,12 @@ def test_the_same_command_again_does_nothing_and_says_the_same(folder, type_comm
         ([*WORDS[:4], "-n", "9", "--n-episodes", "9"], "give -n or --n-episodes, not both"),
         ([*WORDS[:6], "--sampler", "grid", "--trials", "3"], "give more trials"),
         ([*WORDS[:6], "--storage", "."], "Is a directory"),
+        ([*WORDS[:4], "--search-space", "odd.yml"], "'maxx_episode_steps': did you mean"),
         ([*WORDS[:4], "--n-evaluations", "3"], "--eval-freq"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(folder, type_command, words, message):
+    Path("odd.yml").write_text("default: {train_env_kwargs.maxx_episode_steps: [5, 50]}")
     code, _, err = type_command(*words)
     assert code == 2
     assert len(err.splitlines()) == 1

@@ -13,12 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from experiments import child_processes
+from experiments import child_processes, fork_server
 from experiments.child_processes import (
     StoppedError,
     TaskDiedError,
     TaskFailedError,
-    end_server,
     local_executor,
     stop_all,
     supervise,
@@ -90,7 +89,7 @@ def clean_up(folder):
 def method(request, monkeypatch):
     """Children of Linux, and those of Windows and macOS."""
     context = multiprocessing.get_context(request.param)
-    monkeypatch.setattr(child_processes, "_context", context)
+    monkeypatch.setattr(fork_server, "context", context)
     # Another test may have stopped everything.
     monkeypatch.setattr(child_processes, "_stopping", threading.Event())
     return request.param
@@ -256,8 +255,8 @@ def test_when_the_server_is_killed_all_go_on(chores, tmp_path, method, caplog):
             supervise, chores.write_and_wait, str(tmp_path), "first", clean_up=nothing
         )
         wait_for(lambda: list(tmp_path.glob("waiting_*")))
-        server = child_processes._server_pid()
-        end_server()
+        server = fork_server.server_pid()
+        fork_server.end_server()
         wait_for(lambda: not is_alive(server) or is_zombie(server))
         assert executor.submit(supervise, chores.add, 1, 1, clean_up=nothing).result()[0] == 2
         (tmp_path / "go").touch()
@@ -275,9 +274,9 @@ def test_a_stop_does_not_wait_for_a_server_that_imports(chores, tmp_path, method
     """Where it is still at that, no child can be started, and the one who waits is let go."""
     if method == "spawn":
         return
-    end_server()
+    fork_server.end_server()
     with local_executor(1) as executor:
-        os.kill(child_processes._server_pid(), signal.SIGSTOP)
+        os.kill(fork_server.server_pid(), signal.SIGSTOP)
         future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)
         wait_for(child_processes._lock.locked)
         began = time.monotonic()
@@ -314,11 +313,11 @@ DRIVER = """
 import multiprocessing, sys
 from functools import partial
 import study_chores
-from experiments import child_processes
+from experiments import child_processes, fork_server
 
 if __name__ == "__main__":
     method, folder = sys.argv[1:]
-    child_processes._context = multiprocessing.get_context(method)
+    fork_server.context = multiprocessing.get_context(method)
     child_processes.supervise(
         study_chores.wait, folder, clean_up=partial(study_chores.clean_up, folder)
     )
@@ -347,8 +346,8 @@ def test_only_linux_forks(monkeypatch, platform, expected):
     if platform == "win32":
         monkeypatch.setitem(sys.modules, "multiprocessing.forkserver", None)
         monkeypatch.delattr(signal, "pthread_sigmask")
-    loaded = runpy.run_path(child_processes.__file__)
+    loaded = runpy.run_path(fork_server.__file__)
     assert loaded["START_METHOD"] == expected
-    assert loaded["_context"].get_start_method() == expected
+    assert loaded["context"].get_start_method() == expected
     if platform != "linux":
         loaded["start_server"]()

@@ -97,6 +97,10 @@ def test_a_failure_is_told_with_its_details(outcome):
     assert failure.log.read_text() == "at length"
 
 
+def test_a_failure_without_a_word_is_one_all_the_same(outcome):
+    assert outcome(Scheduler([packed(Answer("failed"))])).reason == "it does not say why"
+
+
 @pytest.mark.parametrize("end", ["cancelled", "lost", packed(Answer("stopped")), KILLED])
 def test_what_is_nobodys_fault_is_sent_again(outcome, end):
     scheduler = Scheduler([end] * 5 + [FAILED], begins=False)

@@ -21,6 +21,9 @@ from experiments.run_limits import RunLimits
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
+from pipeline.resuming.saved_states import SavedState
+from pipeline.resuming.state_keeping import StateKeeping
+from pipeline.source_digest import source_digest
 
 LAKE = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_timesteps": 20})
 
@@ -107,6 +110,17 @@ def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(
         do_run(planned, draft, "compare.py s.yml")
     leave_drafts(tmp_path, run_name(planned))
     assert draft.exists() == is_kept
+
+
+@pytest.mark.parametrize("sources", ["older", source_digest()])
+def test_a_study_goes_on_from_states_of_its_own_sources_alone(tmp_path, monkeypatch, sources):
+    planned, _ = runs_of(tmp_path)
+    left = StateKeeping(state=SavedState(None, {"sources": sources}), goes_on=True)
+    for name, value in (("holds_state", True), ("go_on", left)):
+        monkeypatch.setattr(run_or_go_on, name, lambda *_, value=value: value)
+    monkeypatch.setattr(type(planned), "is_of", lambda *_: True)
+    found = run_or_go_on._to_go_on_with(planned, planned.run)
+    assert found.goes_on == (sources != "older")
 
 
 class InPlace:

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from experiments import child_processes
+from experiments import child_processes, fork_server
 from experiments.child_processes import (
     StoppedError,
     TaskDiedError,
@@ -65,8 +65,8 @@ def runs_of(root, n_seeds=2, agents=AGENTS, environments=ENVIRONMENTS):
 @pytest.fixture(scope="module", autouse=True)
 def server():
     """One that has imported the libraries, so that no child has to."""
-    child_processes.end_server()
-    child_processes.start_server()
+    fork_server.end_server()
+    fork_server.start_server()
 
 
 @pytest.fixture(autouse=True)
@@ -162,7 +162,7 @@ def test_a_stop_ends_those_that_work_and_those_that_wait(chores):
 
 @pytest.mark.parametrize("method", ["spawn"])
 def test_it_is_the_same_where_nothing_forks(chores, method, monkeypatch):
-    monkeypatch.setattr(child_processes, "_context", multiprocessing.get_context(method))
+    monkeypatch.setattr(fork_server, "context", multiprocessing.get_context(method))
     assert shared(chores.who) == shared(chores.who)
 
 

@@ -105,6 +105,22 @@ def test_sampled_figures_are_called_so(packed):
     assert {"mean_reward", "mean_return"} <= {metric["type"] for metric in result["metrics"]}
 
 
+def test_a_bracket_is_called_so(packed, runs):
+    final = json.loads((runs["dqn"].path / "run.json").read_text())["final"]
+    data, text = front_matter(packed("dqn"))
+    for name, label in (
+        ("optimum_at_least", "optimum, bracketed: what a policy was shown to reach"),
+        ("optimum", "optimum, bracketed: what no policy exceeds"),
+        ("score", "score (1: the bracket's upper end, 0: best random or constant policy)"),
+    ):
+        assert f"| {label} | {final[name]} |" in text
+        (result,) = data["model-index"][0]["results"]
+        assert {"type": name, "value": final[name], "name": label, "verified": False} in (
+            result["metrics"]
+        )
+    assert "| optimum |" not in text
+
+
 @pytest.mark.parametrize("target", ["pack", "pack.zip"])
 def test_a_pack_verifies_and_plays_elsewhere(packed, runs, target):
     path = packed("dqn", target)

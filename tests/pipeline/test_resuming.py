@@ -353,6 +353,26 @@ def test_a_strangers_state_is_refused(tmp_path, monkeypatch):
     assert before == {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file()}
 
 
+def test_a_state_of_other_sources_is_told_of_and_no_bug_of_theirs_is_a_traceback(
+    tmp_path, monkeypatch
+):
+    with monkeypatch.context() as context:
+        context.setattr("pipeline.resuming.saved_states.source_digest", lambda: "older")
+        run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
+    told = []
+    keeping = go_on(run, StateKeeping(), told.append)
+    (line,) = told
+    assert "was saved by other sources of Yardstick, so that the result may differ" in line
+
+    def restore(*_):
+        raise AttributeError("'Evaluation' object has no attribute 'new'")
+
+    monkeypatch.setattr("pipeline.resuming.state_saver.restore", restore)
+    again = replace(recorded_training(run, ()), verbose=0, pictures=False)
+    with pytest.raises(UserError, match=r"no attribute 'new'; remove it to begin the run anew$"):
+        carry_out(training_of(again, keeping, run))
+
+
 def test_a_state_beside_other_settings_is_refused(tmp_path, monkeypatch):
     run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
     other = cut_off(spec_of(tmp_path, GRID, "sarsa", 600, {}), monkeypatch)

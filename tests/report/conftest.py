@@ -214,7 +214,8 @@ def made_up_trial(number, value, figures, state="complete", failure=None, **para
 @pytest.fixture
 def tuning_record():
     """What a tuning wrote down, made up."""
-    retested = {"held_out": 0.5, "verdict": "", "n_runs": 4, "in_search": 0.6, "number": 0}
+    retested = {"held_out": 0.5, "verdict": "", "in_search": 0.6, "number": 0}
+    retested |= {"n_runs": 4, "n_failed": 1}
     interval = {"point": 0.5, "low": 0.4, "high": 0.6, "n": 4, "n_missing": 0}
     return {
         "name": "t",

@@ -6,7 +6,7 @@ import pytest
 
 from report.conclusions import conclusion
 from report.verdict_matrix import says_more, verdict_matrix
-from verdicts import Summary
+from verdicts import FailureCount, Summary
 
 MEANS = {"a": 100.0, "b": 90.0, "c": 80.0}
 
@@ -73,6 +73,23 @@ def test_the_first_line(made_up, case):
     verdicts, lead = LEADS[case]
     pairs = dict(zip([("a", "b"), ("a", "c"), ("b", "c")], verdicts, strict=True))
     assert said(made_up, pairs).lead == lead
+
+
+FAILED = "3 of 20 runs of b failed"
+FAILED_LEADS = {
+    "equivalent": f"a and b are best, and equivalent in the typical run: {FIGURE}; {FAILED}.",
+    "better": f"a is best: {FIGURE}.",
+    "worse": f"b is best: return of the final policy {B}, score 0.9; the optimum is 200; {FAILED}.",
+    "undecided": f"Undecided: 4 seeds decide nothing. a has the highest mean so far: {FIGURE}.",
+}
+
+
+@pytest.mark.parametrize("verdict", FAILED_LEADS)
+def test_the_first_line_says_whose_runs_failed_of_those_that_it_calls_best(made_up, verdict):
+    failures = {"a": FailureCount(0, 20, 0.2), "b": FailureCount(3, 20, 0.4)}
+    found = said(made_up, {("a", "b"): verdict}, {"a": 100.0, "b": 90.0}, failures=failures)
+    assert found.lead == FAILED_LEADS[verdict]
+    assert found.failed.startswith(FAILED)
 
 
 def test_one_agent_has_no_rival(made_up):

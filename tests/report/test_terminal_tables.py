@@ -11,7 +11,7 @@ from rich.console import Console
 from experiments.pull_statistics import pull_statistics
 from report.conclusions import conclusion
 from report.terminal_tables import print_analysis, print_episodes_table
-from verdicts import PairComparison, ThresholdSummary
+from verdicts import FailureCount, PairComparison, ThresholdSummary
 
 ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
 
@@ -185,7 +185,9 @@ def test_three_agents_have_their_verdicts_in_a_matrix(made_up):
         made_up.pair("a", "c", "undecided"),
         made_up.pair("[b]", "c", "equivalent"),
     ]
-    found = made_up.analysis([made_up.environment(agents, pairs=tuple(pairs))], ["a", "[b]", "c"])
+    failed = {"a": FailureCount(0, 4, 0.6), "c": FailureCount(1, 4, 0.8)}
+    place = made_up.environment(agents, pairs=tuple(pairs), failures=failed)
+    found = made_up.analysis([place], ["a", "[b]", "c"])
     _, lines = lines_of(lambda console: print_analysis(console, found))
     place = next(i for i, line in enumerate(lines) if line.split() == ["1", "2", "3"])
     assert [line.split() for line in lines[place + 1 : place + 4]] == [
@@ -195,6 +197,9 @@ def test_three_agents_have_their_verdicts_in_a_matrix(made_up):
     ]
     assert lines[place + 4] == (
         "> better than the agent of the column, < worse, = equivalent, ? undecided"
+    )
+    assert lines[place + 5] == (
+        "1 of 4 runs of c failed: what is equivalent is so in the typical run."
     )
     assert not any("is undecided against" in line for line in lines)
 

@@ -103,6 +103,7 @@ def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
         "verdict", "history", "parallel", "importances", "cost", "trials",
     ]  # fmt: skip
     assert "Trial 2 is the best on seeds that the search has not seen: 0.7" in text
+    assert "and 1 of its 4 runs failed. Its settings are in" in text
     assert "looked better in the search than on other seeds, by 0.1" in text
     assert 'href="retest/report.html"' in text
     assert "python tune.py &lt;script&gt;" in text

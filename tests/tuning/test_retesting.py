@@ -23,10 +23,11 @@ from verdicts import Estimate
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
 
 
-def retested(number, held_out, verdict="undecided", in_search=0.9):
+def retested(number, held_out, verdict="undecided", in_search=0.9, n_runs=20, n_failed=0):
     label = f"trial {number}" if number else "shipped"
     interval = Estimate(held_out or 0.0, 0.5, 0.9, 20)
-    return Retested(label, number, in_search, held_out, interval, verdict, 20)
+    n_runs = 0 if held_out is None else n_runs
+    return Retested(label, number, in_search, held_out, interval, verdict, n_runs, n_failed)
 
 
 def test_seeds_of_the_search_and_of_the_re_test_are_apart(toy):
@@ -58,6 +59,8 @@ def test_optimism_is_how_much_better_it_looked_than_it_is(
         ([(1, 0.7 + 1e-15, "equivalent")], "score", None),
         ([(1, 0.9, "worse")], "score", None),
         ([(1, None, "undecided")], "score", None),
+        ([(1, 0.9, "better", 0.9, 19), (2, 0.8, "undecided")], "score", 2),  # a run of it failed
+        ([(1, 0.9, "better", 0.9, 19)], "score", None),
         ([(1, 0.8, "undecided"), (2, 0.6, "undecided")], "steps", 2),
     ],
 )
@@ -107,13 +110,13 @@ def test_an_entry_is_read_as_it_was_with_the_seeds_that_it_has_seen(toy, tmp_pat
 
 
 def test_the_file_of_the_winner_says_where_it_comes_from(toy, tmp_path):
-    winner = retested(4, 0.85, "better")
+    winner = retested(4, 0.85, "better", n_failed=3)
     outcome = Outcome((retested(0, 0.7, ""), winner), winner, 0.05, "")
     path = write_winner(toy.tuning(), tmp_path, outcome, ENTRY, 10)
     said = " ".join(line[2:] for line in path.read_text().splitlines() if line.startswith("# "))
     assert "trial 4 of 10 (tpe), mean of score over the seeds 0 to 2: 0.9." in said
     assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (95 % interval" in said
-    assert "the settings before, there: 0.7" in said
+    assert "0.5 to 0.9, 20 runs, 3 of them failed); the settings before, there: 0.7" in said
     assert said.endswith("Verdict: better.")
     remove_winner(tmp_path)
     assert not path.exists()

@@ -308,6 +308,20 @@ def test_a_grid_goes_from_end_to_end(space):
             )
 
 
+@pytest.mark.parametrize(
+    ("low", "high", "kind"),
+    [
+        ("0", "1", optuna.distributions.IntDistribution),
+        ("0.0", "1.0", optuna.distributions.FloatDistribution),
+        ("0", "1.0", optuna.distributions.FloatDistribution),
+        ("0e0", "1e0", optuna.distributions.FloatDistribution),
+    ],
+)
+def test_numbers_are_whole_where_both_ends_are_written_so(tmp_path, low, high, kind):
+    space = read(tmp_path, f"default: {{gamma: {{low: {low}, high: {high}}}}}")
+    assert space.distributions() == {"gamma": kind(0, 1)}
+
+
 # --- mistakes -------------------------------------------------------------------------------------
 
 
@@ -327,6 +341,18 @@ def test_a_grid_goes_from_end_to_end(space):
         ("default: {gamma: {low: 0.5, high: 0.9, scale: logg}}", "did you mean 'log'"),
         ("default: {batch_size: {low: 30, high: 64, scale: powers_of_two}}", "powers of two"),
         ("default: {batch_size: {low: 2.5, high: 3.5}}", "batch_size must be a whole number"),
+        ("default: {batch_size: {low: 1.0, high: 9.0}}", "write low and high without a point"),
+        ("default: {learning_rate: {low: 0.1, high: .inf}}", "both finite: not 0.1 and inf"),
+        (
+            "default: {log2_n_steps: [1, 2], n_steps: {low: 1, high: 8, scale: powers_of_two}}",
+            "log2_n_steps and n_steps both decide log2_n_steps",
+        ),
+        ("default: {gamma: [0, 1], u: {sets: {a: {gamma: 1}, b: {}}}}", "gamma and u both decide"),
+        (
+            "default: {env_kwargs.slip: [0.0, 0.2]}",
+            "env_kwargs.slip is what settings are judged on",
+        ),
+        ("default: {how: {sets: {a: {eval_env_kwargs: {}}, b: {}}}}", "and not searched"),
         ("default: {gamma: {low: 0.1, high: 0.9, forms: [linaer]}}", "one of constant, linear"),
         ("default: {gamma: {low: 0.1, high: 0.9, forms: [constant, [1]]}}", "single values"),
         ("default: {gamma: 0.9}", "gamma must be a list of values, or map low and high"),
