@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -63,3 +65,38 @@ def compared(
         f"{(off > TOLERANCE * scale).sum()} of {off.size} places, "
         f"most in {place}: yours is {side} than what one step ahead makes of it."
     )
+
+
+class AnswerError(Exception):
+    """A function that is an answer cannot be tried; the text says why."""
+
+
+def answering(check: Callable[..., str]) -> Callable[..., str]:
+    """Let a check say what an `AnswerError` says."""
+
+    @wraps(check)
+    def checked(*arguments: Any, **more: Any) -> str:
+        try:
+            return check(*arguments, **more)
+        except AnswerError as fault:
+            return str(fault)
+
+    return checked
+
+
+def number_from(function: Callable[..., Any], *arguments: Any) -> float:
+    """What a function that is an answer gives, as a finite number.
+
+    Raises:
+        AnswerError: if it cannot be called so, or gives something else.
+    """
+    try:
+        given = function(*arguments)
+        if given is None or given is Ellipsis:
+            raise AnswerError("Not done yet: the function gives nothing back.")
+        number = float(given)
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError) as fault:
+        raise AnswerError(f"It cannot be called or gives no number: {fault}") from None
+    if not np.isfinite(number):
+        raise AnswerError(f"It gives {number}, which is not finite.")
+    return number
