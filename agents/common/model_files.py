@@ -150,7 +150,10 @@ class JsonAlgorithm(BaseAlgorithm):
         if raw.pop("format", None) != FORMAT_VERSION:
             raise ValueError(f"{_named(path)} is written in another version of the file format")
         return {
-            name: known[name] if name in known else decode(value) for name, value in raw.items()
+            name: known[name] if name in known else decode(value)
+            for name, value in raw.items()
+            # Files that are older may hold more.
+            if name not in cls._rebuilt
         }
 
 

@@ -94,6 +94,8 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         self.exploration_schedule = self._make_exploration_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy()
+        # A model file holds nothing of episodes under way.
+        self._begin_episodes()
 
     @abstractmethod
     def _check_arguments(self) -> None:

@@ -72,6 +72,8 @@ class TileAlgorithm(LearningAlgorithm):
 
     act = act_on_tiles
 
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions")
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
