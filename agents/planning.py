@@ -18,6 +18,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
+from agents.common.observed_numbers import numbers_in
 from agents.common.online import OnlineAlgorithm
 from agents.common.signatures import CommonArguments
 from agents.common.table_policy import TablePolicy
@@ -88,8 +89,7 @@ class ActionTablePolicy(TablePolicy):
     def _predict(
         self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
     ) -> th.Tensor:
-        assert isinstance(observation, th.Tensor)
-        obs = observation.long().flatten().numpy()
+        obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.actions_after(obs, np.zeros(len(obs), dtype=np.int64)))
 
 
@@ -207,7 +207,7 @@ class PlanningAgent(OnlineAlgorithm):
         Returns:
             Actions, of the observation's shape, and the new ``state``.
         """
-        obs = np.asarray(observation, dtype=np.int64)
+        obs = numbers_in(self.observation_space, observation)
         steps = np.zeros(obs.size, dtype=np.int64) if state is None else state[0].copy()
         if episode_start is not None:
             steps[np.asarray(episode_start, dtype=np.bool_)] = 0

@@ -31,6 +31,7 @@ from safe_files.tensors import check_values, load_tensors
 
 FORMAT_VERSION = 1
 TENSORS = frozenset({"policy.pth"})
+MOST_ENVS = 100_000
 
 
 class JsonAlgorithm(BaseAlgorithm):
@@ -122,6 +123,7 @@ class JsonAlgorithm(BaseAlgorithm):
         model = cls(policy=policy, env=env, _init_setup_model=False)  # type: ignore[call-arg]
         _check_names(model, data)
         _check_spaces(data)
+        _check_n_envs(data.get("n_envs"))
         # Without a seed, setting up leaves alone what was saved with its state.
         model.__dict__.update({**data, "seed": None})
         model._setup_model()
@@ -150,7 +152,10 @@ class JsonAlgorithm(BaseAlgorithm):
         if raw.pop("format", None) != FORMAT_VERSION:
             raise ValueError(f"{_named(path)} is written in another version of the file format")
         return {
-            name: known[name] if name in known else decode(value) for name, value in raw.items()
+            name: known[name] if name in known else decode(value)
+            for name, value in raw.items()
+            # Files that are older may hold more.
+            if name not in cls._rebuilt
         }
 
 
@@ -179,6 +184,12 @@ def _check_spaces(data: Mapping[str, Any]) -> None:
     for name in ("observation_space", "action_space"):
         if not isinstance(data.get(name), spaces.Space):
             raise UnsafeFileError(f"does not say its {name}")
+
+
+def _check_n_envs(n: Any) -> None:
+    """An agent makes room for the episodes of all its environments as soon as it is made."""
+    if not isinstance(n, int) or not 1 <= n <= MOST_ENVS:
+        raise UnsafeFileError(f"is of an agent on {shown(n)} environments, not on 1 to {MOST_ENVS}")
 
 
 def _declared(cls: type) -> Iterable[str]:

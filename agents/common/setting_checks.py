@@ -111,11 +111,14 @@ def check_epsilons(agent: Any) -> None:
 
 
 def check_learning_rate(learning_rate: object) -> None:
-    """Refuse words other than that for sample averages.
+    """Refuse words other than that for sample averages, and numbers that are no step sizes.
 
     Raises:
         ValueError: naming what it can be.
     """
+    if isinstance(learning_rate, int | float):
+        check_at_least(0.0, [("learning_rate", learning_rate)])
+        check_finite([("learning_rate", learning_rate)])
     if isinstance(learning_rate, str) and learning_rate != SAMPLE_AVERAGE:
         raise ValueError(
             f"learning_rate must be a number, a schedule or {SAMPLE_AVERAGE!r}, "

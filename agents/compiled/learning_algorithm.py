@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.utils import FloatSchedule, is_vectorized_observation
 
 from agents.common.exploration import EPSILON_GREEDY
 from agents.common.online import OnlineAlgorithm
@@ -21,7 +21,8 @@ from agents.common.signatures import CommonArguments, TieBreaking
 from agents.common.step_sizes import SAMPLE_AVERAGE
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.dispatch import CompiledClass, check_functions, settings_dtype
-from agents.compiled.training_records import PROGRESS
+from agents.compiled.training_records import PROGRESS, UNDECIDED
+from mdp.array_types import Ints
 
 # Training, and exploring by another generator for a few numbers of observations.
 MOST_WORKSPACES = 4
@@ -94,6 +95,8 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         self.exploration_schedule = self._make_exploration_schedule()
         self.set_random_seed(self.seed)
         self.policy = self._make_policy()
+        # A model file holds nothing of episodes under way.
+        self._begin_episodes()
 
     @abstractmethod
     def _check_arguments(self) -> None:
@@ -160,6 +163,23 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
             known = made_from, self._make_workspace(rng, n)
             self._workspaces[id(rng), n] = known
         return known[1]
+
+    def _note_progress(self, workspace: Any) -> None:
+        """Tell a workspace how far the training is."""
+
+    def _exploring_actions(self, observation: Any) -> Ints:
+        """An action for an observation, or n for n of them, chosen as in training.
+
+        Raises:
+            ValueError: if it is neither.
+        """
+        obs = np.asarray(observation)
+        many = is_vectorized_observation(obs, self.observation_space)
+        workspace = self._workspace_for(self.predict_rng, len(obs) if many else 1)
+        self._note_progress(workspace)
+        workspace.next_actions[:] = UNDECIDED
+        actions: Ints = workspace.act(obs if many else obs[None])
+        return actions.reshape(len(obs) if many else ())
 
     def __getstate__(self) -> dict[str, Any]:
         # A copy's arrays would no longer be its policy's.

@@ -72,6 +72,8 @@ class TileAlgorithm(LearningAlgorithm):
 
     act = act_on_tiles
 
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions")
+
     def __init__(
         self,
         policy: str | type[BasePolicy],
@@ -219,12 +221,7 @@ class TileAlgorithm(LearningAlgorithm):
         """
         if deterministic:
             return super().predict(observation, state, episode_start, deterministic)
-        obs = np.asarray(observation)
-        shape = obs.shape[: obs.ndim - len(self.observation_space.shape or ())]
-        workspace = self._workspace_for(self.predict_rng, int(np.prod(shape)))
-        self._note_progress(workspace)
-        workspace.next_actions[:] = UNDECIDED
-        return workspace.act(obs).reshape(shape), state
+        return self._exploring_actions(observation), state
 
     def action_probabilities(self, observations: NDArray[Any] | None = None) -> Floats:
         """What the policy does now that training acts by, shape (n, A).

@@ -10,6 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from agents.common.observed_numbers import numbers_in
 from agents.linear.tile_coding import Tiles, tiles_between
 from mdp.array_types import Floats, Ints
 
@@ -73,11 +74,7 @@ def vectors_of(space: spaces.Space[Any], observations: Any) -> Floats:
     if not isinstance(space, spaces.Discrete):
         assert space.shape is not None
         return given.reshape(-1, *space.shape).astype(np.float32).astype(np.float64)
-    numbers = given.reshape(-1, 1)
-    outside = numbers[(numbers < 0) | (numbers >= space.n)]
-    if outside.size:
-        raise ValueError(f"observation {outside[0]} is not in {space}, the agent's space")
-    return numbers.astype(np.float64)
+    return numbers_in(space, given).reshape(-1, 1).astype(np.float64)
 
 
 def _check_size(counts: Ints, n_tilings: int, n_actions: int) -> None:

@@ -16,27 +16,23 @@ class EpisodeKeeper(MaskKeeper):
     """Remembers between two steps: actions that were committed to, and the algorithm's own memory.
 
     The memory is a NamedTuple of arrays, which compiled functions are handed as ``agent.memory``
-    and work on in place. What belongs to episodes under way has a row for each environment. It is
-    no part of a model file: what is learnt for good belongs into buffers of the policy, which
-    `_memory_in_use` may put beside it. States of a training, to resume from, hold both.
+    and work on in place. What belongs to episodes under way has a row for each environment. Neither
+    is part of a model file: what is learnt for good belongs into buffers of the policy, which
+    `_memory_in_use` may put beside it. States of a training, to resume from, hold all of it.
 
     Raises:
         ValueError: while learning, if the memory is not of the shapes that the settings ask for.
     """
 
-    _rebuilt = (*MaskKeeper._rebuilt, "_memory")
+    _rebuilt = (*MaskKeeper._rebuilt, "_memory", "_next_actions")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._next_actions: Ints = np.empty(0, dtype=np.int64)
         self._memory: tuple[Any, ...] = ()
         super().__init__(*args, **kwargs)
 
-    def _setup_model(self) -> None:
-        super()._setup_model()
-        self._memory = self._make_memory()
-
     def _make_memory(self) -> tuple[Any, ...]:
-        """A memory of nothing, for ``n_envs`` environments; asked for by `_begin_episodes` too."""
+        """A memory of nothing, for ``n_envs`` environments."""
         return ()
 
     def _memory_in_use(self) -> tuple[Any, ...]:

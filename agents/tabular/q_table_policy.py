@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.type_aliases import Schedule
 
 from agents.common.mask_buffers import MaskBufferPolicy
+from agents.common.observed_numbers import numbers_in
 from mdp.array_types import Bools, Floats, Ints
 
 
@@ -98,6 +99,5 @@ class QTablePolicy(MaskBufferPolicy):
         self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
     ) -> th.Tensor:
         """The first of the best allowed actions; shapes (n,) to (n,)."""
-        assert isinstance(observation, th.Tensor)
-        obs = observation.long().flatten().numpy()
+        obs = numbers_in(self.observation_space, observation).reshape(-1)
         return th.from_numpy(self.allowed_values(obs).argmax(axis=1))

@@ -90,10 +90,17 @@ def _is_plain(env: gym.Env[Any, Any]) -> bool:
     """Whether no wrapper, and nobody's own method, comes between agent and environment."""
     while isinstance(env, gym.Wrapper):
         kind = type(env)
+        if _has_own_method(env):
+            return False
         only_shows = isinstance(env, gym.ObservationWrapper) and kind.__module__.startswith(
             _OBSERVATION_HOMES
         )
         if not only_shows and f"{kind.__module__}.{kind.__qualname__}" not in TRANSPARENT_WRAPPERS:
             return False
         env = env.env
-    return not {"step", "reset"} & vars(env).keys()
+    return not _has_own_method(env)
+
+
+def _has_own_method(env: gym.Env[Any, Any]) -> bool:
+    """Whether something in the object hides a method of its class."""
+    return any(callable(getattr(type(env), name, None)) for name in vars(env))

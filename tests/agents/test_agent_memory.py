@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
+from agents import load_algorithm
 from agents.common.callback_horizons import BlockCallback
+from agents.compiled.training_records import UNDECIDED
 from agents.tabular.q_learning import QLearning
 from agents.tabular.temporal_difference import td_learning
 from mdp.machine_code import inlined
@@ -97,3 +99,19 @@ def test_a_loaded_agent_begins_with_an_empty_one(tmp_path):
     assert loaded._memory.visits.shape == (3, 16)
     assert not loaded._memory.visits.any()
     assert loaded.learn(300)._memory.visits.sum(axis=1).tolist() == [100, 100, 100]
+
+
+@pytest.mark.parametrize("name", ["sarsa", "monte_carlo", "actor_critic", "reinforce"])
+def test_a_loaded_agent_goes_on_in_the_middle_of_episodes(name, tmp_path):
+    env = make_vec_env("FrozenLake-v1", 2, seed=3)
+    model = load_algorithm(name)(env=env, seed=1, engine="interpreted").learn(50)
+    model.save(tmp_path / "model")
+    loaded = load_algorithm(name).load(tmp_path / "model", env, force_reset=False)
+    assert loaded._last_obs.tolist() == model._last_obs.tolist()
+    # What compiled functions are handed has a row for each environment, before the first step too.
+    if name == "actor_critic":
+        assert loaded.compiled_agent(loaded.rng).memory.discounts.tolist() == [1.0, 1.0]
+    elif name == "reinforce":
+        assert loaded.compiled_agent(loaded.rng).memory.lengths.tolist() == [0, 0]
+    assert loaded._next_actions.tolist() == [UNDECIDED, UNDECIDED]
+    assert loaded.learn(50, reset_num_timesteps=False).num_timesteps == 100

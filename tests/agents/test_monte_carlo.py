@@ -155,3 +155,5 @@ def test_refusals():
         agent(env="FrozenLake-v1", longest_episode=0)
     with pytest.raises(ValueError, match="skip_terminal_update is for the agents that learn from"):
         load_algorithm("monte_carlo")(env="FrozenLake-v1", skip_terminal_update=True)
+    with pytest.raises(ValueError, match="longest_episode must be at most 50000000, not 100000000"):
+        agent(env="FrozenLake-v1", longest_episode=10**8)

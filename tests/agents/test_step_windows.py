@@ -165,3 +165,5 @@ def test_refusals():
     agent(env="FrozenLake-v1", exploration="gaussian_noise", target_policy="greedy")
     with pytest.raises(ValueError, match="skip_terminal_update is for the agents that learn from"):
         agent(env="FrozenLake-v1", skip_terminal_update=True)
+    with pytest.raises(ValueError, match="n_steps must be at most 25000000, not 25000001"):
+        agent(env=make_vec_env("FrozenLake-v1", 2), n_steps=25_000_001)

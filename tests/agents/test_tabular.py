@@ -214,6 +214,9 @@ def test_every_combination_trains(algorithm, exploration, learning_rate):
         ({"tie_breaking": "last"}, "tie_breaking must be one of random, first"),
         ({"exploration_decay": "cosine"}, "exploration_decay must be one of"),
         ({"learning_rate": "average"}, "learning_rate must be a number"),
+        ({"learning_rate": -0.1}, "learning_rate must be at least 0, not -0.1"),
+        ({"learning_rate": float("nan")}, "learning_rate must be at least 0, not nan"),
+        ({"learning_rate": float("inf")}, "learning_rate must be finite, not inf"),
         ({"exploration": "boltzmann", "temperature": 0.0}, "temperature must be above 0"),
         (
             {"exploration_decay": "exponential", "exploration_final_eps": 0.0},
@@ -260,3 +263,22 @@ def test_an_observation_outside_of_the_space_is_refused(name, outside):
             model.learn(5)
     with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
         load_algorithm(name)(env=Liar(0, 0), seed=0).predict(outside, deterministic=False)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("outside", [4, -1, 1.5, float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["qlearning", "semi_gradient_q", "optimal"])
+def test_predict_refuses_what_is_not_in_the_space(name, outside, deterministic):
+    """A negative number would be looked up from the table's end, and a fraction cut off."""
+    model = load_algorithm(name)(env=Liar(0, 0), seed=0)
+    for obs in (outside, np.array([0, outside])):
+        with pytest.raises(ValueError, match=rf"{outside} is not in Discrete\(4\)"):
+            model.predict(obs, deterministic=deterministic)
+
+
+@pytest.mark.parametrize("deterministic", [False, True])
+@pytest.mark.parametrize("name", ["qlearning", "semi_gradient_q"])
+def test_predict_takes_one_observation_or_a_row_of_them(name, deterministic):
+    model = load_algorithm(name)(env=Liar(0, 0), seed=0)
+    with pytest.raises(ValueError, match=r"Unexpected observation shape \(2, 2\)"):
+        model.predict(np.zeros((2, 2), dtype=np.int64), deterministic=deterministic)

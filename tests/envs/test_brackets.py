@@ -98,6 +98,16 @@ def _with_gravity(env):
     return env
 
 
+def _with_own_dynamics(env):
+    env.unwrapped._dsdt = lambda state: (0.0,) * 5
+    return env
+
+
+def _with_own_wrapper_step(env):
+    env.step = lambda action: env.env.step(2)
+    return env
+
+
 def _with_own_step(env):
     env.unwrapped.step = lambda action: MountainCarEnv.step(env.unwrapped, 2)
     return env
@@ -114,6 +124,8 @@ def _with_own_step(env):
         "two limits": lambda: TimeLimit(gym.make("CartPole-v1"), 300),
         "attribute": lambda: _with_gravity(gym.make("CartPole-v1")),
         "own step": lambda: _with_own_step(gym.make("MountainCar-v0")),
+        "own dynamics": lambda: _with_own_dynamics(gym.make("Acrobot-v1")),
+        "own step of a wrapper": lambda: _with_own_wrapper_step(gym.make("MountainCar-v0")),
         "own class": lambda: TimeLimit(MyPendulum(), 200),
         "scaled rewards": lambda: ScaleReward(gym.make("CartPole-v1"), 2.0),
         "clipped rewards": lambda: ClipReward(gym.make("MountainCar-v0"), 0, 1),

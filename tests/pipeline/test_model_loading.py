@@ -180,6 +180,15 @@ def test_spaces_are_spaces_of_bearable_size(space, tmp_path):
         load_model("optimal", path)
 
 
+@pytest.mark.parametrize("n", [None, 0, 10**12, "2"])
+def test_it_was_of_a_bearable_number_of_environments(n, tmp_path):
+    path = tmp_path / "model.zip"
+    load_algorithm("qlearning")(env="FrozenLake-v1", seed=0).save(path)
+    changed(path, n_envs=n)
+    with pytest.raises(UserError, match=r"is of an agent on .* environments, not on 1 to 100000"):
+        load_model("qlearning", path)
+
+
 MINE = """
 import agents
 from stable_baselines3 import PPO

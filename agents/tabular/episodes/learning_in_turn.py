@@ -14,6 +14,9 @@ from mdp.machine_code import inlined
 
 NOTHING_LEARNT = -1.0
 
+# Steps that are remembered of all environments together: some 32 bytes each, in a state too.
+MOST_STEPS = 50_000_000
+
 
 @by_type
 def learn_in(agent: TabularAgent, env: Any, progress: Any, i: int) -> float:

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import GymEnv
 from agents.common.setting_checks import check_whole, settings_of
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.learning_algorithm import StepSize
-from agents.tabular.episodes.learning_in_turn import NOTHING_LEARNT, EpisodicAlgorithm
+from agents.tabular.episodes.learning_in_turn import MOST_STEPS, NOTHING_LEARNT, EpisodicAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, move_towards, value_ahead
 from mdp.array_types import Floats, Ints
 from mdp.machine_code import inlined
@@ -121,7 +121,7 @@ class WindowAlgorithm(EpisodicAlgorithm):
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
-        check_whole(1, settings_of(self, "n_steps"))
+        check_whole(1, settings_of(self, "n_steps"), MOST_STEPS // self.n_envs)
 
     def _make_memory(self) -> Windows:
         shape = (self.n_envs, self.n_steps)
