@@ -30,10 +30,13 @@ LAKE = "FrozenLake-v1"
 
 
 class Corridor(gym.Env):
-    """Three cells and one action, forward: the rewards are 1 and 2, the last cell is the end."""
+    """Cells in a row and one action, forward; each step has its reward; the last one is the end."""
 
-    observation_space = gym.spaces.Discrete(3)
     action_space = gym.spaces.Discrete(1)
+
+    def __init__(self, rewards=(1.0, 2.0)):
+        self.rewards = rewards
+        self.observation_space = gym.spaces.Discrete(len(rewards) + 1)
 
     def reset(self, **options):
         super().reset(**options)
@@ -42,7 +45,11 @@ class Corridor(gym.Env):
 
     def step(self, action):
         self.cell += 1
-        return self.cell, float(self.cell), self.cell == 2, False, {}
+        reward = self.rewards[self.cell - 1]
+        return self.cell, reward, self.cell == len(self.rewards), False, {}
+
+
+THREE_ONES = Corridor(rewards=(1.0, 1.0, 1.0))
 
 
 def spec_of(env_id=LAKE, algo="qlearning", n_timesteps=300, settings=(), **fields):
@@ -145,26 +152,10 @@ def test_an_episode_that_is_cut_off_still_bootstraps():
     assert 0.5 in cut["target"]
 
 
-class Line(gym.Env):
-    """Four cells in a row and one action, forward; each step earns 1, and the last cell ends it."""
-
-    observation_space = gym.spaces.Discrete(4)
-    action_space = gym.spaces.Discrete(1)
-
-    def reset(self, **options):
-        super().reset(**options)
-        self.cell = 0
-        return 0, {}
-
-    def step(self, action):
-        self.cell += 1
-        return self.cell, 1.0, self.cell == 3, False, {}
-
-
 def test_along_traces_several_entries_move_by_one_error():
     """Step size 1/2, discount 1, lambda 1/2: errors 1, 1, 1; traces 1, then 1/2 and 1, ..."""
     halves = {"learning_rate": 0.5, "gamma": 1.0, "trace_decay": 0.5}
-    _, recorder = watched(Line(), "sarsa_lambda", n_timesteps=3, **halves)
+    _, recorder = watched(THREE_ONES, "sarsa_lambda", n_timesteps=3, **halves)
     moves, changes = recorder.moves.rows, recorder.changes.rows
     assert (moves["target"].tolist(), moves["td_error"].tolist()) == ([1.0] * 3, [1.0] * 3)
     assert changes["step"].tolist() == [0, 1, 1, 2, 2, 2]
@@ -175,7 +166,7 @@ def test_along_traces_several_entries_move_by_one_error():
 def test_of_several_steps_the_target_is_told_where_there_is_one():
     """Two rewards of 1 make a target of 2; at the end two entries are moved, to 2 and to 1."""
     _, recorder = watched(
-        Line(), "n_step_sarsa", n_timesteps=3, n_steps=2, learning_rate=0.5, gamma=1
+        THREE_ONES, "n_step_sarsa", n_timesteps=3, n_steps=2, learning_rate=0.5, gamma=1
     )
     moves, changes = recorder.moves.rows, recorder.changes.rows
     assert np.array_equal(moves["target"], [np.nan, 2.0, np.nan], equal_nan=True)
@@ -186,7 +177,7 @@ def test_of_several_steps_the_target_is_told_where_there_is_one():
 
 
 def test_whole_episodes_move_at_their_end():
-    _, recorder = watched(Line(), "monte_carlo", n_timesteps=6, learning_rate=0.5, gamma=1.0)
+    _, recorder = watched(THREE_ONES, "monte_carlo", n_timesteps=6, learning_rate=0.5, gamma=1.0)
     changes = recorder.changes.rows
     assert changes["step"].tolist() == [2, 2, 2, 5, 5, 5]
     assert changes["after"].tolist() == [1.5, 1.0, 0.5, 2.25, 1.5, 0.75]
