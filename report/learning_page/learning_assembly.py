@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from pipeline.train_spec import TrainSpec
 from pipeline.watching.map_recorder import MapRecorder
 from pipeline.watching.table_recorder import TableRecorder
 from report.learning_page.learning_data import exact_json, maps_data, place_data, steps_data
-from report.learning_page.learning_words import page_words
+from report.learning_page.learning_words import NO_WORDS, page_words
 from report.page.markup import inline_script, package_file, packed, script_hash, templates
 
 MOST_BYTES = 2_900_000
@@ -30,20 +31,34 @@ SCRIPTS = (
 )
 
 
-def write_learning_page(spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path) -> None:
+def write_learning_page(
+    spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path, title: str = ""
+) -> str:
     """Write the page of a training.
 
     Args:
         spec: of the training.
         recorder: what was kept of it.
         path: the file, which is replaced.
+        title: what the training is called; by default the names of agent and environment.
+
+    Returns:
+        What it shows, in words.
     """
     place = place_data(spec, recorder)
+    title = title or f"{spec.algo} on {spec.env_id}"
     for data in _ever_less(recorder):
-        text = _render(spec, {**data, **place})
+        words = page_words(spec, data)
+        text = _render({"title": title, "seed": spec.seed, **words}, {**data, **place})
         if len(text.encode()) <= MOST_BYTES:
             break
     write_text(path, text)
+    return f"{words['kind']}, {words['extent']}"
+
+
+def page_version() -> str:
+    """A digest of all that a page is made of but the data."""
+    return sha256(_render({"title": "", "seed": 0, **NO_WORDS}, {}).encode()).hexdigest()
 
 
 def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]]:
@@ -61,7 +76,7 @@ def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]
         n_steps = n_steps * 3 // 4
 
 
-def _render(spec: TrainSpec, data: dict[str, Any]) -> str:
+def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     early = package_file("templates/theme.js")
     own = "\n".join(_file(name) for name in SCRIPTS)
     style = "\n".join([package_file("templates/page.css"), _file("learning.css")])
@@ -70,9 +85,7 @@ def _render(spec: TrainSpec, data: dict[str, Any]) -> str:
         [PackageLoader("report.learning_page"), PackageLoader("report.page")]
     )
     return environment.get_template("learning.html").render(
-        title=f"{spec.algo} on {spec.env_id}",
-        seed=spec.seed,
-        **page_words(spec, data),
+        **words,
         data=packed(exact_json(data)),
         style=Markup(style),  # noqa: S704  # our own
         early=inline_script(early),

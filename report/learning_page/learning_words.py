@@ -9,6 +9,8 @@ import numpy as np
 
 from pipeline.train_spec import TrainSpec
 
+NO_WORDS = {"kind": "", "extent": "", "note": ""}
+
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     """The words that depend on what is shown, by the names that the template has for them."""
