@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from rich.console import Console
 
@@ -77,20 +77,21 @@ def _trained_again(
 
 def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
     """The page of a run, written by a child process."""
-    path, folder = page_path(root, run), Path(tempfile.mkdtemp(prefix="yardstick-"))
-    try:
-        words = supervise(
-            _train_again,
-            run,
-            path,
-            folder,
-            clean_up=partial(shutil.rmtree, folder, ignore_errors=True),
-            limits=limits,
-            shares_process=is_plain(run.spec),
-        )
-    except TaskFailedError as error:
-        path.unlink(missing_ok=True)
-        return without_page(run, str(error))
+    path = page_path(root, run)
+    with TemporaryDirectory(prefix="yardstick-learning-", ignore_cleanup_errors=True) as folder:
+        try:
+            words = supervise(
+                _train_again,
+                run,
+                path,
+                Path(folder),
+                clean_up=partial(shutil.rmtree, folder, ignore_errors=True),
+                limits=limits,
+                shares_process=is_plain(run.spec),
+            )
+        except TaskFailedError as error:
+            path.unlink(missing_ok=True)
+            return without_page(run, str(error))
     return note_page(root, run, words)
 
 
