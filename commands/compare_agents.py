@@ -157,6 +157,12 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
     add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
     add("-f", "--log-folder", type=filled, default="logs/studies", help="folder of all studies")
     add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
+    add(
+        "--watch-learning",
+        action="store_true",
+        dest="learning_pages",
+        help="train the first run of each agent again, and link pages that play how it learns",
+    )
     add("--no-report", action="store_true", help="only tables: no figures and no page")
 
 

@@ -59,7 +59,15 @@ def grow_study(
             break
         counts = counts_after(counts, steps)
     looks = {step.environment: step.standing for step in steps}
-    code = conclude(console, results, failures, command, with_page=with_page, looks=looks)
+    code = conclude(
+        console,
+        results,
+        failures,
+        command,
+        with_page=with_page,
+        looks=looks,
+        n_workers=place.n_workers,
+    )
     say(console, _on_cost(counts, steps))
     return code
 

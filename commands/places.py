@@ -32,11 +32,13 @@ class Place:
         words: what it is, in words.
         get_ready: called with the runs that are planned, before it is opened: what they compile is
             compiled once.
+        n_workers: how many processes may work on this machine at once.
     """
 
     launchers: Launchers
     words: str
     get_ready: Callable[[Sequence[PlannedRun]], None]
+    n_workers: int = 1
 
 
 def add_place_flags(group: argparse._ArgumentGroup) -> None:
@@ -84,7 +86,7 @@ def place_of(
 
     n_workers = max(args.jobs, 0) or available_cores()
     launchers = partial(local_launcher, root, command, n_workers, limits)
-    return Place(launchers, f"{n_workers} at once", _start_server)
+    return Place(launchers, f"{n_workers} at once", _start_server, n_workers)
 
 
 def _start_server(planned: Sequence[PlannedRun]) -> None:

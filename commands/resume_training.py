@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from pipeline.preparation import Training
-    from pipeline.training import Outcome
 
 # What may be given beside --resume: how it is shown, kept and imported, and not what is done.
 _MAY_BE_GIVEN = (
@@ -96,7 +95,7 @@ def _check_given(args: argparse.Namespace) -> None:
 
 
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
-    from commands.run_output import print_header, print_line, print_outcome, write_watched
+    from commands.run_output import print_header, print_line, print_outcome, writing_watched
     from commands.terminal import TextConsole
     from pipeline.run_folder import INTERRUPTED
     from pipeline.run_lock import at_work_on, check_left
@@ -112,9 +111,12 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
             lock.enter_context(at_work_on(run, partial(print_line, console)))
         if is_finished(run):
             return _nothing_to_do(args, run, console)
-        training, outcome = _carried_out(args, run, spec, console)
-        print_outcome(console, spec, outcome)
-        write_watched(console, training)
+        training = _prepared(args, run, spec, console)
+        from pipeline.training import carry_out
+
+        with writing_watched(console, training):
+            outcome = carry_out(training)
+            print_outcome(console, spec, outcome)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 
@@ -125,10 +127,8 @@ def _nothing_to_do(args: argparse.Namespace, run: Run, console: Console) -> int:
     return 0
 
 
-def _carried_out(
-    args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console
-) -> tuple[Training, Outcome]:
-    """The run and what comes out of it, from its newest state on."""
+def _prepared(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Console) -> Training:
+    """The run, to be carried out from its newest state on."""
     from commands.run_output import print_line
     from pipeline.library_loading import loading_libraries
     from pipeline.resuming.state_keeping import StateKeeping
@@ -137,7 +137,7 @@ def _carried_out(
     say = partial(print_line, console)
     with doing(console, "loading the libraries") as activity, loading_libraries():
         with current().waiting(0.0):
-            from pipeline.training import carry_out, prepare
+            from pipeline.training import prepare
 
             activity.now("making the environments and the agent")
             tell_changes(run, spec, say)
@@ -146,5 +146,4 @@ def _carried_out(
             say("no state was saved: the run begins again")
         else:
             say(f"continuing from step {keeping.state.note['steps']:,}")
-        training = prepare(spec, console, {}, command_line(), run, keeping)
-    return training, carry_out(training)
+        return prepare(spec, console, {}, command_line(), run, keeping)

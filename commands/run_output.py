@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -185,10 +185,24 @@ def _brief(value: object) -> str:
     return text if len(text) <= _LONGEST_SETTING else f"{text[:_LONGEST_SETTING]}..."
 
 
-def write_watched(console: Console, training: Training) -> None:
-    """Write the page that plays the training, where one was asked for, and say so."""
+@contextmanager
+def writing_watched(console: Console, training: Training) -> Iterator[None]:
+    """Write the page that plays the training afterwards, where one was asked for.
+
+    One that fails is shown as far as it came: how a table diverges is worth a look.
+    """
+    try:
+        yield
+    except UserError:
+        with suppress(UserError, OSError):
+            _write_watched(console, training)
+        raise
+    _write_watched(console, training)
+
+
+def _write_watched(console: Console, training: Training) -> None:
     path = training.spec.watch_learning
-    if training.watch is None or path is None:
+    if training.watch is None or path is None or not training.watch.has_begun:
         return
     from pipeline.signs_of_life import doing
     from report.learning_page import write_learning_page

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from experiments.analysis import StudyAnalysis
+    from report.page.sections import LearningPage
 
 
 def run_study(
@@ -53,7 +54,9 @@ def run_study(
     early = EarlyResults(study)
     failures = do_missing(console, planned, root, place, early)
     results = read(console, study, planned, root, early)
-    return conclude(console, results, failures, command, with_page=with_page)
+    return conclude(
+        console, results, failures, command, with_page=with_page, n_workers=place.n_workers
+    )
 
 
 def read(
@@ -76,6 +79,7 @@ def conclude(
     *,
     with_page: bool,
     looks: Mapping[str, Standing] | None = None,
+    n_workers: int = 1,
 ) -> int:
     """Print the judgement, write tables, figures and page, and say which runs are missing and why.
 
@@ -86,6 +90,7 @@ def conclude(
         command: the command that asked for it.
         with_page: draw the figures and write the page, beside the tables.
         looks: by environment, the look that has been taken; None for one that is taken now.
+        n_workers: processes at once that train again what the page is to play.
 
     Returns:
         The exit code, as of `run_study`.
@@ -93,7 +98,7 @@ def conclude(
     planned = results.planned
     try:
         if len(results.summary):
-            _judge(console, results, command, looks, with_page=with_page)
+            _judge(console, results, command, looks, n_workers, with_page=with_page)
             _print_mixed_versions(console, results)
     finally:
         for failure in failures:
@@ -199,6 +204,7 @@ def _judge(
     results: StudyResults,
     command: str,
     looks: Mapping[str, Standing] | None,
+    n_workers: int,
     *,
     with_page: bool,
 ) -> None:
@@ -221,12 +227,16 @@ def _judge(
         if results.study.render_every:
             files += _films(results, activity)
         if with_page:
-            files += _draw(analysis, blocks, command, activity)
+            files += _draw(analysis, blocks, command, activity, n_workers)
     _print_files(console, results.root, files)
 
 
 def _draw(
-    analysis: StudyAnalysis, blocks: pd.DataFrame | None, command: str, activity: Activity
+    analysis: StudyAnalysis,
+    blocks: pd.DataFrame | None,
+    command: str,
+    activity: Activity,
+    n_workers: int,
 ) -> list[Path]:
     """Figures and the page; the files."""
     activity.now("working out the curves")
@@ -238,9 +248,16 @@ def _draw(
     series = study_series(analysis, activity.at)
     activity.now("drawing the figures")
     files = write_figures(series, blocks, activity.at)
+    learning: list[LearningPage] = []
+    if analysis.study.learning_pages:
+        activity.now("watching")
+        from report.learning_page.first_runs import write_first_pages
+
+        learning = write_first_pages(analysis, n_workers, activity.at)
     activity.now("writing the page")
-    write_report(series, page, command, activity.at)
-    return [*files, page]
+    write_report(series, page, command, activity.at, learning)
+    pages = [analysis.results.root / one.place for one in learning if one.place]
+    return [*files, *pages, page]
 
 
 def _films(results: StudyResults, activity: Activity) -> list[Path]:

@@ -51,6 +51,8 @@ def _check_output(args: argparse.Namespace) -> None:
     for flag in ("quick", "replace"):
         if args.until_decided and getattr(args, "is_quick" if flag == "quick" else flag):
             raise UserError(f"--until-decided and --{flag} do not go together: give one of them")
+    if args.learning_pages and args.no_report:
+        raise UserError("--watch-learning is a section of the page: leave out --no-report")
     if args.metric is not None and args.metric not in METRICS:
         raise unknown("--metric: unknown metric", args.metric, METRICS)
     check_tensorboard(args.tensorboard)

@@ -59,7 +59,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         print_outcome,
         print_refusal,
         telling_what_is_kept,
-        write_watched,
+        writing_watched,
     )
     from commands.terminal import TextConsole
     from pipeline.signs_of_life import doing
@@ -84,10 +84,10 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         with (
             at_work_on(training.run, partial(print_line, console)),
             telling_what_is_kept(training.run),
+            writing_watched(console, training),
         ):
             outcome = carry_out(training)
-        print_outcome(console, spec, outcome)
-        write_watched(console, training)
+            print_outcome(console, spec, outcome)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 

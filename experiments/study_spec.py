@@ -134,6 +134,8 @@ class StudySpec:
         user_modules: the same, as another process can import them.
         tensorboard: whether each run writes a TensorBoard log.
         render_every: episodes between two that are filmed; 0 for no films.
+        learning_pages: whether the page links to others that play the first training of each
+            agent.
         run_timeout: seconds that each run may take; None for no limit.
         run_memory: bytes of memory that each run may take; None for no limit.
         source: the file that it was read from, or None.
@@ -157,6 +159,7 @@ class StudySpec:
     user_modules: tuple[UserModule, ...] = ()
     tensorboard: bool = False
     render_every: int = 0
+    learning_pages: bool = False
     run_timeout: float | None = None
     run_memory: int | None = None
     source: Path | None = None

@@ -64,8 +64,7 @@ from pipeline.training_callbacks import (
     named_callbacks,
     pull_recorder,
 )
-from pipeline.watching.map_recorder import MapRecorder
-from pipeline.watching.table_recorder import TableRecorder
+from pipeline.watching.map_recorder import EvaluationMaps
 from pipeline.watching.watch_choice import Watch, watch_of
 from pipeline.worker_processes import close_environments, end_workers_after_stop
 
@@ -173,8 +172,8 @@ def set_up(
     # training goes back from.
     first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
     watch = _watch(spec, model, exact, evaluation)
-    steps = watch if isinstance(watch, TableRecorder) else None
-    others = [*filter(None, [pulls, steps]), evaluation]
+    told_steps = None if isinstance(watch, EvaluationMaps) else watch
+    others = [*filter(None, [pulls, told_steps]), evaluation]
     saver.root = all_callbacks(spec, [*first, *others], display)
     refusal = None if evaluation.value_maps is not None else model_refusal(spec)
     return Training(
@@ -202,7 +201,7 @@ def _watch(
 ) -> Watch | None:
     """What keeps how the agent learns; one that looks at evaluations is told of them from now."""
     watch = watch_of(spec, model, exact)
-    if isinstance(watch, MapRecorder):
+    if isinstance(watch, EvaluationMaps):
         evaluation.callback = watch
     return watch
 

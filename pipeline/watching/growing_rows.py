@@ -45,3 +45,9 @@ class GrowingRows:
             self._rows = larger
         self._rows[self._n : end] = records
         self._n = end
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Forget all records but the chosen ones; bool of shape (n,)."""
+        kept = self.rows[chosen]
+        self._rows[: len(kept)] = kept
+        self._n = len(kept)

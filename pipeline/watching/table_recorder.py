@@ -16,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from agents.common.callback_horizons import BlockCallback, Horizon
 from agents.common.online import true_outcome
-from mdp.array_types import Floats
+from mdp.array_types import Floats, Ints
 from pipeline.watching.growing_rows import GrowingRows
 
 # All that a page of three megabytes can hold, and what it holds where nobody says how much.
@@ -94,6 +94,11 @@ class TableRecorder(BlockCallback):
         self._returns = np.zeros(0)
         self._episodes = np.zeros(0, dtype=np.int64)
 
+    @property
+    def has_begun(self) -> bool:
+        """Whether there is anything to show."""
+        return len(self.steps) > 0
+
     def horizon(self) -> Horizon:
         """After each step, as long as steps are kept."""
         return Horizon() if self.is_full else Horizon(calls=1)
@@ -148,15 +153,18 @@ class TableRecorder(BlockCallback):
             before = self._tables[number]
             moved = np.flatnonzero(before != now)
             if len(moved):
-                self._note_changes(number, moved, now)
+                self._note_changes(number, moved, before, now)
         self._look_whether_full()
 
-    def _note_changes(self, number: int, moved: Any, now: Floats) -> None:
+    def _note_changes(self, number: int, moved: Ints, before: Floats, now: Floats) -> None:
+        # What was nan and is so still differs from itself.
+        stays = np.isnan(before.reshape(-1)[moved]) & np.isnan(now.reshape(-1)[moved])
+        moved = moved[~stays]
         changes = np.zeros(len(moved), dtype=CHANGE)
         changes["step"], changes["table"] = len(self.steps) - 1, number
         changes["entry"], changes["after"] = moved, now.reshape(-1)[moved]
         self.changes.extend(changes)
-        self._tables[number].reshape(-1)[moved] = changes["after"]
+        before.reshape(-1)[moved] = changes["after"]
 
     def _look_whether_full(self) -> None:
         if self.n_episodes and self._episodes.sum() >= self.n_episodes:

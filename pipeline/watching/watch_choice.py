@@ -9,7 +9,13 @@ from pipeline.errors import UserError
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.value_maps import best_actions_of
 from pipeline.train_spec import TrainSpec
-from pipeline.watching.map_recorder import MapRecorder, can_be_mapped
+from pipeline.watching.map_recorder import (
+    EvaluationMaps,
+    MapRecorder,
+    UpdateMaps,
+    can_be_mapped,
+    tells_updates,
+)
 from pipeline.watching.table_recorder import MOST_ENTRIES, TableRecorder, tables_of
 
 Watch = TableRecorder | MapRecorder
@@ -43,7 +49,7 @@ def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None
         )
     if spec.watch_episodes:
         raise UserError(
-            f"--watch-episodes is for agents with tables: {spec.algo} is shown at each evaluation "
-            "(--eval-freq)"
+            f"--watch-episodes is for agents with tables: {spec.algo} is shown at each "
+            f"{'update' if tells_updates(agent) else 'evaluation'}"
         )
-    return MapRecorder(exact)
+    return UpdateMaps(exact) if tells_updates(agent) else EvaluationMaps(exact)

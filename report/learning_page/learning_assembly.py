@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -13,7 +15,8 @@ from pipeline.files import write_text
 from pipeline.train_spec import TrainSpec
 from pipeline.watching.map_recorder import MapRecorder
 from pipeline.watching.table_recorder import TableRecorder
-from report.learning_page.learning_data import exact_json, maps_data, steps_data
+from report.learning_page.learning_data import exact_json, maps_data, place_data, steps_data
+from report.learning_page.learning_words import NO_WORDS, page_words
 from report.page.markup import inline_script, package_file, packed, script_hash, templates
 
 MOST_BYTES = 2_900_000
@@ -22,42 +25,67 @@ SCRIPTS = (
     "learning_board.js",
     "learning_readout.js",
     "learning_curves.js",
+    "learning_steps.js",
+    "learning_maps.js",
     "learning_player.js",
 )
 
 
-def write_learning_page(spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path) -> None:
+def write_learning_page(
+    spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path, title: str = ""
+) -> str:
     """Write the page of a training.
 
     Args:
         spec: of the training.
         recorder: what was kept of it.
         path: the file, which is replaced.
+        title: what the training is called; by default the names of agent and environment.
+
+    Returns:
+        What it shows, in words.
     """
+    place = place_data(spec, recorder)
+    title = title or f"{spec.algo} on {spec.env_id}"
+    for data in _ever_less(recorder):
+        words = page_words(spec, data)
+        text = _render({"title": title, "seed": spec.seed, **words}, {**data, **place})
+        if len(text.encode()) <= MOST_BYTES:
+            break
+    write_text(path, text)
+    return f"{words['kind']}, {words['extent']}"
+
+
+def page_version() -> str:
+    """A digest of all that a page is made of but the data."""
+    return sha256(_render({"title": "", "seed": 0, **NO_WORDS}, {}).encode()).hexdigest()
+
+
+def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]]:
+    """What was kept, then three quarters or half of that, and so on as long as there is any."""
     if isinstance(recorder, MapRecorder):
-        recorder.record()  # as the agent is at the end, where that was not evaluated
-        write_text(path, _render(spec, maps_data(spec, recorder)))
+        recorder.finish()
+        stride = recorder.stride
+        while stride < 2 * max(recorder.n_units, recorder.stride):
+            yield maps_data(recorder, stride)
+            stride *= 2
         return
     n_steps = len(recorder.steps)
-    text = _render(spec, steps_data(spec, recorder, n_steps))
-    while len(text) > MOST_BYTES and n_steps > 1:
+    while n_steps:
+        yield steps_data(recorder, n_steps)
         n_steps = n_steps * 3 // 4
-        text = _render(spec, steps_data(spec, recorder, n_steps))
-    write_text(path, text)
 
 
-def _render(spec: TrainSpec, data: dict[str, Any]) -> str:
+def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     early = package_file("templates/theme.js")
     own = "\n".join(_file(name) for name in SCRIPTS)
     style = "\n".join([package_file("templates/page.css"), _file("learning.css")])
     environment = templates()
-    environment.loader = ChoiceLoader([PackageLoader("report.learning_page")])
+    environment.loader = ChoiceLoader(
+        [PackageLoader("report.learning_page"), PackageLoader("report.page")]
+    )
     return environment.get_template("learning.html").render(
-        title=f"{spec.algo} on {spec.env_id}",
-        seed=spec.seed,
-        is_steps=data["kind"] == "steps",
-        is_cut=data.get("is_cut", False),
-        n_episodes=spec.watch_episodes,
+        **words,
         data=packed(exact_json(data)),
         style=Markup(style),  # noqa: S704  # our own
         early=inline_script(early),

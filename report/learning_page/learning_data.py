@@ -18,60 +18,71 @@ from mdp.array_types import Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.value_maps import MAX_STATES
 from pipeline.train_spec import TrainSpec
-from pipeline.watching.map_recorder import MapRecorder
+from pipeline.watching.map_recorder import LOGGED, MapRecorder
 from pipeline.watching.table_recorder import TableRecorder
 
-MOST_FIGURES = 200_000  # of all maps together
 
-
-def steps_data(spec: TrainSpec, recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
+def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
     """The first steps of an agent that learns in tables.
 
     Args:
-        spec: of the training.
         recorder: what was kept of it.
         most_steps: how many of them.
     """
-    n = min(most_steps, len(recorder.steps))
+    steps = recorder.steps.rows[:most_steps]
+    n = len(steps)
     moves, changes = recorder.moves.rows, recorder.changes.rows
-    data = {
+    return {
         "kind": "steps",
         "tables": [_table(name, recorder.initial[name]) for name in recorder.names],
-        "steps": _columns(recorder.steps.rows[:n]),
+        "steps": _columns(steps),
         "moves": _columns(moves[moves["step"] < n]),
         "changes": _columns(changes[changes["step"] < n]),
         "is_cut": recorder.is_cut or n < len(recorder.steps),
+        "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
     }
-    shape = recorder.initial[recorder.names[0]].shape if recorder.has_actions else (0, 0)
-    return {**data, **_place(spec, (shape[-2], shape[-1]))}
 
 
-def maps_data(spec: TrainSpec, recorder: MapRecorder) -> dict[str, Any]:
-    """What an agent did in every state at each evaluation, and what each state was worth then."""
-    evaluator = recorder.evaluator
-    most = max(MOST_FIGURES // (2 * evaluator.model.n_states), 2)
-    kept = np.unique(np.linspace(0, len(recorder.moments) - 1, most).round().astype(np.int64))
-    moments = [recorder.moments[index] for index in kept]
-    shape = (evaluator.model.n_states, evaluator.model.n_actions)
+def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
+    """What an agent did in every state as it learnt, and what each state was worth then.
+
+    Args:
+        recorder: what was kept of it.
+        stride: of how many updates or evaluations one is shown, and the last in any case.
+    """
+    evaluator, rows = recorder.evaluator, recorder.moments.rows
+    is_shown = rows["number"] % stride == 0
+    is_shown[-1] = True
+    shown = rows[is_shown]
+    optimal = evaluator.optimum[0][evaluator.model.reachable]
     return {
         "kind": "maps",
-        "moments": [
-            {
-                "timesteps": timesteps,
-                "exploration": rate,
-                "return": float(evaluator.model.initial @ values),
-                "values": np.where(evaluator.model.reachable, values, np.nan),
-                "actions": actions,
-            }
-            for timesteps, rate, values, actions in moments
-        ],
+        "unit": recorder.unit,
+        "n_units": recorder.n_units,
+        "stride": stride,
+        "moments": {
+            **_columns(shown),
+            "values": np.where(evaluator.model.reachable, shown["values"], np.nan),
+            "return": shown["values"] @ evaluator.model.initial,
+        },
+        "logged": LOGGED,
         "optimum": evaluator.yardstick.optimum,
-        **_place(spec, shape, evaluator.layout),
+        "optimal_range": [optimal.min(), optimal.max()],
     }
+
+
+def place_data(spec: TrainSpec, recorder: TableRecorder | MapRecorder) -> dict[str, Any]:
+    """Where states lie, and what actions are called."""
+    if isinstance(recorder, MapRecorder):
+        evaluator = recorder.evaluator
+        return _place(spec, (evaluator.model.n_states, evaluator.model.n_actions), evaluator.layout)
+    has_rows = recorder.has_actions
+    shape = recorder.initial[recorder.names[0]].shape if has_rows else (0, 0)
+    return _place(spec, (shape[-2], shape[-1]))
 
 
 def exact_json(value: Any) -> str:
-    """The value as JSON, every number to its last digit, and null for what is not finite."""
+    """The value as JSON: every number to its last digit, null for nan, and infinity as a word."""
     return json.dumps(_plain(value), separators=(",", ":"), allow_nan=False)
 
 
@@ -79,8 +90,10 @@ def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, float):
-        if not math.isfinite(value):
+        if math.isnan(value):
             return None
+        if math.isinf(value):
+            return "Infinity" if value > 0 else "-Infinity"
         return int(value) if value.is_integer() and abs(value) < 2**53 else value
     if isinstance(value, dict):
         return {str(key): _plain(item) for key, item in value.items()}
@@ -103,7 +116,6 @@ def _table(name: str, values: Floats) -> dict[str, Any]:
 def _place(
     spec: TrainSpec, shape: tuple[int, int], layout: GridLayout | None = None
 ) -> dict[str, Any]:
-    """Where states lie, and what actions are called."""
     n_states, n_actions = shape
     env = make_single_env(spec, training=True)
     try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from markupsafe import Markup
@@ -20,9 +20,10 @@ from report.page import (
     ranking_section,
     settings_section,
     verdict_section,
+    watching_section,
 )
 from report.page.markup import SHARED, as_json, frame, packed, template_file, templates
-from report.page.sections import Report, Section
+from report.page.sections import LearningPage, Report, Section
 from report.series.study_series import StudySeries
 
 # A new kind of section is a module with such a function, named here.
@@ -36,11 +37,18 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
     overall_section.section,
     policy_section.section,
     film_section.section,
+    watching_section.section,
     settings_section.section,
 )
 
 
-def write_report(series: StudySeries, path: Path, command: str, tell: Tell = tell_nobody) -> None:
+def write_report(
+    series: StudySeries,
+    path: Path,
+    command: str,
+    tell: Tell = tell_nobody,
+    learning: Sequence[LearningPage] = (),
+) -> None:
     """Write the page of a study, one file that needs nothing else and no network.
 
     Args:
@@ -48,8 +56,9 @@ def write_report(series: StudySeries, path: Path, command: str, tell: Tell = tel
         path: the file, which is replaced.
         command: the command that reproduces the study.
         tell: told how far the writing is.
+        learning: the pages that play trainings, where they were asked for.
     """
-    report = Report(series, command, tell)
+    report = Report(series, command, tell, learning)
     sections = []
     for place, make in enumerate(SECTIONS, start=1):
         tell(f"section {place} of {len(SECTIONS)}")

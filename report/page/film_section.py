@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from experiments.analysis import StudyAnalysis
 from experiments.planned_runs import PlannedRun
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError
@@ -23,7 +22,7 @@ from pipeline.models.model_choice import model_of_run
 from pipeline.models.model_loading import load_model
 from pipeline.playing import playing_env
 from report.page.markup import data_uri
-from report.page.sections import Report, Section
+from report.page.sections import Report, Section, first_runs
 from report.wording import number
 from safe_files.regular_files import read_file
 
@@ -60,7 +59,7 @@ def section(report: Report) -> Section | None:
     groups: list[list[Film]] = []
     contents: dict[bytes, int] = {}  # and their places on the page
     without_room: list[list[str]] = []
-    runs_to_film = _runs_to_film(report.analysis)
+    runs_to_film = first_runs(report.analysis)
     for n_done, runs in enumerate(runs_to_film, start=1):
         groups.append([])
         without_room.append([])
@@ -82,26 +81,6 @@ def section(report: Report) -> Section | None:
     data = [data_uri("image/gif", content) for content in contents]
     context = {"films": groups, "without_room": without_room}
     return Section("films", "Episodes", context, data, by_environment=True)
-
-
-def _runs_to_film(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
-    """The first run of each agent that has finished, for each environment.
-
-    A batch leaves no agent.
-    """
-    first: dict[tuple[str, str], PlannedRun] = {}
-    for run in analysis.results.finished:
-        is_new = (run.agent, run.environment) not in first
-        if is_new and not run.is_batch:
-            first[run.agent, run.environment] = run
-    return [
-        [
-            first[agent.agent, environment.environment]
-            for agent in environment.agents
-            if (agent.agent, environment.environment) in first
-        ]
-        for environment in analysis.environments
-    ]
 
 
 def film_of(planned: PlannedRun) -> Path | None:

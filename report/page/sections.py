@@ -5,11 +5,39 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+from urllib.parse import quote
 
 from experiments.analysis import StudyAnalysis
+from experiments.planned_runs import PlannedRun
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.series.study_series import StudySeries
 from verdicts import Estimate
+
+
+@dataclass(frozen=True)
+class LearningPage:
+    """The page that plays the first training of an agent.
+
+    Attributes:
+        agent: its label.
+        environment: that of the environment.
+        seed: of the training.
+        place: the file, seen from the folder of the study; empty where there is none.
+        words: what it shows, or why there is none.
+        size: of the file, in bytes.
+    """
+
+    agent: str
+    environment: str
+    seed: int
+    place: str
+    words: str
+    size: int = 0
+
+    @property
+    def link(self) -> str:
+        """The place as an address."""
+        return quote(self.place)
 
 
 @dataclass(frozen=True)
@@ -20,11 +48,13 @@ class Report:
         series: the numbers that its figures show.
         command: the command that reproduces the study.
         tell: told how far the slow parts are.
+        learning: the pages that play trainings, where they were asked for.
     """
 
     series: StudySeries
     command: str
     tell: Tell = tell_nobody
+    learning: Sequence[LearningPage] = ()
 
     @property
     def analysis(self) -> StudyAnalysis:
@@ -53,6 +83,26 @@ class Section:
     data: Any = None
     places: Sequence[Any] = ()
     by_environment: bool = False
+
+
+def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
+    """The first run of each agent that has finished, for each environment.
+
+    A batch leaves no agent.
+    """
+    first: dict[tuple[str, str], PlannedRun] = {}
+    for run in analysis.results.finished:
+        is_new = (run.agent, run.environment) not in first
+        if is_new and not run.is_batch:
+            first[run.agent, run.environment] = run
+    return [
+        [
+            first[agent.agent, environment.environment]
+            for agent in environment.agents
+            if (agent.agent, environment.environment) in first
+        ]
+        for environment in analysis.environments
+    ]
 
 
 def estimate_data(estimate: Estimate) -> dict[str, float]:

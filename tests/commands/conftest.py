@@ -5,16 +5,35 @@ from pathlib import Path
 
 import pytest
 
+import enjoy
 import train
+from commands import pack_run
+from commands.parsing import run_command
 from pipeline.signs_of_life import Silence
 
 ROOT = Path(train.__file__).parent
+COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main, "pack": pack_run.main}
 
 
 @pytest.fixture(autouse=True)
 def nothing_takes_long(monkeypatch):
     """However slow the machine is, no command says that it is still loading."""
     monkeypatch.setattr(Silence.__init__, "__defaults__", (1e9,))
+
+
+@pytest.fixture
+def type_command(monkeypatch, capsys, tmp_path):
+    """Run a command line in this process, inside an empty folder: exit code, output, errors."""
+    monkeypatch.chdir(tmp_path)
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
+        with pytest.raises(SystemExit) as stop:
+            run_command(COMMANDS[words[0]])
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
 
 
 @pytest.fixture

@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 import yaml
 
-import enjoy
 import train
-from commands.parsing import run_command
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
@@ -27,22 +25,6 @@ from pipeline.settings import hyperparam_entries
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
-COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main}
-
-
-@pytest.fixture
-def type_command(monkeypatch, capsys, tmp_path):
-    """Run a command line in this process, inside an empty folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-        with pytest.raises(SystemExit) as stop:
-            run_command(COMMANDS[words[0]])
-        captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
-
-    return run
 
 
 def contents(folder):

@@ -284,6 +284,25 @@ def test_a_run_that_fails_does_not_stop_the_others(type_command, folder):
     assert not (study / ".drafts").exists()
 
 
+def test_the_first_training_is_played_of_a_users_own_environment(type_command, folder, monkeypatch):
+    monkeypatch.setattr("report.figures.figure_files.write_figures", lambda *_: [])
+    monkeypatch.setattr("report.page.film_section.film_of", lambda _: None)
+    words = ["--env", "Fragile-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
+    words += ["--seeds", 1, "-n", 300, "-j", 1, "-f", "studies"]
+    code, out, err = type_command(*words, "--watch-learning")
+    assert (code, err) == (0, "")
+    study, place = (
+        folder / "studies" / "Fragile-v0_qlearning",
+        "learning/qlearning/Fragile-v0_1.html",
+    )
+    assert place in out.split()
+    assert "300 steps" in (study / place).read_text(encoding="utf-8")
+    assert f'href="{place}"' in (study / "report.html").read_text(encoding="utf-8")
+    code, out, err = type_command(*words, "--watch-learning", "--no-report")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "leave out --no-report" in err
+
+
 def test_a_killed_worker_costs_nothing(type_command, folder):
     words = ["--env", "Killed-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
     code, out, err = type_command(*words, "--seeds", 3, "-n", 500, "--no-report", "-f", "studies")

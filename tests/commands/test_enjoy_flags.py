@@ -3,36 +3,16 @@
 import re
 import shlex
 import shutil
-import sys
 from collections import Counter
 
 import pytest
 
-import enjoy
-import train
-from commands.parsing import run_command
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import Run
 
-COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main}
 LAKE = ["--algo", "random", "--env", "FrozenLake-v1"]
 QUICK = ["train.py", "--seed", "0", "-n", "100", "--eval-freq", "-1", "--verbose", "1"]
-
-
-@pytest.fixture
-def type_command(monkeypatch, capsys, tmp_path):
-    """Run a command line in this process, inside an empty folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-        with pytest.raises(SystemExit) as stop:
-            run_command(COMMANDS[words[0]])
-        captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
-
-    return run
 
 
 def watch_line(out):

@@ -1,30 +1,6 @@
 """``yardstick pack`` as a user types it, and ``enjoy.py`` with what it makes."""
 
-import sys
-
 import pytest
-
-import enjoy
-import train
-from commands import pack_run
-from commands.parsing import run_command
-
-COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main, "pack": pack_run.main}
-
-
-@pytest.fixture
-def type_command(monkeypatch, capsys, tmp_path):
-    """Run a command line in this process, inside an empty folder."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", [str(word) for word in words])
-        with pytest.raises(SystemExit) as stop:
-            run_command(COMMANDS[words[0]])
-        captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture

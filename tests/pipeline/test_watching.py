@@ -12,11 +12,12 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
+from agents.common.callback_horizons import BlockCallback
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
-from pipeline.watching import table_recorder, watch_choice
+from pipeline.watching import map_recorder, table_recorder, watch_choice
 from pipeline.watching.table_recorder import (
     NO_STATE,
     TERMINATED,
@@ -29,10 +30,13 @@ LAKE = "FrozenLake-v1"
 
 
 class Corridor(gym.Env):
-    """Three cells and one action, forward: the rewards are 1 and 2, the last cell is the end."""
+    """Cells in a row and one action, forward; each step has its reward; the last one is the end."""
 
-    observation_space = gym.spaces.Discrete(3)
     action_space = gym.spaces.Discrete(1)
+
+    def __init__(self, rewards=(1.0, 2.0)):
+        self.rewards = rewards
+        self.observation_space = gym.spaces.Discrete(len(rewards) + 1)
 
     def reset(self, **options):
         super().reset(**options)
@@ -41,7 +45,11 @@ class Corridor(gym.Env):
 
     def step(self, action):
         self.cell += 1
-        return self.cell, float(self.cell), self.cell == 2, False, {}
+        reward = self.rewards[self.cell - 1]
+        return self.cell, reward, self.cell == len(self.rewards), False, {}
+
+
+THREE_ONES = Corridor(rewards=(1.0, 1.0, 1.0))
 
 
 def spec_of(env_id=LAKE, algo="qlearning", n_timesteps=300, settings=(), **fields):
@@ -144,26 +152,10 @@ def test_an_episode_that_is_cut_off_still_bootstraps():
     assert 0.5 in cut["target"]
 
 
-class Line(gym.Env):
-    """Four cells in a row and one action, forward; each step earns 1, and the last cell ends it."""
-
-    observation_space = gym.spaces.Discrete(4)
-    action_space = gym.spaces.Discrete(1)
-
-    def reset(self, **options):
-        super().reset(**options)
-        self.cell = 0
-        return 0, {}
-
-    def step(self, action):
-        self.cell += 1
-        return self.cell, 1.0, self.cell == 3, False, {}
-
-
 def test_along_traces_several_entries_move_by_one_error():
     """Step size 1/2, discount 1, lambda 1/2: errors 1, 1, 1; traces 1, then 1/2 and 1, ..."""
     halves = {"learning_rate": 0.5, "gamma": 1.0, "trace_decay": 0.5}
-    _, recorder = watched(Line(), "sarsa_lambda", n_timesteps=3, **halves)
+    _, recorder = watched(THREE_ONES, "sarsa_lambda", n_timesteps=3, **halves)
     moves, changes = recorder.moves.rows, recorder.changes.rows
     assert (moves["target"].tolist(), moves["td_error"].tolist()) == ([1.0] * 3, [1.0] * 3)
     assert changes["step"].tolist() == [0, 1, 1, 2, 2, 2]
@@ -174,7 +166,7 @@ def test_along_traces_several_entries_move_by_one_error():
 def test_of_several_steps_the_target_is_told_where_there_is_one():
     """Two rewards of 1 make a target of 2; at the end two entries are moved, to 2 and to 1."""
     _, recorder = watched(
-        Line(), "n_step_sarsa", n_timesteps=3, n_steps=2, learning_rate=0.5, gamma=1
+        THREE_ONES, "n_step_sarsa", n_timesteps=3, n_steps=2, learning_rate=0.5, gamma=1
     )
     moves, changes = recorder.moves.rows, recorder.changes.rows
     assert np.array_equal(moves["target"], [np.nan, 2.0, np.nan], equal_nan=True)
@@ -185,11 +177,23 @@ def test_of_several_steps_the_target_is_told_where_there_is_one():
 
 
 def test_whole_episodes_move_at_their_end():
-    _, recorder = watched(Line(), "monte_carlo", n_timesteps=6, learning_rate=0.5, gamma=1.0)
+    _, recorder = watched(THREE_ONES, "monte_carlo", n_timesteps=6, learning_rate=0.5, gamma=1.0)
     changes = recorder.changes.rows
     assert changes["step"].tolist() == [2, 2, 2, 5, 5, 5]
     assert changes["after"].tolist() == [1.5, 1.0, 0.5, 2.25, 1.5, 0.75]
     assert np.isnan(recorder.moves.rows["target"]).all()
+
+
+def test_a_table_that_diverges_is_kept_to_the_last_bit_and_nan_moves_once():
+    huge = {"learning_rate": 1e200, "gamma": 1.0, "initial_q": -1e200}
+    with np.errstate(all="ignore"):
+        agent, recorder = watched(Corridor(), n_timesteps=40, **huge)
+    table = recorder.initial["q_tables"].reshape(-1).copy()
+    changes = recorder.changes.rows
+    table[changes["entry"]] = changes["after"]
+    assert table.tobytes() == agent.policy.q_table.tobytes()
+    assert np.isnan(changes["after"]).sum() == np.isnan(table).sum() > 0
+    assert np.isinf(changes["after"]).any()
 
 
 def test_there_is_an_end_to_what_is_kept(monkeypatch):
@@ -239,18 +243,28 @@ def done(spec):
     return training, carry_out(training)
 
 
+SMALL_PPO = {"n_steps": 32, "batch_size": 32}
+SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradient_steps": 2}
+
+
 @pytest.mark.parametrize(
     ("algo", "settings"),
     [
         ("qlearning", {}),
-        ("dqn", {"learning_starts": 50, "buffer_size": 200}),
-        ("ppo", {"n_steps": 32, "batch_size": 32, "engine": "compiled"}),
+        ("dqn", SMALL_DQN),
+        ("dqn", {**SMALL_DQN, "engine": "compiled"}),
+        ("dqn", {**SMALL_DQN, "engine": "compiled", "train_freq": [2, "episode"]}),
+        ("double_dqn", {**SMALL_DQN, "engine": "compiled", "n_envs": 2}),
+        ("ppo", SMALL_PPO),
+        ("ppo", {**SMALL_PPO, "engine": "compiled", "n_envs": 2}),
+        ("a2c", {"engine": "compiled"}),
     ],
 )
 def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     spec = spec_of(algo=algo, settings=settings, log_folder=tmp_path)
     alone = train(spec, Console(quiet=True), {}, "")
     training, outcome = done(replace(spec, watch_learning=tmp_path / "page.html"))
+    assert outcome.engine == alone.engine
     one, other = (
         load_algorithm(algo).load(run.run.model_path).policy.state_dict()
         for run in (alone, outcome)
@@ -258,16 +272,82 @@ def test_a_run_that_is_watched_leaves_the_same_agent(tmp_path, algo, settings):
     assert all(one[name].numpy().tobytes() == other[name].numpy().tobytes() for name in one)
     one, other = (episodes_of(run.run.path) for run in (alone, outcome))
     assert one == other
+    one, other = (np.load(run.run.evaluations_path) for run in (alone, outcome))
+    assert one["results"].tobytes() == other["results"].tobytes()
     if algo == "qlearning":
         assert len(training.watch.steps) == 300
         return
-    steps = [moment[0] for moment in training.watch.moments]
+    assert len(training.watch.moments) > 4
+
+
+class Updates(BlockCallback):
+    """Where the library's agents have learnt something: their count, steps and loss as logged."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def _on_rollout_start(self):
+        log = self.model.logger.name_to_value
+        if self.model._n_updates and (not self.seen or self.model._n_updates != self.seen[-1][0]):
+            loss = log.get("train/loss", np.nan)
+            self.seen.append((self.model._n_updates, self.model.num_timesteps, loss))
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("engine", ["library", "compiled"])
+@pytest.mark.parametrize(
+    ("algo", "settings", "steps"),
+    [("ppo", SMALL_PPO, range(0, 321, 32)), ("dqn", SMALL_DQN, [0, *range(56, 305, 8)])],
+)
+def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, steps, engine):
+    settings = {**settings, "engine": engine}
+    spec = spec_of(algo=algo, settings=settings, log_folder=tmp_path)
+    spec = replace(spec, watch_learning=tmp_path / "page.html")
+    training = prepare(spec, Console(quiet=True), {}, "")
+    heard = Updates()
+    training.callback.callbacks.append(heard)
+    outcome = carry_out(training)
+    training.watch.finish()
+    rows = training.watch.moments.rows
+    assert (rows["timesteps"].tolist(), training.watch.n_units) == ([*steps], len(steps) - 1)
+    assert rows["number"].tolist() == [*range(len(steps))]
+    # The last one is learnt after the last rollout.
+    assert heard.seen[-1][1] == rows["timesteps"][-2]
+    assert rows["loss"][1:-1].tolist() == [loss for _, _, loss in heard.seen]
+    assert rows["loss"][-1] == training.model.logger.name_to_value["train/loss"]
+    assert np.isnan(rows["value_loss"][1:]).any() == (algo == "dqn")
+    assert np.isnan(rows[0]["loss"])
+    # What the start is worth at the end is the return that was computed of the final agent.
+    at_start = rows["values"] @ training.watch.evaluator.model.initial
+    assert at_start[-1] == pytest.approx(outcome.final.mean_return, abs=1e-12)
+    assert rows["exploration"][0] == (1.0 if algo == "dqn" else pytest.approx(np.nan, nan_ok=True))
+    lengths = [float(row[0]) for row in episodes_of(outcome.run.path)]
+    assert rows["training_return"][-1] == pytest.approx(np.mean(lengths[-100:]))
+
+
+def test_of_many_maps_every_second_is_kept(tmp_path, monkeypatch):
+    monkeypatch.setattr(map_recorder, "MOST_MAPS", 4)
+    spec = spec_of(algo="ppo", settings=SMALL_PPO, log_folder=tmp_path)
+    training, _ = done(replace(spec, watch_learning=tmp_path / "page.html"))
+    training.watch.finish()
+    training.watch.finish()
+    rows = training.watch.moments.rows
+    # Ten updates; the last one is kept though it is none of every fourth.
+    assert rows["number"].tolist() == [0, 4, 8, 10]
+    assert rows["timesteps"].tolist() == [0, 128, 256, 320]
+    assert (training.watch.stride, training.watch.n_units) == (4, 10)
+
+
+def test_a_planner_is_seen_at_each_evaluation(tmp_path):
+    spec = spec_of(algo="value_iteration", log_folder=tmp_path)
+    training, outcome = done(replace(spec, watch_learning=tmp_path / "page.html"))
+    rows = training.watch.moments.rows
     evaluated = np.load(outcome.run.evaluations_path)
-    assert steps == [0, *evaluated["timesteps"]]
-    # The value of the start is the return that the evaluation computed.
-    values = [moment[2][0] for moment in training.watch.moments[1:]]
-    assert values == pytest.approx(evaluated["results"].mean(axis=1), abs=1e-12)
-    assert training.watch.moments[0][1] == (1.0 if algo == "dqn" else None)
+    assert rows["timesteps"].tolist() == [0, *evaluated["timesteps"]]
+    assert rows["values"][1:, 0] == pytest.approx(evaluated["results"].mean(axis=1), abs=1e-12)
 
 
 def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, monkeypatch):

@@ -45,7 +45,7 @@ def data_in(text):
 def test_numbers_are_written_to_their_last_digit():
     values = np.array([0.1 + 0.2, 1e-300, -2.0, np.nan, np.inf, 123456789.123456789])
     assert json.loads(exact_json({"values": values})) == {
-        "values": [0.30000000000000004, 1e-300, -2, None, None, 123456789.12345679]
+        "values": [0.30000000000000004, 1e-300, -2, None, "Infinity", 123456789.12345679]
     }
 
 
@@ -89,22 +89,44 @@ def test_without_a_map_states_are_numbers(watch):
 
 def test_without_a_table_the_policy_in_every_state(watch):
     data, text, training = watch("FrozenLake-v1", "value_iteration", 128)
-    assert data["kind"] == "maps"
+    assert (data["kind"], data["unit"], data["stride"]) == ("maps", "evaluation", 1)
     assert "from evaluation to evaluation" in text
-    first, *_, last = training.watch.moments
-    assert data["moments"][0]["timesteps"] == 0
-    assert data["moments"][-1]["actions"] == last[3].tolist()
-    assert data["moments"][-1]["return"] == last[2][0]
-    assert first[0] == 0
+    rows, moments = training.watch.moments.rows, data["moments"]
+    assert moments["timesteps"] == rows["timesteps"].tolist()
+    assert moments["timesteps"][0] == 0
+    assert moments["actions"][-1] == rows["actions"][-1].tolist()
+    assert moments["return"][-1] == rows["values"][-1][0]
+    assert set(moments["loss"]) == {None}
     # Where an episode has ended nothing is done.
     reachable = training.watch.evaluator.model.reachable
-    assert [value is not None for value in data["moments"][0]["values"]] == reachable.tolist()
+    assert [value is not None for value in moments["values"][0]] == reachable.tolist()
 
 
 def test_the_beginning_and_the_end_are_there_without_evaluations(watch):
     data, _, training = watch("FrozenLake-v1", "value_iteration", 64, eval_freq=-1)
-    assert [moment["timesteps"] for moment in data["moments"]] == [0, 64]
-    assert data["moments"][-1]["return"] == training.watch.moments[-1][2][0] > 0.5
+    moments = data["moments"]
+    assert moments["timesteps"] == [0, 64]
+    assert moments["return"][-1] == training.watch.moments.rows["values"][-1][0] > 0.5
+
+
+def test_of_a_network_the_page_says_which_updates_it_shows(watch, monkeypatch):
+    settings = {"n_steps": 16, "batch_size": 16, "engine": "compiled"}
+    data, text, training = watch("FrozenLake-v1", "ppo", 320, settings)
+    assert "from update to update" in text
+    assert "20 updates\n" in text.replace("</p>", "\n")
+    assert data["moments"]["number"] == [*range(21)]
+    path = training.spec.watch_learning
+    # As large as the page is with every second one, and a letter less.
+    monkeypatch.setattr(learning_assembly, "MOST_BYTES", len(text) - 1)
+    write_learning_page(training.spec, training.watch, path)
+    second = path.read_text(encoding="utf-8")
+    assert "20 updates, one in 2 of which is shown" in second
+    monkeypatch.setattr(learning_assembly, "MOST_BYTES", len(second.encode()) - 1)
+    write_learning_page(training.spec, training.watch, path)
+    text = path.read_text(encoding="utf-8")
+    assert "20 updates, one in 4 of which is shown" in text
+    assert data_in(text)["moments"]["number"] == [0, 4, 8, 12, 16, 20]
+    assert data_in(text)["stride"] == 4
 
 
 def test_a_page_is_no_larger_than_three_megabytes(watch, monkeypatch):

@@ -764,7 +764,7 @@ HOSTILE_NAME = "Q</script><script>document.title='taken'</script>"
 
 @pytest.fixture(scope="module")
 def learning_pages(tmp_path_factory):
-    """Pages of a table on a map, of one without a map, and of a planner; hostile is the second."""
+    """Pages of a table on a map, of a hostile one without, of a planner and of a network."""
     from gymnasium.envs.toy_text import TaxiEnv
 
     folder = tmp_path_factory.mktemp("learning")
@@ -777,6 +777,11 @@ def learning_pages(tmp_path_factory):
         "table": ("FrozenLake-v1", "double_qlearning", {"n_timesteps": 400, "initial_q": 0.5}),
         "rows": ("Hostile-v0", "qlearning", {"n_timesteps": 300}),
         "map": ("FrozenLake-v1", "value_iteration", {"n_timesteps": 640}),
+        "updates": (
+            "FrozenLake-v1",
+            "ppo",
+            {"n_timesteps": 640, "n_steps": 32, "batch_size": 32, "engine": "compiled"},
+        ),
     }
     try:
         trainings = {}
@@ -923,13 +928,28 @@ def test_it_plays_and_pauses_by_the_space_bar(browser, played):
 def test_what_has_no_table_is_shown_at_each_evaluation(browser, played):
     recorder = played("map").watch
     press(browser, Keys.END)
-    assert find(browser, "#moment").text == f"evaluation {len(recorder.moments)} of " + str(
-        len(recorder.moments)
+    assert find(browser, "#moment").text == f"evaluation {recorder.n_units} of {recorder.n_units}"
+    value = recorder.moments.rows["values"][-1][0]
+    assert float(fact(browser, "return of the policy, computed").split()[0]) == pytest.approx(
+        value, rel=1e-3
     )
-    value = recorder.moments[-1][2][0]
-    assert float(fact(browser, "return of the policy").split()[0]) == pytest.approx(value, rel=1e-3)
     arrows = [path.get_attribute("d") for path in find_all(browser, ".board .arrow")]
     assert sum(bool(arrow) for arrow in arrows) == recorder.evaluator.model.reachable.sum()
+
+
+def test_a_network_is_shown_at_each_update_with_what_it_logs(browser, played):
+    recorder = played("updates").watch
+    assert find(browser, "#moment").text == "before the training"
+    assert fact(browser, "train/loss") == "\N{EN DASH}"
+    press(browser, Keys.ARROW_RIGHT)
+    assert find(browser, "#moment").text == "update 1 of 20"
+    row = recorder.moments.rows[1]
+    assert float(fact(browser, "train/loss")) == pytest.approx(row["loss"], rel=1e-3)
+    assert float(fact(browser, "train/value_loss")) == pytest.approx(row["value_loss"], rel=1e-3)
+    assert fact(browser, "environment steps") == "32"
+    assert fact(browser, "exploration") is None
+    press(browser, Keys.END)
+    assert find(browser, "#moment").text == "update 20 of 20"
 
 
 def test_a_hostile_environment_is_only_text_and_nobody_is_asked(browser, played):
@@ -949,12 +969,36 @@ def test_a_hostile_environment_is_only_text_and_nobody_is_asked(browser, played)
     assert len([url for url in asked if not url.startswith(("data:", "blob:"))]) == 1
 
 
-@pytest.mark.parametrize("name", ["table", "rows", "map"])
+def test_a_table_that_diverges_is_shown_as_it_is(browser, learning_pages, tmp_path):
+    training = learning_pages["table"]
+    recorder, path = training.watch, tmp_path / "page.html"
+    rows = recorder.changes.rows
+    last = rows["step"] == rows["step"][-1]
+    kept = rows["after"].copy()
+    rows["after"][last] = np.nan
+    rows["after"][np.flatnonzero(~last)[-1]] = np.inf
+    try:
+        write_learning_page(training.spec, recorder, path)
+    finally:
+        rows["after"] = kept
+    resize(browser, 1280)
+    browser.get(path.as_uri())
+    wait(browser, lambda: find(browser, "#moment").text)
+    press(browser, Keys.END)
+    words = find(browser, "#board").text.split()
+    assert {"nan", "\N{INFINITY}"} <= set(words)
+    assert find(browser, "#legend").text.count("from 0") == 1
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.parametrize("name", ["table", "rows", "map", "updates"])
 def test_on_a_phone_it_has_large_buttons_and_no_sideways_scroll(browser, played, name):
     played(name, width=390)
     press(browser, Keys.END)
     root = "document.documentElement"
     assert browser.execute_script(f"return {root}.scrollWidth <= {root}.clientWidth")
+    # No figure stands letter below letter.
+    assert all(figure.size["width"] >= 80 for figure in find_all(browser, "#readout dd"))
     for button in find_all(browser, ".controls button, .controls select"):
         if button.is_displayed():
             assert min(button.size.values()) >= 44

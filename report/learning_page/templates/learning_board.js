@@ -55,7 +55,7 @@ const boardOf = (data, low, high) => {
     const [from, tip] = all.length === 1 ? [-0.24, 0.26] : [0.06, 0.4];
     return `M${point(from, 0)}L${point(tip, 0)}M${point(tip - 0.14, 0.12)}L${point(tip, 0)}L${point(tip - 0.14, -0.12)}`;
   };
-  const share = (value) => (high > low ? Math.round((100 * (value - low)) / (high - low)) : 50);
+  const share = (value) => (high > low ? Math.round(100 * Math.min(Math.max((value - low) / (high - low), 0), 1)) : 50);
 
   // `look(state)` says what a state is worth and which actions are best there.
   const draw = (layer, look) => {
@@ -64,9 +64,10 @@ const boardOf = (data, low, high) => {
       const state = number + nCells * layer;
       const isEnd = letter === "G" || letter === "X";
       const { value, actions } = letter === "#" || isEnd ? { value: null, actions: [] } : look(state);
-      const fill = letter === "#" ? "var(--muted)" : value === null ? "var(--card)" : `color-mix(in srgb, var(--map-high) ${share(value)}%, var(--map-low))`;
+      const isNumber = value !== null && Number.isFinite(value);
+      const fill = letter === "#" ? "var(--muted)" : !isNumber ? "var(--card)" : `color-mix(in srgb, var(--map-high) ${share(value)}%, var(--map-low))`;
       const path = actions.map(arrowTo).join("");
-      const word = glyphs[letter] ?? (layout === null && actions.length === 1 ? String(actions[0]) : "");
+      const word = glyphs[letter] ?? (value !== null && !isNumber ? shown(value) : layout === null && actions.length === 1 ? String(actions[0]) : "");
       if (cell.fill !== fill) cell.rect.style.fill = cell.fill = fill;
       if (cell.path !== path) cell.arrow.setAttribute("d", (cell.path = path));
       if (cell.word !== word) cell.letter.textContent = cell.word = word;

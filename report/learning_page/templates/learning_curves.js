@@ -2,7 +2,7 @@
 
 // A line through points (x, y) with x from 0 to 1, and a mark at the present moment.
 const curveOf = (title, points) => {
-  const finite = points.filter(([, y]) => y !== null);
+  const finite = points.filter(([, y]) => y !== null && Number.isFinite(y));
   if (finite.length === 0) return null;
   const values = finite.map(([, y]) => y);
   const [low, high] = [values.reduce((a, b) => Math.min(a, b)), values.reduce((a, b) => Math.max(a, b))];

@@ -2,17 +2,22 @@
 
 // A number with so many significant digits; "–" for none.
 const shown = (value, digits = 4) => {
-  if (value === null || value === undefined || Number.isNaN(value)) return "–";
+  if (value === null || value === undefined) return "–";
+  if (!Number.isFinite(value)) return Number.isNaN(value) ? "nan" : value > 0 ? "∞" : "−∞";
   if (value !== 0 && (Math.abs(value) < 1e-4 || Math.abs(value) >= 1e7)) return value.toExponential(digits - 1);
   return Number(value.toPrecision(digits)).toLocaleString("en", { maximumFractionDigits: 8 });
 };
 
+// In what is no table, null stands for what is not there; in a table it is no number.
+const entries = (values) => Float64Array.from(values, (value) => value ?? NaN);
+
 // The tables after any number of steps: changes are put in place going forwards, and taken back.
 const replayOf = (data) => {
-  const { step, table, entry, after } = data.changes;
+  const { step, table, entry } = data.changes;
+  const after = entries(data.changes.after);
   const tables = data.tables.map(({ name, shape, fill, values }) => {
     const size = shape.reduce((product, n) => product * n, 1);
-    return { name, shape, values: values === undefined ? new Float64Array(size).fill(fill) : Float64Array.from(values) };
+    return { name, shape, values: values === undefined ? new Float64Array(size).fill(fill ?? NaN) : entries(values) };
   });
   const nSteps = data.steps.timesteps.length;
   const first = new Int32Array(nSteps + 1);
@@ -36,10 +41,11 @@ const replayOf = (data) => {
     const actions = values.flatMap((one, action) => (one === highest ? [action] : []));
     return { value: highest, actions: actions.length === nActions ? [] : actions };
   };
-  // The range of what states are worth at any time.
+  // The range of what states are worth at any time, as far as it is numbers.
   let [low, high] = [Infinity, -Infinity];
   const look = (state) => {
     const { value: highest } = best(state);
+    if (!Number.isFinite(highest)) return;
     low = Math.min(low, highest);
     high = Math.max(high, highest);
   };

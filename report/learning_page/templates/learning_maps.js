@@ -1,0 +1,59 @@
+"use strict";
+
+// What a page of maps shows: one before the training, and one after each update or evaluation.
+const mapShow = (data) => {
+  const { moments, unit } = data;
+  const { timesteps } = moments;
+  // Colours span the optimal values, and as much again below them.
+  const [lowest, high] = data.optimal_range;
+  const least = moments.values.flat().reduce((a, b) => (b === null ? a : Math.min(a, b)), lowest);
+  const low = Math.max(lowest - (high - lowest || 1), least);
+  const board = boardOf(data, low, high);
+  document.getElementById("board-figure").hidden = !data.is_drawn;
+  document.getElementById("board").append(board.svg);
+  document.getElementById("legend").textContent = `${data.layout === null ? "Numbers: the action that the agent takes in each state, a square" : "Arrows: what the agent does in each cell"}. Colour: the expected return of that policy from there on, computed from the model of the environment (from ${shown(low)}${least < low ? " and below" : ""} to ${shown(high)}). Framed: where it does something else than before.`;
+  const [begin, end] = [timesteps[0], Math.max(timesteps.at(-1), timesteps[0] + 1)];
+  const place = (position) => (timesteps[position] - begin) / (end - begin);
+  // Of what an agent has: its word here, and the name under which its logger has it.
+  const figures = [
+    ["Return of the policy, computed", "return", null],
+    ["Return of the last training episodes, mean", "training_return", null],
+    ["Exploration", "exploration", null],
+    ["Loss", "loss", data.logged.loss],
+    ["Loss of the value network", "value_loss", data.logged.value_loss],
+    ["Loss of entropy", "entropy_loss", data.logged.entropy_loss],
+  ].filter(([, name]) => moments[name].some((value) => value !== null));
+  const curves = figures.map(([word, name]) => curveOf(word, moments[name].map((value, i) => [place(i), value]))).filter((curve) => curve !== null);
+  const nLayers = data.layout === null ? 1 : data.layout.layers.length;
+  const draw = (position) => {
+    const [now, before] = [moments.values[position], moments.values[Math.max(position - 1, 0)]];
+    const [actions, last] = [moments.actions[position], moments.actions[Math.max(position - 1, 0)]];
+    const changed = actions.flatMap((action, state) => (now[state] !== null && action !== last[state] ? [state] : []));
+    board.draw(0, (state) => ({ value: now[state], actions: now[state] === null ? [] : [actions[state]] }));
+    board.mark(0, changed.map((state) => ({ state, action: null, isUp: now[state] >= before[state] })), []);
+    board.svg.setAttribute("aria-label", `The agent's policy on the map after ${timesteps[position]} steps`);
+    document.getElementById("readout").replaceChildren(listOf([
+      ["environment steps", shown(timesteps[position], 12)],
+      ...figures.map(([word, name, logged]) => {
+        const value = shown(moments[name][position]);
+        const words = name === "return" ? `${value} (optimum ${shown(data.optimum)})` : value;
+        return [logged === null ? word.toLowerCase() : logged, words];
+      }),
+      ["changed its action", `in ${changed.length} state${changed.length === 1 ? "" : "s"}${nLayers > 1 ? ", of all sets of prizes" : ""}`],
+    ]));
+    curves.forEach((curve) => curve.go(place(position)));
+    const number = moments.number[position];
+    if (position === 0) return "before the training";
+    if (number === moments.number[position - 1]) return "at the end";
+    return `${unit} ${number.toLocaleString("en")} of ${data.n_units.toLocaleString("en")}`;
+  };
+  return {
+    n: timesteps.length - 1,
+    draw,
+    curves,
+    starts: [],
+    nextLarge: null,
+    speeds: [1, 2, 4, 8, 30],
+    speed: 4,
+  };
+};
