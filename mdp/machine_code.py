@@ -18,6 +18,7 @@ import numba
 from numba.core import event
 
 from mdp.code_cache import PACKAGES, ROOT, CheckedCache, folder, numba_cache_dir
+from mdp.code_parts import Part, called_as_part
 from mdp.work_time import WorkTime
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -48,28 +49,27 @@ def kernel(function: Function) -> Function:
     return _decorated(function, BARE_OPTIONS)
 
 
-# Nothing that Python could call: what unpacks many arrays takes longer to compile than a loop.
-INTERNAL_OPTIONS: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-
-
 def called(function: Function) -> Function:
     """Compile a function that allocates nothing and that only compiled functions call."""
-    return _decorated(function, {**BARE_OPTIONS, **INTERNAL_OPTIONS})
+    return _part(function, BARE_OPTIONS)
 
 
 def vectorised(function: Function) -> Function:
     """As `called`, for loops over single-precision numbers whose sums may be in any order."""
-    return _decorated(function, {**REORDERED_OPTIONS, **INTERNAL_OPTIONS})
+    return _part(function, REORDERED_OPTIONS)
+
+
+INLINED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "forceinline": True}
 
 
 def inlined(function: Function) -> Function:
     """Compile a small function that allocates nothing, as a part of those that call it."""
-    return _decorated(function, {**BARE_OPTIONS, "forceinline": True})
+    return cast(Function, called_as_part(_decorated(function, INLINED_OPTIONS), INLINED_OPTIONS))
 
 
 def internal(function: Function) -> Function:
-    """As `inlined`, for functions whose arguments or results Python cannot see."""
-    return _decorated(function, {**BARE_OPTIONS, "forceinline": True, "no_cpython_wrapper": True})
+    """As `inlined`, for functions that Python does not call."""
+    return _part(function, INLINED_OPTIONS)
 
 
 def view(function: Function) -> Function:
@@ -108,6 +108,10 @@ def compile_timer() -> Iterator[Callable[[], WorkTime]]:
     timer = _CompileTimer()
     with event.install_listener("numba:compile", timer):
         yield lambda: timer.spent
+
+
+def _part(function: Function, options: dict[str, Any]) -> Function:
+    return cast(Function, Part(function, options))
 
 
 def _decorated(function: Function, options: dict[str, Any]) -> Function:

@@ -19,7 +19,8 @@ from numba.extending import overload
 
 from agents.common.signatures import CheckedConstructor
 from mdp.code_cache import RULE_PREFIX
-from mdp.machine_code import BARE_OPTIONS, INTERNAL_OPTIONS
+from mdp.code_parts import WITHOUT_WRAPPERS, PartCompiler
+from mdp.machine_code import INLINED_OPTIONS
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -42,7 +43,7 @@ def by_type(stub: Function) -> Function:
     def choose(thing: Any, *others: Any) -> Any:
         return getattr(getattr(_class_of(thing), name, None), "py_func", None)
 
-    options: Any = {**BARE_OPTIONS, **INTERNAL_OPTIONS, "forceinline": True}
+    options: Any = {**INLINED_OPTIONS, **WITHOUT_WRAPPERS, "pipeline_class": PartCompiler}
     overload(stub, strict=False, jit_options=options)(choose)
     return stub
 

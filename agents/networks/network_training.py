@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -11,8 +12,11 @@ from stable_baselines3.common.type_aliases import Schedule
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.compiled.generators import handles_of
 from agents.networks.observations import Numbers
-from agents.networks.references import Reference
+from agents.networks.references import Reference, address_of
 from agents.networks.shared_tensors import SharedTensors
+
+# An address that is filled in once there is a reference to what it belongs to.
+NOWHERE = np.uintp(0)
 
 
 class NetworkTraining(ABC):
@@ -29,10 +33,12 @@ class NetworkTraining(ABC):
         shown: observations of environments in Python, shape (n_envs, d).
         waits: whether rollouts are learnt from by `learn_from_rollout`, and not by the loop.
         heeds_budgets: whether a number of episodes to train for moves the schedules.
+        improves_by: the compiled function that learns from a minibatch.
     """
 
     held: Any
     heeds_budgets: ClassVar[bool]
+    improves_by: ClassVar[Callable[[Any, float, float], int]]
 
     def __init__(self, agent: Any, seen: Any, tensors: SharedTensors) -> None:
         self.agent = agent
@@ -43,6 +49,7 @@ class NetworkTraining(ABC):
         self.generator = agent.rng
         self.held = self._make_learner()
         self.learner = Reference(self.held)
+        self.hold(improve=address_of(type(self).improves_by, self.learner))
         width = 1 if isinstance(seen, Numbers) else int(tensors.networks[0].layers.sizes[0])
         self.shown = np.zeros((agent.n_envs, width))
 
@@ -70,8 +77,12 @@ class NetworkTraining(ABC):
         """
         optimizer = self.tensors.take_over()
         if optimizer is not self.held.optimizer:
-            self.held = self.held._replace(optimizer=optimizer)
-            self.learner.hold(self.held)
+            self.hold(optimizer=optimizer)
+
+    def hold(self, **parts: Any) -> None:
+        """Put other parts in the place of the learner's."""
+        self.held = self.held._replace(**parts)
+        self.learner.hold(self.held)
 
     def read_generator(self) -> None:
         """Draw from the agent's generator, which a callback may have replaced."""

@@ -15,7 +15,7 @@ from agents.networks.matrix_products import Singles
 from agents.networks.observations import AFTER, BEFORE, look, move_on, observe, show
 from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
-from agents.networks.policy_updates import RolloutMinibatch, learn_from_rollout_minibatch
+from agents.networks.policy_updates import RolloutMinibatch
 from agents.networks.references import call
 from agents.networks.rollouts import Rollout, shuffle
 from mdp.array_types import Ints
@@ -47,6 +47,8 @@ PLACE = np.dtype(
         ("n_rollouts", np.int64),
         ("n_updates", np.int64),  # epochs, as the library counts them
         ("remaining", np.float64),  # share of the training that was left at the last one
+        ("clip_range", np.float64),  # how far ratios of probabilities may move
+        ("clip_range_vf", np.float64),  # how far values may
         ("policy_gradient", np.float64),  # means over the last training
         ("value", np.float64),
         ("entropy", np.float64),
@@ -76,6 +78,7 @@ class PolicyLearner(NamedTuple):
         memory: that of what it takes steps from.
         starts: whether the present observations begin episodes, shape (E,).
         last_values: values of what the rollout ends with, shape (E,).
+        improve: the address of `learn_from_rollout_minibatch`.
         order: numbers of the rollout's steps, to be shuffled, shape (T * E,).
         batch: the minibatch.
         policy_outputs: for what the network puts out for the minibatch.
@@ -99,6 +102,7 @@ class PolicyLearner(NamedTuple):
     memory: np.uintp
     starts: Singles
     last_values: Singles
+    improve: np.uintp
     order: Ints
     batch: RolloutMinibatch
     policy_outputs: Singles
@@ -144,13 +148,13 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     place, rules = learner.place[0], learner.rules[0]
     place.step, place.remaining = 0, remaining
     place.n_rollouts += 1
-    clip_range = schedule_value(rules.clip_range, remaining)
-    clip_range_vf = schedule_value(rules.clip_range_vf, remaining)
+    place.clip_range = schedule_value(rules.clip_range, remaining)
+    place.clip_range_vf = schedule_value(rules.clip_range_vf, remaining)
     place.policy_gradient = place.value = place.entropy = place.clipped = 0.0
     n_batches, goes_on = 0, True
     for _ in range(rules.n_epochs):
         shuffle(learner.order, learner.rng[0])
-        n_in_epoch, goes_on = learn_for_an_epoch(learner, learning_rate, clip_range, clip_range_vf)
+        n_in_epoch, goes_on = learn_for_an_epoch(learner, learning_rate)
         n_batches += n_in_epoch
         place.n_updates += 1
         if not goes_on:
@@ -163,9 +167,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
 
 
 @inlined
-def learn_for_an_epoch(
-    learner: Any, learning_rate: float, clip_range: float, clip_range_vf: float
-) -> tuple[int, bool]:
+def learn_for_an_epoch(learner: Any, learning_rate: float) -> tuple[int, bool]:
     """Learn from all of the rollout once.
 
     Returns:
@@ -177,7 +179,7 @@ def learn_for_an_epoch(
     for begin in range(0, n_steps, size):
         n = min(size, n_steps - begin)
         call(learner.pick, learner.memory, float(begin), float(n))
-        goes_on = learn_from_rollout_minibatch(learner, n, learning_rate, clip_range, clip_range_vf)
+        goes_on = call(learner.improve, learner, float(n), learning_rate) == 1
         place.policy_gradient += losses.policy_gradient
         place.value += losses.value
         place.entropy += losses.entropy

@@ -16,7 +16,7 @@ from agents.common.schedules import ScheduleRow
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.networks.library_networks import Network, network_of
-from agents.networks.network_training import NetworkTraining, record_of
+from agents.networks.network_training import NOWHERE, NetworkTraining, record_of
 from agents.networks.observations import Numbers
 from agents.networks.perceptron import make_inputs, make_outputs, n_parameters
 from agents.networks.policy_learner import (
@@ -28,7 +28,11 @@ from agents.networks.policy_learner import (
     evaluate,
     train,
 )
-from agents.networks.policy_updates import LOSSES, RolloutMinibatch
+from agents.networks.policy_updates import (
+    LOSSES,
+    RolloutMinibatch,
+    learn_from_rollout_minibatch,
+)
 from agents.networks.references import Reference, address_of
 from agents.networks.rollouts import Rollout, RolloutMemory, estimate_advantages, pick_steps
 from agents.networks.shared_tensors import shared_tensors
@@ -68,6 +72,7 @@ class PolicyTraining(NetworkTraining):
 
     # The library's rollouts take what remains from the steps to do.
     heeds_budgets = False
+    improves_by = learn_from_rollout_minibatch
 
     def _make_learner(self) -> PolicyLearner:
         agent, tensors = self.agent, self.tensors
@@ -100,6 +105,7 @@ class PolicyTraining(NetworkTraining):
             np.uintp(self.memory.address),
             np.zeros(agent.n_envs, np.float32),
             np.zeros(agent.n_envs, np.float32),
+            NOWHERE,
             order,
             batch,
             make_outputs(actor, rows),

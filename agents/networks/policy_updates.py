@@ -18,7 +18,7 @@ from agents.networks.matrix_products import Singles
 from agents.networks.optimizers import descend
 from agents.networks.perceptron import Inputs, backward, forward, last_outputs
 from mdp.array_types import Ints
-from mdp.machine_code import called
+from mdp.machine_code import called, kernel
 
 # What the library's log has of a minibatch.
 LOSSES = np.dtype(
@@ -55,42 +55,39 @@ class RolloutMinibatch(NamedTuple):
     values: Singles
 
 
-@called
-def learn_from_rollout_minibatch(
-    learner: Any, n: int, learning_rate: float, clip_range: float, clip_range_vf: float
-) -> bool:
-    """Take one step of gradient descent on the first ``n`` rows of `learner.batch`.
+@kernel
+def learn_from_rollout_minibatch(learner: Any, n_rows: float, learning_rate: float) -> int:
+    """Take one step of gradient descent on the first ``n_rows`` rows of `learner.batch`.
 
     Args:
         learner: both networks, the optimizer and the minibatch.
-        n: number of rows.
+        n_rows: number of rows.
         learning_rate: of the optimizer.
-        clip_range: how far ratios of probabilities may move.
-        clip_range_vf: how far values may; infinite for any distance.
 
     Returns:
-        False where the policy has moved too far already, and nothing was done.
+        0 where the policy has moved too far already, and nothing was done; otherwise 1.
     """
     batch, rules, losses = learner.batch, learner.rules[0], learner.losses[0]
+    n = int(n_rows)
     if rules.normalize_advantage and n > 1:
         standardize(batch.advantages[:n])
     states = batch.states
     forward(learner.policy, learner.flat, states, n, learner.policy_outputs)
     forward(learner.value, learner.flat, states, n, learner.value_outputs)
-    _policy_errors(learner, n, clip_range)
-    _value_errors(learner, n, clip_range_vf)
+    _policy_errors(learner, n, learner.place[0].clip_range)
+    _value_errors(learner, n, learner.place[0].clip_range_vf)
     losses.total = (
         losses.policy_gradient + rules.ent_coef * losses.entropy + rules.vf_coef * losses.value
     )
     if losses.kl > 1.5 * rules.target_kl:
-        return False
+        return 0
     for layers, outputs, errors in (
         (learner.policy, learner.policy_outputs, learner.policy_errors),
         (learner.value, learner.value_outputs, learner.value_errors),
     ):
         backward(layers, learner.flat, states, n, outputs, errors, learner.gradient)
     descend(learner.optimizer, learner.flat, learner.gradient, learning_rate, rules.max_grad_norm)
-    return True
+    return 1
 
 
 @called

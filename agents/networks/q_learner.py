@@ -12,7 +12,7 @@ from agents.networks.matrix_products import Singles
 from agents.networks.observations import AFTER, BEFORE, look, move_on, observe, show
 from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
-from agents.networks.q_updates import best_of, follow, learn_from_minibatch
+from agents.networks.q_updates import best_of, follow
 from agents.networks.references import call
 from agents.networks.replay_batches import Minibatch
 from mdp.array_types import Ints
@@ -78,6 +78,7 @@ class QLearner(NamedTuple):
         optimizer: what moves the parameters.
         draw: the address of `draw_minibatch`, which goes by the type of observations.
         memory: that of what it draws from.
+        improve: the address of `learn_from_minibatch`.
         batch: the minibatch.
         outputs: for what the network puts out for the minibatch.
         next_outputs: for what is put out for its next states.
@@ -96,6 +97,7 @@ class QLearner(NamedTuple):
     optimizer: Optimizer
     draw: np.uintp
     memory: np.uintp
+    improve: np.uintp
     batch: Minibatch
     outputs: Singles
     next_outputs: Singles
@@ -119,7 +121,7 @@ def train(learner: Any, n_updates: float, learning_rate: float) -> int:
     place.losses, place.n_losses, place.learning_rate = 0.0, int(n_updates), learning_rate
     for _ in range(int(n_updates)):
         call(learner.draw, learner.memory, 0.0, 0.0)
-        place.losses += learn_from_minibatch(learner, learning_rate)
+        call(learner.improve, learner, learning_rate, 0.0)
     place.n_updates += int(n_updates)
     return int(n_updates)
 

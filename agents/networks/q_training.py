@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.compiled.generators import handles_of
 from agents.networks.library_networks import Network, network_of
-from agents.networks.network_training import NetworkTraining, record_of
+from agents.networks.network_training import NOWHERE, NetworkTraining, record_of
 from agents.networks.observations import Numbers
 from agents.networks.perceptron import make_inputs, make_outputs
 from agents.networks.q_learner import (
@@ -27,7 +27,7 @@ from agents.networks.q_learner import (
     choose_greedily,
     train,
 )
-from agents.networks.q_updates import DOUBLE, ONLINE_NETWORK, TARGET_NETWORK
+from agents.networks.q_updates import DOUBLE, ONLINE_NETWORK, TARGET_NETWORK, learn_from_minibatch
 from agents.networks.references import Reference, address_of
 from agents.networks.replay_batches import Memory, Minibatch, Replay, draw_minibatch
 from agents.networks.shared_tensors import shared_tensors
@@ -57,6 +57,7 @@ class QTraining(NetworkTraining):
     """DQN, double DQN or deep Q-learning in training."""
 
     heeds_budgets = True
+    improves_by = learn_from_minibatch
 
     def _make_learner(self) -> QLearner:
         agent, tensors = self.agent, self.tensors
@@ -86,6 +87,7 @@ class QTraining(NetworkTraining):
             tensors.take_over(),
             address_of(draw_minibatch, self.memory),
             np.uintp(self.memory.address),
+            NOWHERE,
             batch,
             make_outputs(layers, n),
             make_outputs(layers, n),

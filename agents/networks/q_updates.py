@@ -12,7 +12,7 @@ import numpy as np
 from agents.networks.matrix_products import Singles
 from agents.networks.optimizers import descend
 from agents.networks.perceptron import backward, forward, last_outputs
-from mdp.machine_code import called, inlined
+from mdp.machine_code import called, inlined, kernel
 
 # What the value of the next state is taken from.
 TARGET_NETWORK, DOUBLE, ONLINE_NETWORK = range(3)
@@ -28,12 +28,11 @@ def best_of(values: Any) -> int:
     return best
 
 
-@called
-def learn_from_minibatch(learner: Any, learning_rate: float) -> float:
-    """Take one step of gradient descent on `learner.batch`.
+@kernel
+def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
+    """Take one step of gradient descent on `learner.batch`, whose number of rows is returned.
 
-    Returns:
-        The loss before it: Huber's, or half the squared error.
+    The loss before it is added to ``place.losses``: Huber's, or half the squared error.
     """
     layers, batch, rules = learner.layers, learner.batch, learner.rules[0]
     n = len(batch.actions)
@@ -48,7 +47,7 @@ def learn_from_minibatch(learner: Any, learning_rate: float) -> float:
     for i in range(n):
         batch.rewards[i] += batch.discounts[i] * next_values[i, best_of(preferred[i])]
     forward(layers, learner.flat, batch.states, n, learner.outputs)
-    loss = _errors(learner, n, rules.largest_error)
+    learner.place[0].losses += _errors(learner, n, rules.largest_error)
     backward(
         layers,
         learner.flat,
@@ -59,7 +58,7 @@ def learn_from_minibatch(learner: Any, learning_rate: float) -> float:
         learner.gradient,
     )
     descend(learner.optimizer, learner.flat, learner.gradient, learning_rate, rules.max_grad_norm)
-    return loss
+    return n
 
 
 @called
