@@ -18,7 +18,7 @@ GOAL = 3
 
 
 class ShortCorridorEnv(ChainEnv):
-    """A corridor to be left by chance: no action that is always the same leads out of it.
+    """A corridor that only random actions can leave: always the same action leads nowhere.
 
     ## Description
     Sutton and Barto (Reinforcement Learning, 2nd edition), example 13.1: three states in a row,
