@@ -87,12 +87,12 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     ),
     "dyna_q": _tabular("models.dyna_q:DynaQ", "Q-learning that plans on a learnt model"),
     "dyna_q_plus": _tabular(
-        "models.dyna_q_plus:DynaQPlus", "Dyna-Q that tries again what is long ago"
+        "models.dyna_q_plus:DynaQPlus", "Dyna-Q with a bonus for actions not tried for long"
     ),
     "prioritized_sweeping": _tabular(
         "models.prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
     ),
-    "r_max": _tabular("models.r_max:RMax", "planning, with the unknown taken for the best"),
+    "r_max": _tabular("models.r_max:RMax", "planning that assumes the best of everything unknown"),
     "qlearning_ucb": _tabular(
         "q_learning_ucb:QLearningUCB", "Q-learning with upper confidence bounds"
     ),
@@ -191,7 +191,7 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "epsilon_greedy": _bandit("value_bandits:EpsilonGreedy", "bandit: epsilon-greedy"),
     "boltzmann": _bandit("value_bandits:Boltzmann", "bandit: softmax of the estimates"),
     "ucb": _bandit("ucb:UCB", "bandit: upper confidence bounds"),
-    "kl_ucb": _bandit("kl_ucb:KLUCB", "bandit: upper bounds by the divergence of coins"),
+    "kl_ucb": _bandit("kl_ucb:KLUCB", "bandit: upper bounds by Kullback-Leibler divergence"),
     "gradient_bandit": _bandit("gradient_bandit:GradientBandit", "bandit: gradient on preferences"),
     "exp3": _bandit("exp3:Exp3", "bandit: exponential weights against an adversary"),
     "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),

@@ -169,9 +169,9 @@ class SegmentBandit(ClickBandit):
     """An A/B test: users of several segments, and treatments that they click on or not.
 
     ## Description
-    A user comes by, of a segment that is known, and is shown one of the treatments. What works for
-    one segment need not work for another. With the default figures, of Li et al.'s kind
-    ("A contextual-bandit approach to personalized news article recommendation", 2010), 30 % of the
+    Each user belongs to a known segment, and is shown one of the treatments. A treatment that works
+    for one segment need not work for another. With the default figures, of Li et al.'s kind ("A
+    contextual-bandit approach to personalized news article recommendation", 2010), 30 % of the
     users are core users and 70 % casual ones:
 
     | segment | treatment 0 | treatment 1 | treatment 2 |
@@ -179,8 +179,8 @@ class SegmentBandit(ClickBandit):
     | 0 core | .10 | .25 | .05 |
     | 1 casual | .12 | .06 | .05 |
 
-    Whoever shows everybody the same does best with treatment 1, at .117 clicks a user; whoever
-    looks at the segment reaches .159.
+    The best single treatment for everybody is treatment 1, with .117 clicks per user. By segment,
+    .159 can be reached.
 
     ## Action Space
     `Discrete(n_arms)`: the treatment to show.

@@ -20,8 +20,8 @@ class ReplayBandit(Bandit):
     ## Description
     What would another policy have earned on the users of a log? If the log chose its arms uniformly
     at random, replay answers without bias: go through the log, let the policy choose for each
-    context, and count the rows where it chooses what was logged, for only there is the reward known
-    (Li, Chu, Langford and Wang, "Unbiased offline evaluation of contextual-bandit-based news
+    context, and count the rows where it chooses the logged arm, because only there the reward is
+    known (Li, Chu, Langford and Wang, "Unbiased offline evaluation of contextual-bandit-based news
     article recommendation algorithms", 2011). About one row in `n_arms` counts. The policy's mean
     reward is estimated by the return divided by `matched_pulls`.
 
@@ -45,13 +45,13 @@ class ReplayBandit(Bandit):
 
     ## Information
     `step` gives `matched`, whether the arm was the logged one; `matched_pulls`, how often that has
-    been so in this episode; and `feedback_due`, always True. `reset` gives nothing. What is best is
-    not known, so that there is no regret.
+    been so in this episode; and `feedback_due`, always True. `reset` gives nothing. The best arm is
+    not known, so there is no regret.
 
-    Where `matched` is False the row tells nothing, and an agent may not learn from it. The bandit
-    agents skip it. Agents that know nothing of this, such as DQN, learn from the reward of 0: with
-    uniform logging that divides what they expect of each arm by `n_arms`, and leaves their order as
-    it is. No random numbers are drawn.
+    If `matched` is False, the row says nothing, and an agent must not learn from it. The bandit
+    agents skip it. Other agents, such as DQN, learn from the reward of 0. With uniform logging this
+    divides their estimate for each arm by `n_arms`, and does not change the order of the arms. No
+    random numbers are drawn.
 
     ## Arguments
     - `log`: the path to a CSV file with the columns `arm`, `reward` and `propensity`, and one for

@@ -24,11 +24,11 @@ class DeepSeaEnv(MapEnv):
     column to the left or to the right. The treasure lies in the lower right corner, and moving
     right costs a little. Random actions find it once in 2**size episodes.
 
-    Which of the two actions is the right one is another matter in each cell, and fixed by
-    `map_seed`; so no single action is worth anything.
+    In each cell `map_seed` decides which of the two actions goes right, so no single action leads
+    to the treasure.
 
     The best return is 1 - 0.01 = 0.99. With `deterministic=False` and q = 1 - 1/size it is
-    q**(size - 1) - 0.01 * (1 - q**size): an agent that a failed move has taken off the way saves
+    q**(size - 1) - 0.01 * (1 - q**size): if a failed move has taken the agent off the way, it saves
     the cost of the rest.
 
     ## Action Space
@@ -59,9 +59,9 @@ class DeepSeaEnv(MapEnv):
 
     ## Arguments
     - `size=10`: number of rows and of columns
-    - `deterministic=True`: whether all goes as it should. If not, a move to the right fails with
+    - `deterministic=True`: whether all moves succeed. If not, a move to the right fails with
       probability 1 / size and sinks straight down, and two rewards are drawn, see Rewards
-    - `move_cost=0.01`: what `size` moves to the right cost together
+    - `move_cost=0.01`: the cost of `size` moves to the right together
     - `map_seed=0`: the same seed gives the same meaning of actions; None makes 1 always right
     - `render_mode=None`: `"ansi"`, `"rgb_array"` or `"human"`
 

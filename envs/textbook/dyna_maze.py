@@ -51,14 +51,15 @@ class DynaMazeEnv(GridWorld):
                   .........    .........              .........    .........
                   ...S.....    ...S.....              ...S.....    ...S.....
 
-    `maze` chooses one, and `changed` whether it is as it becomes, or as it is at first. An
-    environment that stays as it is has an exact model and an optimum. With `change_after_steps` it
-    changes once: so many steps after it was made, over all its episodes, it turns from the first
-    maze into the changed one (later, if the robot stands where a wall comes: when it has moved on).
-    Its dynamics then depend on time, and no model or optimum is told. That is meant for training:
-    with `env_kwargs: {maze: blocking, changed: true}` and `train_env_kwargs: {change_after_steps:
-    1000}` an agent trains in a maze that changes, as in the book, and is measured in the changed
-    one, exactly. Each of several environments that train together counts its own steps.
+    `maze` chooses the maze, and `changed` whether it is the changed one or the first one. A maze
+    that does not change has an exact model and an optimum. With `change_after_steps` the
+    environment changes once: after that many steps since it was made, over all its episodes, the
+    first maze turns into the changed one (later, if the robot stands where a wall comes: when it
+    has moved on). Its dynamics then depend on time, so there is no model and no optimum. That is
+    meant for training: with `env_kwargs: {maze: blocking, changed: true}` and `train_env_kwargs:
+    {change_after_steps: 1000}` an agent trains in a maze that changes, as in the book, and is
+    evaluated exactly in the changed one. If several environments train together, each counts its
+    own steps.
 
     ## Action Space
     `Discrete(4)`: 0 up, 1 down, 2 left, 3 right.
@@ -90,7 +91,7 @@ class DynaMazeEnv(GridWorld):
 
     ## Arguments
     - `maze="dyna"`: or `"blocking"` or `"shortcut"`
-    - `changed=False`: whether the maze is as it becomes; `"dyna"` never changes
+    - `changed=False`: whether it is the changed maze; `"dyna"` never changes
     - `change_after_steps=None`: see Description; needs `changed=True`
     - `step_reward=0`, `goal_reward=1`: the rewards
     - `slip=0`: probability that the robot moves sideways instead, half of it to each side

@@ -69,8 +69,8 @@ class RacetrackEnv(MapEnv):
     Sutton and Barto (Reinforcement Learning, 2nd edition), exercise 5.12, on the tracks of figure
     5.5. The car has a place and a velocity, in cells a step, upwards and to the right: each is from
     0 to 4, and both are 0 on the starting line alone. An action changes each by -1, 0 or 1; with
-    probability .1 neither changes, whatever was chosen. A change that would lead out of 0 to 4 is
-    left out, and one that would stop the car elsewhere than on the starting line too.
+    probability .1 neither changes, whatever was chosen. A change is left out if it would lead out
+    of 0 to 4, or if it would stop the car outside the starting line.
 
     Then the car moves along a straight line to its new cell. If the line enters a cell of the
     finishing line `G`, the episode ends, whatever lies beyond; if before that it enters one off the

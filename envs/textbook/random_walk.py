@@ -17,7 +17,7 @@ MOST_OUTCOMES = 20_000_000
 
 
 class RandomWalkEnv(ChainEnv):
-    """A walk to the left or to the right by chance alone: a state's value is to be estimated.
+    """A random walk to the left or to the right: the values of its states are to be estimated.
 
     ## Description
     Sutton and Barto (Reinforcement Learning, 2nd edition), example 6.2: states 1 to 5 in a row.

@@ -18,19 +18,19 @@ GOAL = 3
 
 
 class ShortCorridorEnv(ChainEnv):
-    """A corridor to be left by chance: no action that is always the same leads out of it.
+    """A corridor that only random actions can leave: always the same action leads nowhere.
 
     ## Description
-    Sutton and Barto (Reinforcement Learning, 2nd edition), example 13.1: three states in a row,
-    and the goal to the right of them. Actions do what they are called in the first state and in
-    the third; in the second, right leads left and left leads right. The agent is not told where it
-    is, so that it can only say how often it goes right. Always right, and always left, never reach
-    the goal. Going right with probability p takes (4 - 2 p) / (p (1 - p)) steps on average: 82 for
-    .05, 44 for .95, and at best 11.66, for p = 2 - sqrt(2), or .59.
+    Sutton and Barto (Reinforcement Learning, 2nd edition), example 13.1: three states in a row, and
+    the goal to the right of them. In the first state and in the third, actions do what their names
+    say; in the second, right leads left and left leads right. The agent does not see where it is,
+    so it can only choose how often it goes right. Always right and always left never reach the
+    goal. Going right with probability p takes (4 - 2 p) / (p (1 - p)) steps on average: 82 for .05,
+    44 for .95, and at best 11.66, for p = 2 - sqrt(2), or .59.
 
-    The optimum that a run shows, -3, is that of somebody who sees the states; what no agent that is
-    told nothing can exceed is -11.66. Greedy evaluations of the agents here say nothing, as they
-    take the likelier action for good.
+    The optimum that a run shows, -3, is for an agent that sees the states. An agent that does not
+    see them can reach -11.66 at most. Greedy evaluations say nothing here, because they always take
+    the more probable action.
 
     ## Action Space
     `Discrete(2)`: 0 left, 1 right.

@@ -45,10 +45,10 @@ class WindyGridworldEnv(MapEnv):
         ..........
         0001112210   rows that a step which leaves the column is blown upwards
 
-    A step is the move and the wind of the column that it leaves, together, as far as the grid goes.
-    The shortest way takes 15 steps. With king's moves (exercise 6.9) it takes 7, and staying put,
-    a ninth move, gains nothing. With `stochastic=True` (exercise 6.10) the wind, where there is
-    one, is one stronger and one weaker than that a third of the time each.
+    A step is the move plus the wind of the column that it leaves, but never beyond the grid. The
+    shortest way takes 15 steps. With king's moves (exercise 6.9) it takes 7, and staying put, a
+    ninth move, gains nothing. With `stochastic=True` (exercise 6.10) a wind is stronger by one a
+    third of the time, and weaker by one a third of the time.
 
     ## Action Space
     With `moves="rook"`, `Discrete(4)`: 0 up, 1 down, 2 left, 3 right. With `"king"`, `Discrete(8)`:
