@@ -253,6 +253,13 @@ def test_r_max_by_hand():
     assert taught.agent.policy.visit_counts[0].tolist() == [[2, 3], [0, 0]]
 
 
+@pytest.mark.parametrize("gamma", [0.0, 0.5, 0.999, 0.9999])
+def test_r_max_keeps_to_its_tolerance(gamma):
+    taught = Taught("r_max", 1, gamma=gamma, known_after=1, tolerance=1e-4)
+    taught.step(0, 0, 0.5, 0)
+    assert taught.table[0, 0] == pytest.approx(0.5 / (1 - gamma), abs=1e-4)
+
+
 def test_r_max_plans_the_optimum_of_what_it_has_counted():
     env = make_vec_env("FrozenLake-v1", 2, seed=0)
     settings = {"known_after": 4, "value_bound": 1.0, "gamma": 0.9, "tolerance": 1e-9}
