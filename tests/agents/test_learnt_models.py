@@ -4,15 +4,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
+from agents.tabular.models.dyna_q_plus import DatedModelPolicy
+from agents.tabular.models.model_policy import MOST_BYTES, ModelPolicy
+from agents.tabular.models.r_max import CountedModelPolicy
 from agents.tabular.models.sweeping_model import NONE
 from agents.tabular.models.sweeping_policy import _are_lists, _is_queue
 from agents.tabular.temporal_difference import learn_from_all
 from envs.known_models import transition_model
 from mdp import TransitionModel, value_iteration
+from safe_files.limits import MAX_ARCHIVE_BYTES
 from tests.agents.test_engine import differences, make, state_of
 from tests.agents.test_temporal_difference import Spaces
 
@@ -248,6 +253,13 @@ def test_r_max_by_hand():
     assert taught.agent.policy.visit_counts[0].tolist() == [[2, 3], [0, 0]]
 
 
+@pytest.mark.parametrize("gamma", [0.0, 0.5, 0.999, 0.9999])
+def test_r_max_keeps_to_its_tolerance(gamma):
+    taught = Taught("r_max", 1, gamma=gamma, known_after=1, tolerance=1e-4)
+    taught.step(0, 0, 0.5, 0)
+    assert taught.table[0, 0] == pytest.approx(0.5 / (1 - gamma), abs=1e-4)
+
+
 def test_r_max_plans_the_optimum_of_what_it_has_counted():
     env = make_vec_env("FrozenLake-v1", 2, seed=0)
     settings = {"known_after": 4, "value_bound": 1.0, "gamma": 0.9, "tolerance": 1e-9}
@@ -395,6 +407,19 @@ def test_a_model_of_another_shape_is_refused():
         agent.learn(10)
 
 
+@pytest.mark.parametrize("kind", [ModelPolicy, DatedModelPolicy, CountedModelPolicy])
+def test_the_largest_model_fits_into_a_file_that_is_read_again(kind):
+    policy = kind(spaces.Discrete(1000), spaces.Discrete(4))
+    most = policy._most_outcomes()
+    policy.keep_outcomes(most)
+    size = sum(array.nbytes for array in policy.buffers())
+    per_outcome = sum(array[..., 0].nbytes for array in policy.buffers() if array.shape[-1] == most)
+    # Numbers of which there is one are counted for each state.
+    assert MOST_BYTES - per_outcome - 16_000 <= size <= MOST_BYTES < MAX_ARCHIVE_BYTES
+    with pytest.raises(ValueError, match=f"at most {most} of each"):
+        policy.keep_outcomes(most + 1)
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "complaint"),
     [
@@ -410,14 +435,14 @@ def test_a_model_of_another_shape_is_refused():
             "outcomes_kept must be a whole .* at least 1",
         ),
         ("dyna_q", {"outcomes_kept": True}, "outcomes_kept must be a whole number .*, not True"),
-        ("dyna_q", {"outcomes_kept": 10**7}, "at most 1562500 of each"),
+        ("dyna_q", {"outcomes_kept": 10**7}, "at most 925212 of each"),
         ("dyna_q_plus", {"kappa": -0.1}, "kappa must be at least 0"),
         ("dyna_q_plus", {"kappa": float("inf")}, "kappa must be finite"),
         ("prioritized_sweeping", {"threshold": -1.0}, "threshold must be at least 0"),
         ("prioritized_sweeping", {"planning_steps": 1e9}, "planning_steps must be a whole number"),
         ("r_max", {"gamma": 1.0, "value_bound": 1.0}, "gamma must be below 1"),
         ("r_max", {"known_after": 0}, "known_after must be a whole number of at least 1, not 0"),
-        ("r_max", {"known_after": 10**30}, "known_after must be at most 100000000, not 1000"),
+        ("r_max", {"known_after": 10**30}, "known_after must be at most 1000000000, not 1000"),
         ("r_max", {"tolerance": 0.0}, "tolerance must be above 0"),
     ],
 )

@@ -13,7 +13,7 @@ from mdp.array_types import Bools, Floats, Ints
 from mdp.machine_code import inlined
 
 # Of the largest value: what one sweep after the other goes on changing by rounding.
-ROUNDING = 1e-14
+ROUNDING = 1e-13
 
 
 class CountedModel(NamedTuple):
@@ -111,5 +111,5 @@ def replan(agent: TabularAgent) -> None:
     while True:
         change, largest = sweep_states(agent)
         off = change * gamma / (1.0 - gamma)
-        if off <= agent.settings.tolerance or change * (1.0 - gamma) <= ROUNDING * largest:
+        if off <= agent.settings.tolerance or change <= ROUNDING * largest:
             return

@@ -12,7 +12,6 @@ from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import next_uniform
 from agents.tabular.models.learnt_models import add_pair, n_kept, note_outcome
 from agents.tabular.models.model_keeping import MOST_PLANNING, ModelKeeper
-from agents.tabular.models.model_policy import MOST_OUTCOMES
 from agents.tabular.q_learning import QLearning
 from agents.tabular.temporal_difference import TabularAgent, update
 from agents.tabular.value_tables import best_value
@@ -117,4 +116,4 @@ class DynaQ(ModelKeeper, QLearning):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         check_whole(0, settings_of(self, "planning_steps"), MOST_PLANNING)
-        check_whole(1, settings_of(self, "outcomes_kept"), MOST_OUTCOMES)
+        check_whole(1, settings_of(self, "outcomes_kept"))

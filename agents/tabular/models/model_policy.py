@@ -12,8 +12,10 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from agents.tabular.models.learnt_models import LearntModel
 from agents.tabular.q_table_policy import QTablePolicy
+from safe_files.limits import MAX_ARCHIVE_BYTES
 
-MOST_OUTCOMES = 10**8  # 1.7 GB
+# What is kept has to fit into a model file that is read again, with a little besides.
+MOST_BYTES = MAX_ARCHIVE_BYTES * 15 // 16
 
 
 class ModelPolicy(QTablePolicy):
@@ -56,17 +58,27 @@ class ModelPolicy(QTablePolicy):
         Raises:
             ValueError: if they would take too much memory.
         """
-        n_pairs = self.visit_counts[0].numel()
-        if n * n_pairs > MOST_OUTCOMES:
+        most = self._most_outcomes()
+        if n > most:
             raise ValueError(
-                f"{n} outcomes of {n_pairs} pairs of state and action are too many to keep: "
-                f"at most {MOST_OUTCOMES // n_pairs} of each"
+                f"{n} outcomes of {self.visit_counts[0].numel()} pairs of state and action are too "
+                f"many to keep: at most {most} of each"
             )
         if n != self.outcomes_kept:
             self.outcomes_kept = n
             n_states, n_actions = self.visit_counts.shape[1:]
             for name, array in self._nothing_learnt(n_states, n_actions, n).items():
                 self.register_buffer(f"model_{name}", th.from_numpy(array))
+
+    def _most_outcomes(self) -> int:
+        """How many outcomes of each pair a model file has room for."""
+        n_states, n_actions = self.visit_counts.shape[1:]
+        with_one, with_two = (
+            n_states * sum(a.nbytes for a in self._nothing_learnt(1, n_actions, n).values())
+            for n in (1, 2)
+        )
+        tables = self.q_tables.nbytes + self.visit_counts.nbytes
+        return max(1 + (MOST_BYTES - tables - with_one) // (with_two - with_one), 0)
 
     def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
         """The arrays of a model, by name, before anything was seen."""

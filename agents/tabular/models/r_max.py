@@ -15,7 +15,7 @@ from agents.tabular.models.counted_models import (
     replan,
 )
 from agents.tabular.models.model_keeping import ModelKeeper
-from agents.tabular.models.model_policy import MOST_OUTCOMES, ModelPolicy
+from agents.tabular.models.model_policy import ModelPolicy
 from agents.tabular.optimistic_algorithm import OptimisticAlgorithm
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import best_value
@@ -116,7 +116,7 @@ class RMax(ModelKeeper, OptimisticAlgorithm):
         super()._check_arguments()
         if self.gamma == 1:
             raise ValueError("gamma must be below 1, so that planning comes to an end")
-        check_whole(1, settings_of(self, "known_after"), MOST_OUTCOMES)
+        check_whole(1, settings_of(self, "known_after"))
         check_above_zero(settings_of(self, "tolerance"))
         check_finite(settings_of(self, "tolerance"))
 
