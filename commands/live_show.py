@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+from rich.cells import cell_len
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.table import Table
@@ -17,9 +18,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from pipeline.action_figures import ActionFigures, action_figures
 from pipeline.playing import FrameTaker
 
-BAR = 12  # letters
-# Beside the map: a name, a bar and a number.
+# In letters: a bar, a number such as -1.235e-05 or "probability", and what lies beside the map.
+BAR = 12
+NUMBER = 11
 FIGURES_WIDTH = 36
+GAP = 3
+# In lines: what is above the map, what is above the figures, and one for the cursor.
+HEADINGS = 3
 MOST_ACTIONS = 20
 
 
@@ -92,31 +97,58 @@ class LiveShow:
         title = Text(f"episode {len(self.returns) + 1}, step {self._step}", style="dim")
         if figures is None or chosen is None:
             return Group(title, drawn)
-        table = figures_table(figures, chosen, self._names)
-        width = max((line.cell_len for line in drawn.split()), default=0)
-        if width + FIGURES_WIDTH > self._live.console.width:
+        lines = drawn.split()
+        width = max((line.cell_len for line in lines), default=0)
+        columns, rows = self._live.console.width, self._live.console.height - HEADINGS
+        is_beside = width + GAP + FIGURES_WIDTH <= columns
+        if is_beside:
+            columns -= width + GAP
+        else:
+            rows -= len(lines)
+        table = figures_table(figures, chosen, self._names, min(rows, MOST_ACTIONS), columns)
+        if not is_beside:
             return Group(title, drawn, table)
-        beside = Table.grid(padding=(0, 3))
+        beside = Table.grid(padding=(0, GAP))
         beside.add_row(drawn, table)
         return Group(title, beside)
 
 
-def figures_table(figures: ActionFigures, chosen: int, names: tuple[str, ...]) -> Table:
+def figures_table(
+    figures: ActionFigures,
+    chosen: int,
+    names: tuple[str, ...],
+    n_shown: int = MOST_ACTIONS,
+    width: int = FIGURES_WIDTH,
+) -> Table:
     """A row for each action, with a bar between the lowest and the highest; the chosen one marked.
 
-    Of very many actions the first are shown, and the chosen one.
+    Columns are as wide whatever they hold, so that nothing moves but what changes.
+
+    Args:
+        figures: what the agent makes of its actions.
+        chosen: what it is about to do.
+        names: what actions are called, as far as they have names.
+        n_shown: how many there is room for: the first ones, and the chosen one in any case.
+        width: letters that there is room for; bars take what is left, and none where that is none.
     """
+    n_shown = max(n_shown, 1)
+    shown = [*range(min(n_shown, len(figures.numbers)))]
+    if chosen not in shown:
+        shown[-1] = chosen
+    words = [names[action] if action < len(names) else str(action) for action in shown]
+    longest = max(map(cell_len, ["action", *words]))
+    bar = max(min(BAR, width - longest - NUMBER - 4), 0)
     table = Table.grid(padding=(0, 1))
+    for columns in (1, longest, NUMBER, bar):
+        table.add_column(width=columns, no_wrap=True, overflow="crop")
+    table.add_row("", "action", figures.word, "", style="dim")
     low, high = float(np.min(figures.numbers)), float(np.max(figures.numbers))
     low = 0.0 if figures.word == "probability" else low
-    table.add_row("", "action", figures.word, "", style="dim")
-    for action, number in enumerate(figures.numbers.tolist()):
-        if action >= MOST_ACTIONS and action != chosen:
-            continue
-        share = (number - low) / (high - low) if high > low else 0.0
-        name = names[action] if action < len(names) else str(action)
-        bar = "#" * round(BAR * share)
-        style = "bold" if action == chosen else ""
-        mark = ">" if action == chosen else " "
-        table.add_row(mark, Text(name), f"{number:.4g}", Text(bar), style=style)
+    for action, name in zip(shown, words, strict=True):
+        number = float(figures.numbers[action])
+        share = (number - low) / (high - low) if 0 < high - low < np.inf else 0.0
+        mark, style = (">", "bold") if action == chosen else (" ", "")
+        table.add_row(
+            mark, Text(name), f"{number:.4g}", Text("#" * round(bar * share)), style=style
+        )
     return table

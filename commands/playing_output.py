@@ -15,7 +15,7 @@ from rich.console import Console
 
 from commands.live_show import LiveShow
 from commands.run_output import describe, describe_measured, episodes, print_refusal
-from envs.layout import DOWN, LEFT, RIGHT, UP, grid_layout
+from envs.layout import action_names
 from pipeline.errors import UserError
 from pipeline.evaluation.asked_policies import why_not_exact
 from pipeline.evaluation.bracketed import bracketed_yardstick
@@ -30,7 +30,6 @@ from pipeline.signs_of_life import Activity, can_move, doing
 from pipeline.train_spec import TrainSpec
 
 FRAMES_PER_SECOND = 4
-_WORDS = {UP: "up", DOWN: "down", LEFT: "left", RIGHT: "right"}
 
 
 @dataclass(frozen=True)
@@ -164,9 +163,7 @@ def _show_of(console: Console, request: PlayingRequest, model: Any, env: Any) ->
     taker = FrameTaker(env)
     if request.mode != "ansi" or not can_move(console) or console.quiet:
         return _Show(Activity(console, "playing"), request.mode, taker)
-    layout = grid_layout(env.unwrapped.envs[0])
-    names = tuple(_WORDS.get(move, str(move)) for move in layout.moves) if layout else ()
-    return LiveShow(console, model, taker, request.fps, names)
+    return LiveShow(console, model, taker, request.fps, action_names(env.unwrapped.envs[0]))
 
 
 def _write_film(console: Console, path: Path, frames: list[Any]) -> None:

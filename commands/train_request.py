@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import os
 from dataclasses import fields
 from pathlib import Path
 from secrets import randbelow
+from tempfile import TemporaryFile
 from typing import Any
 
 from commands.parsing import check_device, check_tensorboard
@@ -72,10 +72,13 @@ def _page_path(args: argparse.Namespace) -> Path | None:
         raise UserError(f"--watch-learning writes a .html file, not {path.name!r}")
     if not path.absolute().parent.is_dir():
         raise UserError(f"--watch-learning: there is no folder {path.parent}")
-    if not os.access(path.absolute().parent, os.W_OK):
-        raise UserError(f"--watch-learning: nothing can be written in {path.parent}")
     if path.is_dir():
         raise UserError(f"--watch-learning: {path} is a folder")
+    try:
+        TemporaryFile(dir=path.absolute().parent).close()
+    except OSError as error:
+        reason = f"nothing can be written in {path.parent}: {error.strerror}"
+        raise UserError(f"--watch-learning: {reason}") from error
     return path
 
 

@@ -23,6 +23,7 @@ from mdp.array_types import Ints
 FREE, START, WALL, GOAL, TRAP, PRIZE = ".S#GXP"
 
 UP, DOWN, LEFT, RIGHT = MOVES
+_NAMES = {UP: "up", DOWN: "down", LEFT: "left", RIGHT: "right"}
 WORDS = {"#": "shelf", "M": "mine", "P": "power"}
 
 
@@ -140,3 +141,12 @@ def _letter(own: str, tile: Tile) -> str:
     if tile.terminated:
         return TRAP
     return FREE if tile.bonus is None else PRIZE
+
+
+def action_names(env: gym.Env[Any, Any]) -> tuple[str, ...]:
+    """What the actions of an environment are called; empty where it does not say."""
+    given = getattr(env.unwrapped, "action_names", None)
+    if isinstance(given, tuple | list):
+        return tuple(map(str, given))
+    layout = grid_layout(env)
+    return () if layout is None else tuple(_NAMES.get(move, str(move)) for move in layout.moves)

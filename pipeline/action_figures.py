@@ -11,6 +11,8 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.distributions import CategoricalDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 
+from agents.linear.softmax import SoftmaxAlgorithm
+from agents.linear.tile_algorithm import TileAlgorithm
 from mdp.array_types import Floats
 
 
@@ -44,6 +46,10 @@ def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | N
         if table is not None and isinstance(agent.observation_space, spaces.Discrete):
             row = int(np.asarray(observations).reshape(-1)[0])
             return ActionFigures(word, np.asarray(table)[row if len(table) > 1 else 0])
+    if isinstance(agent, SoftmaxAlgorithm):
+        return ActionFigures("probability", agent.action_probabilities(observations)[0])
+    if isinstance(agent, TileAlgorithm):
+        return ActionFigures("value", agent.policy.sums(observations)[0])
     with th.no_grad():
         return _of_network(policy, observations)
 

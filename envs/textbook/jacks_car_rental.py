@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
+from typing import ClassVar
 
 import numpy as np
 
@@ -82,6 +83,10 @@ class JacksCarRentalEnv(MaskedFiniteEnv):
     ## Version History
     - v0: the first version
     """
+
+    action_names: ClassVar[tuple[str, ...]] = tuple(
+        f"move {n:+d}" for n in range(-MOST_MOVED, MOST_MOVED + 1)
+    )
 
     def __init__(
         self,

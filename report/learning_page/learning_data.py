@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from envs.known_models import observations_of_states
-from envs.layout import GridLayout, grid_layout
+from envs.layout import GridLayout, action_names, grid_layout
 from mdp.array_types import Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.value_maps import MAX_STATES
@@ -120,13 +120,12 @@ def _place(
     env = make_single_env(spec, training=True)
     try:
         layout = layout or _layout_of(env, n_states)
-        given = getattr(env.unwrapped, "action_names", None)
+        names = action_names(env)
         n_arms = int(getattr(env.action_space, "n", n_actions))
     finally:
         env.close()
-    names = [str(name) for name in given] if isinstance(given, tuple | list) else []
     if len(names) < n_arms:
-        names = [f"action {action}" for action in range(n_arms)]
+        names = tuple(f"action {action}" for action in range(n_arms))
     return {
         "n_states": n_states,
         "actions": names[:n_arms],

@@ -23,7 +23,7 @@ def _words_of_steps(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     note = ""
     if data["is_cut"] and spec.watch_episodes:
         asked = _count(spec.watch_episodes, "episode")
-        note = f"a page of 3 MB has no room for the first {asked}: it ends before they do"
+        note = f"a page has room for {n_steps:,} steps, and ends before the first {asked} do"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
     return {

@@ -54,6 +54,7 @@ def test_the_page_that_plays_a_training(tmp_path, monkeypatch):
         (("--watch-episodes", "3"), "says how much --watch-learning shows: give that too"),
         (("--watch-learning", "page.pdf"), "writes a .html file, not 'page.pdf'"),
         (("--watch-learning", "no/page.html"), "there is no folder no"),
+        (("--watch-learning", "/proc/page.html"), "nothing can be written in /proc: No such file"),
     ]:
         with pytest.raises(UserError, match=complaint):
             spec_of(*words)

@@ -105,9 +105,39 @@ def test_bars_lie_between_the_lowest_and_the_highest():
     assert rows[1:] == [["a", "-1"], ["b", "0", "###"], [">", "2", "3", "#" * 12]]
 
 
-def test_of_many_actions_the_chosen_one_is_among_those_shown():
-    table = figures_table(ActionFigures("value", np.arange(100.0)), 99, ())
-    assert table.row_count == 1 + 20 + 1
+def rows_of(table, width=60):
+    console = TextConsole(file=io.StringIO(), width=width)
+    console.print(table)
+    return console.file.getvalue().splitlines()
+
+
+@pytest.mark.parametrize(("n_shown", "n_rows"), [(20, 20), (5, 5), (0, 1), (-3, 1)])
+def test_of_many_actions_the_chosen_one_is_among_those_there_is_room_for(n_shown, n_rows):
+    figures = ActionFigures("value", np.arange(100.0))
+    rows = rows_of(figures_table(figures, 99, (), n_shown))
+    assert len(rows) == 1 + n_rows
+    assert rows[-1].split() == [">", "99", "99", "#" * 12]
+    rows = rows_of(figures_table(figures, 0, (), n_shown))
+    assert len(rows) == 1 + n_rows
+    assert rows[1].split() == [">", "0", "0"]
+
+
+@pytest.mark.parametrize("numbers", [[np.nan, 1.0], [np.inf, 0.0], [0.0, 0.0]])
+def test_without_a_range_there_are_no_bars(numbers):
+    rows = rows_of(figures_table(ActionFigures("value", np.array(numbers)), 0, ()))
+    assert "#" not in "".join(rows)
+    assert rows[0].split() == ["action", "value"]
+
+
+def test_bars_give_way_where_it_is_narrow_and_nothing_moves_sideways():
+    figures = ActionFigures("probability", np.array([1e-5, 1.0]))
+    one, other = (
+        rows_of(figures_table(figures, chosen, ("left", "right"), width=width), width)
+        for chosen, width in ((0, 26), (1, 26))
+    )
+    assert {len(row) for row in (*one, *other)} == {26}
+    assert one[2].split() == ["right", "1", "#" * 5]
+    assert rows_of(figures_table(figures, 1, (), width=10), 30)[2].split() == [">", "1", "1"]
 
 
 def test_what_an_environment_draws_moves_no_cursor(pauses, monkeypatch):

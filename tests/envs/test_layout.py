@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from envs.known_models import transition_model
-from envs.layout import grid_layout
+from envs.layout import action_names, grid_layout
 
 UP, DOWN, LEFT, RIGHT = (-1, 0), (1, 0), (0, -1), (0, 1)
 
@@ -109,3 +109,12 @@ def test_moves_lead_where_the_layout_says(name):
             assert target in layout.collected_in(layout.layers[reached])
         assert model.terminated[state, action, 0] == (letters[target] in "GX")
     assert {letters[start] for start in np.flatnonzero(model.initial)} == {"S"}
+
+
+def test_actions_are_called_as_the_environment_says_or_by_their_moves():
+    assert action_names(gym.make("FrozenLake-v1")) == ("left", "down", "right", "up")
+    assert action_names(gym.make("envs:Warehouse-v0")) == ("up", "down", "left", "right")
+    moves = action_names(gym.make("envs:JacksCarRental-v0"))
+    assert (len(moves), moves[0], moves[5], moves[-1]) == (11, "move -5", "move +0", "move +5")
+    assert action_names(gym.make("envs:WindyGridworld-v0"))[:4] == ("up", "down", "left", "right")
+    assert action_names(gym.make("Taxi-v4")) == ()

@@ -53,6 +53,22 @@ def test_of_a_policy_that_samples_its_probabilities():
     assert shares == pytest.approx(np.exp(logs.numpy()), rel=1e-5)
 
 
+@pytest.mark.parametrize("env_id", ["FrozenLake-v1", "MountainCar-v0"])
+def test_on_tiles_values_or_what_is_made_of_preferences(env_id):
+    observation = np.array([5]) if env_id == "FrozenLake-v1" else np.array([[-0.5, 0.01]])
+    values = agent_of("semi_gradient_q", env_id)
+    values.policy.weights[:] = th.arange(values.policy.weights.shape[1])
+    word, numbers = action_figures(values, observation)
+    assert (word, numbers.argmax()) == ("value", len(numbers) - 1)
+    assert np.unique(np.diff(numbers)).size == 1
+    softmax = agent_of("actor_critic", env_id)
+    word, shares = action_figures(softmax, observation)
+    assert (word, shares.tolist()) == (
+        "probability",
+        [pytest.approx(1 / len(shares))] * len(shares),
+    )
+
+
 def test_where_there_is_no_such_figure():
     assert action_figures(agent_of("random"), np.array([0])) is None
     assert action_figures(agent_of("ppo", "Pendulum-v1", **SMALL), np.zeros((1, 3))) is None

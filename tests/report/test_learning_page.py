@@ -4,6 +4,7 @@ import base64
 import gzip
 import json
 import re
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -139,6 +140,10 @@ def test_a_page_is_no_larger_than_three_megabytes(watch, monkeypatch):
     cut = data_in(path.read_text(encoding="utf-8"))
     assert path.stat().st_size <= smaller
     assert cut["is_cut"]
+    asked = replace(training.spec, watch_episodes=3000)
+    write_learning_page(asked, training.watch, path)
+    said = r"a page has room for [\d,]+ steps, and ends before the first 3,000 episodes do"
+    assert re.search(said, path.read_text(encoding="utf-8"))
     n_steps = len(cut["steps"]["timesteps"])
     assert 1 < n_steps < 2000
     assert len(cut["moves"]["step"]) == n_steps

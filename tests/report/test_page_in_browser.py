@@ -782,6 +782,8 @@ def learning_pages(tmp_path_factory):
             "ppo",
             {"n_timesteps": 640, "n_steps": 32, "batch_size": 32, "engine": "compiled"},
         ),
+        "prizes": ("MineMaze-v0", "value_iteration", {"n_timesteps": 64}),
+        "tiles": ("MountainCar-v0", "semi_gradient_sarsa", {"n_timesteps": 50, "n_tiles": 2}),
     }
     try:
         trainings = {}
@@ -991,12 +993,26 @@ def test_a_table_that_diverges_is_shown_as_it_is(browser, learning_pages, tmp_pa
     assert browser.get_log("browser") == []
 
 
-@pytest.mark.parametrize("name", ["table", "rows", "map", "updates"])
+def test_of_prizes_each_set_has_its_map(browser, played):
+    evaluator = played("prizes").watch.evaluator
+    press(browser, Keys.END)
+    layers = Select(find(browser, "#layer"))
+    assert layers.first_selected_option.text == "none"
+    n_cells = evaluator.model.n_states // evaluator.layout.n_layers
+    for option, layer in zip(layers.options, range(evaluator.layout.n_layers), strict=True):
+        layers.select_by_value(option.get_attribute("value"))
+        arrows = [path.get_attribute("d") for path in find_all(browser, ".board .arrow")]
+        reached = evaluator.model.reachable[layer * n_cells : (layer + 1) * n_cells]
+        assert 0 < sum(map(bool, arrows)) <= reached.sum()
+
+
+@pytest.mark.parametrize("name", ["table", "rows", "map", "updates", "prizes", "tiles"])
 def test_on_a_phone_it_has_large_buttons_and_no_sideways_scroll(browser, played, name):
     played(name, width=390)
     press(browser, Keys.END)
     root = "document.documentElement"
     assert browser.execute_script(f"return {root}.scrollWidth <= {root}.clientWidth")
+    assert browser.get_log("browser") == []
     # No figure stands letter below letter.
     assert all(figure.size["width"] >= 80 for figure in find_all(browser, "#readout dd"))
     for button in find_all(browser, ".controls button, .controls select"):

@@ -12,7 +12,7 @@ const drawn = (name, attributes, text) => {
 // they differ from what they show.
 const boardOf = (data, low, high) => {
   const { layout } = data;
-  const width = layout === null ? Math.min(data.n_states, Math.max(10, Math.ceil(Math.sqrt(data.n_states)))) : layout.rows[0].length;
+  const width = layout === null ? Math.max(Math.min(data.n_states, Math.max(10, Math.ceil(Math.sqrt(data.n_states)))), 1) : layout.rows[0].length;
   const height = layout === null ? Math.ceil(data.n_states / width) : layout.rows.length;
   const nCells = layout === null ? data.n_states : width * height;
   const place = (cell) => [cell % width, Math.floor(cell / width)];

@@ -24,13 +24,28 @@ const mapShow = (data) => {
     ["Loss of entropy", "entropy_loss", data.logged.entropy_loss],
   ].filter(([, name]) => moments[name].some((value) => value !== null));
   const curves = figures.map(([word, name]) => curveOf(word, moments[name].map((value, i) => [place(i), value]))).filter((curve) => curve !== null);
-  const nLayers = data.layout === null ? 1 : data.layout.layers.length;
+  // Where prizes belong to the state, a map for each set of them that episodes can come to.
+  const nCells = data.layout === null ? data.n_states : data.n_states / data.layout.layers.length;
+  const layers = (data.layout?.layers ?? [[]]).flatMap((cells, layer) => {
+    const isReached = moments.values[0].slice(layer * nCells, (layer + 1) * nCells).some((value) => value !== null);
+    return isReached ? [{ layer, name: cells.map((cell) => board.name(cell)).join("; ") || "none" }] : [];
+  });
+  const pick = document.getElementById("layer");
+  document.getElementById("layer-pick").hidden = layers.length < 2;
+  layers.forEach(({ layer, name }) => {
+    const option = made("option", name);
+    option.value = layer;
+    pick.append(option);
+  });
+  let shownNow = 0;
   const draw = (position) => {
+    shownNow = position;
+    const layer = Number(pick.value);
     const [now, before] = [moments.values[position], moments.values[Math.max(position - 1, 0)]];
     const [actions, last] = [moments.actions[position], moments.actions[Math.max(position - 1, 0)]];
     const changed = actions.flatMap((action, state) => (now[state] !== null && action !== last[state] ? [state] : []));
-    board.draw(0, (state) => ({ value: now[state], actions: now[state] === null ? [] : [actions[state]] }));
-    board.mark(0, changed.map((state) => ({ state, action: null, isUp: now[state] >= before[state] })), []);
+    board.draw(layer, (state) => ({ value: now[state], actions: now[state] === null ? [] : [actions[state]] }));
+    board.mark(layer, changed.map((state) => ({ state, action: null, isUp: now[state] >= before[state] })), []);
     board.svg.setAttribute("aria-label", `The agent's policy on the map after ${timesteps[position]} steps`);
     document.getElementById("readout").replaceChildren(listOf([
       ["environment steps", shown(timesteps[position], 12)],
@@ -39,7 +54,7 @@ const mapShow = (data) => {
         const words = name === "return" ? `${value} (optimum ${shown(data.optimum)})` : value;
         return [logged === null ? word.toLowerCase() : logged, words];
       }),
-      ["changed its action", `in ${changed.length} state${changed.length === 1 ? "" : "s"}${nLayers > 1 ? ", of all sets of prizes" : ""}`],
+      ["changed its action", `in ${changed.length} state${changed.length === 1 ? "" : "s"}${layers.length > 1 ? ", with any prizes" : ""}`],
     ]));
     curves.forEach((curve) => curve.go(place(position)));
     const number = moments.number[position];
@@ -47,6 +62,7 @@ const mapShow = (data) => {
     if (number === moments.number[position - 1]) return "at the end";
     return `${unit} ${number.toLocaleString("en")} of ${data.n_units.toLocaleString("en")}`;
   };
+  pick.addEventListener("change", () => draw(shownNow));
   return {
     n: timesteps.length - 1,
     draw,

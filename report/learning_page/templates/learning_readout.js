@@ -57,7 +57,7 @@ const stepFacts = (moves, changes, board) => {
   const [only] = changes;
   const facts = [
     ["episode", `${move.episode + 1}, return so far ${shown(move.episode_return)}`],
-    ["state", `${board.name(move.obs)} → ${board.name(move.next_obs)}`],
+    ...(move.obs < 0 ? [] : [["state", `${board.name(move.obs)} → ${board.name(move.next_obs)}`]]),
     ["action", board.action(move.action)],
     ["reward", shown(move.reward) + ENDS[move.end]],
     ["target", move.target === null ? "not told" : shown(move.target, 6)],
