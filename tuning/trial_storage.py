@@ -23,7 +23,7 @@ SECONDS_TO_CONNECT = 15  # to a proxy
 _LONGEST_LINE = 1 << 20  # bytes
 _TRIES, _SECONDS_BETWEEN_TRIES = 5, 0.2
 # Whose errors are the storage's.
-_LIBRARIES = frozenset({"optuna", "sqlalchemy", "sqlite3", "grpc"})
+_LIBRARIES = frozenset({"optuna", "sqlalchemy", "sqlite3", "grpc", "json"})
 _JOURNAL = "journal:"
 _GRPC = "grpc"
 _SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://)", re.IGNORECASE)
@@ -75,9 +75,10 @@ def failing_in_a_line(given: str | None) -> Iterator[None]:
         if not _LIBRARIES & {kind.__module__.partition(".")[0] for kind in type(error).__mro__}:
             raise
         name = OWN_FILE if given is None else f"--storage {without_secret(given)}"
-        raise UserError(
-            f"{name}: {_reason(error)}; what is done stays, and the same command goes on"
-        ) from error
+        goes_on = "; what is done stays, and the same command goes on"
+        if isinstance(error, json.JSONDecodeError):
+            name, goes_on = f"{name} is damaged", ""
+        raise UserError(f"{name}: {_reason(error)}{goes_on}") from error
 
 
 def kind_of(given: str) -> Literal["journal", "proxy", "database"]:

@@ -1,5 +1,6 @@
 """Where trials are kept, as --storage says it."""
 
+import json
 import sys
 
 import pytest
@@ -87,5 +88,7 @@ def test_a_storage_that_goes_while_it_is_used_is_one_line(tmp_path):
     expected = r"^trials\.db: .*; what is done stays, and the same"
     with pytest.raises(UserError, match=expected), failing_in_a_line(None):
         storage.create_new_study([1], "s")
+    with pytest.raises(UserError, match=r"^trials\.db is damaged: "), failing_in_a_line(None):
+        json.loads("[1")
     with pytest.raises(KeyError), failing_in_a_line(None):  # not the storage's
         raise KeyError("x")
