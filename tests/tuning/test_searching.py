@@ -51,7 +51,7 @@ def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path
 
 
 def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
-    def full(dir):
+    def full(**_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     place = toy.opened(toy.tuning(), tmp_path)
