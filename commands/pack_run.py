@@ -53,6 +53,8 @@ def main() -> int:
         told = f"{path}: {check_pack(path)} files, each as it was packed"
         console.print(told, markup=False, soft_wrap=True)
         return 0
+    if not path.is_dir():
+        raise UserError(f"{path} is a file: name the folder of a run")
     target = pack(path, default_target(path) if args.target is None else Path(args.target))
     console.print(f"pack  {target}", markup=False, soft_wrap=True)
     console.print(f"play  {called_as('enjoy')} {target}", markup=False, soft_wrap=True)

@@ -16,6 +16,7 @@ from rich.console import Console
 from commands.live_show import LiveShow
 from commands.run_output import describe, describe_measured, episodes, print_refusal
 from envs.layout import action_names
+from pipeline.environment_mistakes import lacking_packages_told
 from pipeline.errors import UserError
 from pipeline.evaluation.asked_policies import why_not_exact
 from pipeline.evaluation.bracketed import bracketed_yardstick
@@ -138,7 +139,7 @@ def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None
         model = load_to_play(spec.algo, chosen.file, env, spec.device, spec.user_modules)
         env.seed(spec.seed)
     show = _show_of(console, request, model, env)
-    with show.shown():
+    with show.shown(), lacking_packages_told(spec.env_id):
         for total_return, length in play_episodes(
             model,
             env,

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import pandas as pd
 
 from experiments.evidence import Evidence, evidence_on
 from experiments.looks import Standing
@@ -101,6 +102,7 @@ class EnvironmentAnalysis:
         seeds: by agent, how many seeds it was to have.
         look: which look at these runs it is.
         optimum_at_least: the lower end of the optimum's bracket; None where there is none.
+        optima: by agent, where agents play environments whose optima differ; else empty.
     """
 
     environment: str
@@ -120,6 +122,7 @@ class EnvironmentAnalysis:
     seeds: Mapping[str, int] = field(default_factory=dict)
     look: Standing = field(default_factory=Standing)
     optimum_at_least: float | None = None
+    optima: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -195,7 +198,16 @@ def _analyse_environment(
         seeds=evidence.seeds,
         look=look,
         optimum_at_least=evidence.optimum_at_least,
+        optima=_differing_optima(table),
     )
+
+
+def _differing_optima(table: pd.DataFrame) -> dict[str, float]:
+    """By agent, the optimum on the first seed, of which maps and arms may depend."""
+    known = table[table["seed"] == table["seed"].min()].dropna(subset=["optimum"])
+    optima = {str(row["agent"]): float(row["optimum"]) for _, row in known.iterrows()}
+    alike = len(optima) < 2 or np.allclose([*optima.values()], next(iter(optima.values())))
+    return {} if alike else optima
 
 
 def _pairs(evidence: Evidence, names: Sequence[str], look: Standing) -> list[PairComparison]:

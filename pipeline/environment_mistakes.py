@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import inspect
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium as gym
@@ -31,6 +32,19 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
     if kwargs and not any(name in what for name in kwargs):
         what += f" (with {', '.join(f'{name}={shown(value)}' for name, value in kwargs.items())})"
     return UserError(f"{env_id}: {what}")
+
+
+@contextmanager
+def lacking_packages_told(env_id: str) -> Iterator[None]:
+    """Say in a line which package an environment lacks, as it may only find when it is drawn.
+
+    Raises:
+        UserError: in the place of Gymnasium's own error.
+    """
+    try:
+        yield
+    except gym.error.DependencyNotInstalled as error:
+        raise UserError(f"{env_id}: {one_line(error)}") from error
 
 
 def _creator(env_id: str) -> tuple[Mapping[str, inspect.Parameter], str]:

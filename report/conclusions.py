@@ -54,6 +54,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
         pairs=tuple(pair_sentences(study, environment)),
         failed=_on_failed(environment),
         notes=(
+            *_on_other_tasks(environment),
             *on_unreliable(environment),
             *speed_sentences(environment),
             *_on_the_impossible(study, environment),
@@ -201,6 +202,16 @@ def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
         return False
     reach = baseline + environment.margin
     return all(agent.metric.median.point <= reach for agent in environment.agents)
+
+
+def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """That agents do not play the same environment, since one's settings change it."""
+    if environment.optima:
+        each = [f"{number(optimum)} for {name}" for name, optimum in environment.optima.items()]
+        yield (
+            f"The agents do NOT PLAY THE SAME ENVIRONMENT: the optimum is {enumeration(each)}. "
+            "Their returns cannot be compared."
+        )
 
 
 def _on_the_impossible(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:

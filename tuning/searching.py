@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
@@ -15,6 +16,7 @@ from experiments.launching import Launcher, RunFailure
 from experiments.planned_runs import PlannedRun
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
+from pipeline.files import DISK_ERRORS
 from pipeline.json_text import plain
 from tuning.judging import UnjudgedError, judged, outcome_of
 from tuning.suggesting import Suggestions
@@ -36,6 +38,7 @@ if TYPE_CHECKING:
 SECONDS_BETWEEN_LOOKS = 1.0
 # So many that fail in a row, and none before that did not: then it is not their settings.
 MOST_FAILURES = 5
+_ROOM_FOR_A_RUN = 1 << 18  # bytes, of a small one
 
 Hopeless = Callable[[int, Mapping[int, float]], bool]
 
@@ -190,6 +193,7 @@ class Search:
     def _note(self, each: TrialUnderWay, planned: PlannedRun, failure: RunFailure | None) -> None:
         """Take in what came of a run."""
         if failure is not None:
+            _check_room(self.root)
             where = "" if failure.log is None else f"; see {failure.log}"
             self._fail(each, f"seed {planned.seed}: {failure.reason}{where}")
             return
@@ -246,6 +250,23 @@ class Search:
             if other is each:
                 future.cancel()  # those that have begun go on, and their folders stay
         self.listener.trial_ended(each.trial.number, value, reason)
+
+
+def _check_room(root: Path) -> None:
+    """Make sure that it is no full disk that runs fail of, which says nothing of their settings.
+
+    Raises:
+        UserError: if it is full.
+    """
+    try:
+        with tempfile.TemporaryFile(dir=root) as file:
+            file.write(bytes(_ROOM_FOR_A_RUN))
+    except OSError as error:
+        if error.errno in DISK_ERRORS:
+            raise UserError(
+                f"{root}: {error.strerror}: make room; what is done stays, and the same command "
+                "goes on"
+            ) from error
 
 
 @contextlib.contextmanager

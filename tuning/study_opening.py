@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
 
 ASKED = "asked"
+SPACE = "search_space"
 _MOST_NAMED = 3
 
 
@@ -63,7 +64,10 @@ def open_study(
 def _difference(name: str, before: Any, asked: Mapping[str, Any]) -> str:
     there, now = _flat(before), _flat(asked)
     named = [
-        f"{key}: {shown(there.get(key))} there, {shown(now.get(key))} now"
+        # Distributions as JSON are no reading matter.
+        key
+        if key.startswith(SPACE)
+        else f"{key}: {shown(there.get(key))} there, {shown(now.get(key))} now"
         for key in {**there, **now}
         if there.get(key) != now.get(key)
     ]

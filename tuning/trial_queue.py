@@ -49,7 +49,7 @@ class TrialQueue:
         self.token = secrets.token_hex(8)
         self._n_signs = 0
         self._heard: dict[str, tuple[object, float]] = {}
-        self._heart = Heartbeat(self._give_sign, SECONDS_BETWEEN_SIGNS)
+        self._heart = Heartbeat(self._try_to_give_sign, SECONDS_BETWEEN_SIGNS)
 
     def __enter__(self) -> TrialQueue:
         self._add_places()
@@ -154,6 +154,11 @@ class TrialQueue:
     def _give_sign(self) -> None:
         self._n_signs += 1
         self.storage.set_study_user_attr(self.study_id, _sign(self.token), self._n_signs)
+
+    def _try_to_give_sign(self) -> None:
+        # A storage that is gone for a moment is no reason to fall silent for good.
+        with contextlib.suppress(Exception):
+            self._give_sign()
 
     def _add_places(self) -> None:
         from optuna.trial import TrialState, create_trial

@@ -49,3 +49,14 @@ def test_mistakes_end_in_one_line(type_command, lake, tmp_path):
     (tmp_path / "there.zip").write_bytes(b"PK\x05\x06" + bytes(18))
     code, _, err = type_command("pack", "there.zip", "--check")
     assert (code, err.count("\n")) == (2, 1)
+
+
+def test_a_package_that_drawing_lacks_is_one_line(type_command, lake, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    type_command("pack", lake, "there.zip")
+    film = ("enjoy.py", "there.zip", "--record", "film.gif", "--n-episodes", "1")
+    code, _, err = type_command(*film)
+    assert (code, len(err.splitlines())) == (2, 1)
+    assert err.startswith("enjoy.py: error: FrozenLake-v1: pygame is not installed")
+    code, _, err = type_command("pack", "there.zip", "other")
+    assert (code, err) == (2, "pack: error: there.zip is a file: name the folder of a run\n")

@@ -387,6 +387,16 @@ def test_more_than_any_policy_can_reach_stands_in_the_conclusions(tmp_path):
     assert "qlearning has MORE THAN ANY POLICY CAN REACH, 520: the environment is not" in text
 
 
+def test_agents_that_play_other_environments_are_not_compared_in_silence(tmp_path):
+    results = bracketed_results(
+        tmp_path, (420.0, 520.0), {"qlearning": [400.0] * 4, "sarsa": [400.0] * 4}
+    )
+    assert "SAME ENVIRONMENT" not in said(results)
+    results.summary.loc[results.summary["agent"] == "sarsa", "optimum"] = 700.0
+    told = "NOT PLAY THE SAME ENVIRONMENT: the optimum is 520 for qlearning and 700 for sarsa."
+    assert told in said(results)
+
+
 @pytest.mark.parametrize(
     ("env_id", "ends", "threshold"),
     [

@@ -1,11 +1,14 @@
 """Searches over a toy: what is tried and ended, and what becomes of it after a kill."""
 
+import errno
 import math
+import os
 
 import numpy as np
 import pytest
 
 from pipeline.errors import UserError
+from tuning import searching
 from tuning.trial_queue import FAILURE, FIGURES, SETTINGS
 
 
@@ -45,6 +48,18 @@ def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path
     assert ended
     assert all(len(trial.user_attrs[FIGURES]) < 5 for trial in ended)
     assert len(launcher.done) == sum(len(t.user_attrs[FIGURES]) for t in place.queue.trials())
+
+
+def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
+    def full(**_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    place = toy.opened(toy.tuning(), tmp_path)
+    toy.search(place, toy.Launcher(stops_after=7))
+    monkeypatch.setattr(searching.tempfile, "TemporaryFile", full)
+    with pytest.raises(UserError, match="No space left on device: make room"):
+        toy.search(place, toy.Launcher(failing={0, 1, 2}))
+    assert set(toy.states(place)) == {"COMPLETE", "WAITING"}
 
 
 def test_a_cost_is_made_small(toy, tmp_path):
