@@ -33,10 +33,12 @@ class RunOutcome:
     Attributes:
         figure: what it is judged by.
         seconds: what it took.
+        name: of the figure: as asked for, but the final return where no score is known.
     """
 
     figure: float
     seconds: float
+    name: str
 
 
 def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
@@ -50,18 +52,18 @@ def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
     results = read_run(tuning.study, planned)
     if results is None:
         raise UnjudgedError("it has not finished")
-    row = results.rows[0]
-    if tuning.figure in ("steps", "seconds"):
+    row, name = results.rows[0], tuning.figure
+    if name in ("steps", "seconds"):
         figure = _cost(tuning, row, results.curves[0])
     else:
-        figure = _figure(row, tuning.figure)
-    return RunOutcome(figure, float(row["seconds"]))
+        if name == "score" and row.get(name) is None:  # where no optimum is known
+            name = "final"
+        figure = _figure(row, name)
+    return RunOutcome(figure, float(row["seconds"]), name)
 
 
 def _figure(row: Mapping[str, Any], name: str) -> float:
     value = row.get(name)
-    if name == "score" and value is None:
-        value = row.get("final")  # where no optimum is known
     if value is None or not math.isfinite(value):
         raise UnjudgedError(f"it has no figure for {name}")
     return float(value)

@@ -18,7 +18,7 @@ from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import DISK_ERRORS
 from pipeline.json_text import plain
-from tuning.judging import UnjudgedError, judged, outcome_of
+from tuning.judging import RunOutcome, UnjudgedError, judged, outcome_of
 from tuning.suggesting import Suggestions
 from tuning.trial_queue import (
     FAILURE,
@@ -203,6 +203,7 @@ class Search:
             self._fail(each, f"seed {planned.seed}: {error}")
             return
         self._failures = None
+        self._check_alike(outcome)
         each.figures[planned.seed] = outcome.figure
         each.seconds += outcome.seconds
         with _lost_to_others():
@@ -211,6 +212,15 @@ class Search:
             each.trial.set_user_attr(SECONDS, each.seconds)
             each.trial.report(self._value(each), len(each.figures))
         self._judge(each)
+
+    def _check_alike(self, outcome: RunOutcome) -> None:
+        """Scores and returns are not to be compared: an optimum may be known since an update."""
+        before = self.queue.judged_by(outcome.name)
+        if before != outcome.name:
+            raise UserError(
+                f"{self.tuning.study.name}: runs there were judged by {before}, and now by "
+                f"{outcome.name}: --name NAME makes a search of its own"
+            )
 
     def _value(self, each: TrialUnderWay) -> float:
         figures = list(each.figures.values())

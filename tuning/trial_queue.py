@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 # What a trial says of itself, besides what Optuna knows.
 DRIVER, FAILURE, FIGURES = "driver", "failure", "figures"
 SETTINGS, SECONDS = "settings", "seconds"
+# What the study says of all of its trials.
+JUDGED_BY = "judged by"
 
 SECONDS_BETWEEN_SIGNS = 15.0
 SECONDS_OF_SILENCE = 60.0
@@ -64,6 +66,13 @@ class TrialQueue:
         """All that there is a place for, by number."""
         found = self.storage.get_all_trials(self.study_id, deepcopy=False)
         return sorted(found, key=lambda trial: trial.number)[: self.n_trials]
+
+    def judged_by(self, figure: str) -> str:
+        """What runs of the study are judged by: as those before, and the first by ``figure``."""
+        attributes = self.storage.get_study_user_attrs(self.study_id)
+        if JUDGED_BY not in attributes:
+            self.storage.set_study_user_attr(self.study_id, JUDGED_BY, figure)
+        return str(attributes.get(JUDGED_BY, figure))
 
     def is_done(self) -> bool:
         """Whether every trial has ended."""

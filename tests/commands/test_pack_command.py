@@ -1,5 +1,7 @@
 """``yardstick pack`` as a user types it, and ``enjoy.py`` with what it makes."""
 
+import sys
+
 import pytest
 
 

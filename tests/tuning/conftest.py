@@ -98,10 +98,11 @@ def score(entry, seed):
     return 1.0 - abs(entry["learning_rate"] - 0.1) - abs(entry["gamma"] - 0.95) + 0.01 * seed
 
 
-def search(monkeypatch, place, launcher, figure=score, **options):
-    monkeypatch.setattr(
-        searching, "outcome_of", lambda _, run: RunOutcome(figure(run.entry, run.seed), 1.0)
-    )
+def search(monkeypatch, place, launcher, figure=score, judged_by="score", **options):
+    def outcome_of(_, run):
+        return RunOutcome(figure(run.entry, run.seed), 1.0, judged_by)
+
+    monkeypatch.setattr(searching, "outcome_of", outcome_of)
     with place.queue, suppress(KeyboardInterrupt):
         searching.Search(
             place.tuning,

@@ -62,6 +62,16 @@ def test_a_full_disk_says_nothing_of_settings(toy, tmp_path, monkeypatch):
     assert set(toy.states(place)) == {"COMPLETE", "WAITING"}
 
 
+def test_scores_are_not_compared_with_returns_of_before(toy, tmp_path):
+    """The optimum of an environment may be known since an update."""
+    place = toy.opened(toy.tuning(), tmp_path)
+    toy.search(place, toy.Launcher(stops_after=7), judged_by="final")
+    with pytest.raises(UserError, match=r"judged by final, and now by score: --name NAME makes"):
+        toy.search(place, toy.Launcher())
+    assert toy.search(place, toy.Launcher(), judged_by="final").done
+    assert toy.states(place) == ["COMPLETE"] * 10
+
+
 def test_a_cost_is_made_small(toy, tmp_path):
     place = toy.opened(toy.tuning(figure="steps"), tmp_path)
     toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])
