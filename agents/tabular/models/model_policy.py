@@ -78,7 +78,7 @@ class ModelPolicy(QTablePolicy):
             for n in (1, 2)
         )
         tables = self.q_tables.nbytes + self.visit_counts.nbytes
-        return max(1 + (MOST_BYTES - tables - with_one) // (with_two - with_one), 0)
+        return max(1 + int((MOST_BYTES - tables - with_one) // (with_two - with_one)), 0)
 
     def _nothing_learnt(self, n_states: int, n_actions: int, n: int) -> dict[str, Any]:
         """The arrays of a model, by name, before anything was seen."""
