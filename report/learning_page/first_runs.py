@@ -27,6 +27,7 @@ from report.learning_page.kept_pages import kept_page, note_page, page_path, wit
 from report.learning_page.learning_assembly import write_learning_page
 from report.page.sections import LearningPage, first_runs
 
+BATCH = "its runs were done as one batch, which leaves no agent"
 WITHOUT_STATES = StateKeeping(SaveInterval(is_off=True))
 
 
@@ -52,17 +53,22 @@ def write_first_pages(
         with local_executor(n_workers) as executor:
             kept |= _trained_again(executor, root, to_do, limits, tell)
     pages = [page for page in kept.values() if page is not None]
-    return pages + _of_batches(analysis, pages)
+    return pages + _without_run(analysis, pages)
 
 
-def _of_batches(analysis: StudyAnalysis, pages: list[LearningPage]) -> list[LearningPage]:
-    """The agents of which no run was done by itself."""
+def _without_run(analysis: StudyAnalysis, pages: list[LearningPage]) -> list[LearningPage]:
+    """The agents of which there is no run that could be trained again."""
     there = {(page.agent, page.environment) for page in pages}
-    return [
-        LearningPage(agent.agent, one.environment, 0, "", "its runs are a batch, without an agent")
+    batches = {(run.agent, run.environment) for run in analysis.results.finished if run.is_batch}
+    without = [
+        (agent.agent, one.environment)
         for one in analysis.environments
         for agent in one.agents
         if (agent.agent, one.environment) not in there
+    ]
+    return [
+        LearningPage(*names, 0, "", BATCH if names in batches else "no run of it has finished")
+        for names in without
     ]
 
 

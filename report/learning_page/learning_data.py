@@ -20,6 +20,7 @@ from pipeline.evaluation.value_maps import MAX_STATES
 from pipeline.train_spec import TrainSpec
 from pipeline.watching.map_recorder import LOGGED, MapRecorder
 from pipeline.watching.table_recorder import TableRecorder
+from report.page.sections import layout_data
 
 
 def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
@@ -129,7 +130,7 @@ def _place(
     return {
         "n_states": n_states,
         "actions": names[:n_arms],
-        "layout": None if layout is None else _layout_data(layout),
+        "layout": None if layout is None else layout_data(layout),
         "is_drawn": 1 < n_states <= MAX_STATES,
     }
 
@@ -142,12 +143,3 @@ def _layout_of(env: Any, n_states: int) -> GridLayout | None:
     seen = observations_of_states(env)
     is_number = seen is not None and np.array_equal(seen, np.arange(n_states))
     return layout if is_number else None
-
-
-def _layout_data(layout: GridLayout) -> dict[str, Any]:
-    return {
-        "rows": layout.rows,
-        "moves": layout.moves,
-        "names": dict(layout.names),
-        "layers": [layout.collected_in(layer) for layer in range(layout.n_layers)],
-    }

@@ -14,7 +14,7 @@ from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.planned_runs import PlannedRun
 from experiments.run_figures import read_value_maps
 from pipeline.environments import make_single_env
-from report.page.sections import Report, Section
+from report.page.sections import Report, Section, layout_data
 
 MAX_MAPS = 40  # of a run: more than a slider needs
 MIN_MAPS = 2  # the first and the last
@@ -54,7 +54,7 @@ def _environment_data(
         return None
     optimum = next(iter(maps.values()))
     return {
-        **_layout_data(layout),
+        **layout_data(layout),
         "matters": _digits(model.reachable),
         "optimum": {
             "values": optimum["optimal_values"],
@@ -108,15 +108,6 @@ def _read(run: PlannedRun, n_maps: int) -> Arrays:
         kept = np.linspace(0, n - 1, n_maps).round().astype(np.int64)
         arrays |= {name: arrays[name][kept] for name in ("timesteps", "values", "actions")}
     return arrays
-
-
-def _layout_data(layout: GridLayout) -> dict[str, Any]:
-    return {
-        "rows": layout.rows,
-        "moves": layout.moves,
-        "names": dict(layout.names),
-        "layers": [layout.collected_in(layer) for layer in range(layout.n_layers)],
-    }
 
 
 def _map_data(arrays: Arrays) -> dict[str, Any]:

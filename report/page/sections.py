@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 from urllib.parse import quote
 
+from envs.layout import GridLayout
 from experiments.analysis import StudyAnalysis
 from experiments.planned_runs import PlannedRun
 from pipeline.signs_of_life import Tell, tell_nobody
@@ -108,3 +109,13 @@ def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
 def estimate_data(estimate: Estimate) -> dict[str, float]:
     """A figure and its interval, for scripts."""
     return {"point": estimate.point, "low": estimate.low, "high": estimate.high}
+
+
+def layout_data(layout: GridLayout) -> dict[str, Any]:
+    """Where states lie on a map, for scripts."""
+    return {
+        "rows": layout.rows,
+        "moves": layout.moves,
+        "names": dict(layout.names),
+        "layers": [layout.collected_in(layer) for layer in range(layout.n_layers)],
+    }

@@ -106,11 +106,16 @@ def test_what_is_no_zip_is_damaged(analysis, monkeypatch):
         difference(run, run)
 
 
-def test_batches_of_bandits_are_named(done, made_up, tmp_path):
-    agents = [made_up.agent("ucb", 1.0)]
-    analysis = made_up.analysis([made_up.environment(agents)], ["ucb"], tmp_path)
-    pages, _ = done(analysis)
-    assert pages["ucb"].words == "its runs are a batch, without an agent"
+def test_agents_without_a_run_of_their_own_are_named(done, made_up, tmp_path):
+    agents = [made_up.agent("ucb", 1.0), made_up.agent("fails", 0.0)]
+    analysis = made_up.analysis([made_up.environment(agents)], ["ucb", "fails"], tmp_path)
+    batch = SimpleNamespace(
+        agent="ucb", environment="lake", is_batch=True, is_finished=True, path=tmp_path
+    )
+    results = replace(analysis.results, planned=(batch,))
+    pages, _ = done(replace(analysis, results=results))
+    assert pages["ucb"].words == first_runs.BATCH
+    assert pages["fails"].words == "no run of it has finished"
 
 
 def test_the_section_links_what_there_is_and_escapes_what_it_says(report_study, tmp_path):
