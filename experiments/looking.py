@@ -64,7 +64,7 @@ def _taken(looks: Looks, evidence: Evidence, question: Question) -> tuple[Looks,
         if earlier.shows(look):
             return looks, Standing(place + 1, looks.level_at(place), level)
     if _says_nothing(evidence, level):
-        return looks, Standing(len(looks.taken) + 1, level, level)
+        return looks, Standing(len(looks.taken) + 1, level, level, is_counted=False)
     looks = replace(looks, taken=(*looks.taken, look))
     return looks, Standing(len(looks.taken), level, looks.next_level)
 

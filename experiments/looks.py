@@ -157,12 +157,14 @@ class Standing:
         level: its error rate.
         next_level: that of the next.
         design: the looks that it is one of, which were settled beforehand; None for one by itself.
+        is_counted: False where there are too few runs to claim anything.
     """
 
     number: int = 1
     level: float = level_of_look(ALPHA, 1)
     next_level: float = level_of_look(ALPHA, 2)
     design: Design | None = None
+    is_counted: bool = True
 
 
 def question_of(study: StudySpec) -> Question:

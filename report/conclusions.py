@@ -255,6 +255,11 @@ def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:
             f"Agents got more seeds until they were decided, at up to {looks} fixed beforehand: "
             f"claims at {level} each."
         )
+    elif look.number > 1 and not look.is_counted:
+        yield (
+            f"This would be the {ordinal(look.number)} look at this study, with claims at {level}; "
+            "runs that are too few to claim anything are not counted as one."
+        )
     elif look.number > 1:
         yield f"This is the {ordinal(look.number)} look at this study: claims at {level}."
 

@@ -165,6 +165,8 @@ def test_page_and_terminal_say_which_look_it_is(tmp_path):
     results = results_of(study_of(n_seeds=8), tmp_path)
     text = everything_said(analyse(results, looks=take_looks(results)))
     assert "8 seeds cannot tell 2 agents apart, whatever they score; it takes 11 or more" in text
+    assert "This would be the third look at this study, with claims at 0.083 %; runs that" in text
+    assert "This is the" not in text
 
 
 def damages(data):
