@@ -1,0 +1,119 @@
+"""Looks at answers to the exercises on PPO and on figures over seeds; see `checker`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from answer_faults import RIGHT, TOLERANCE, answering, number_from
+
+
+@answering
+def check_score(score: Callable[..., float]) -> str:
+    """Whether a function is the score: a straight line through two points.
+
+    Args:
+        score: called with a return, the optimum and the baseline.
+    """
+
+    def told(earned: float, optimum: float = 80.0, baseline: float = -20.0) -> float:
+        return number_from(score, earned, optimum, baseline)
+
+    best, nothing, between = told(80.0), told(-20.0), told(30.0)
+    if abs(best) < TOLERANCE < abs(nothing):
+        return "The optimum has the score 0: that is a gap, and the score goes the other way."
+    if abs(best - 1) > TOLERANCE:
+        return f"The optimum has to have the score 1; with yours it has {best:.4g}."
+    if abs(nothing) > TOLERANCE:
+        return f"The baseline has to have the score 0; with yours it has {nothing:.4g}."
+    if abs(told(-120.0) + 1) > TOLERANCE:
+        return "Who is worse than the baseline should be seen to be: its score lies below 0."
+    if abs(between - 0.5) > TOLERANCE:
+        return "In the middle between baseline and optimum the score has to be 0.5."
+    if abs(told(7.0, 10.0, 5.0) - 0.4) > TOLERANCE:
+        return "It is right for one optimum and one baseline, and not for others."
+    return RIGHT
+
+
+@answering
+def check_gain(gain: Callable[..., float]) -> str:
+    """Whether a function is PPO's bounded gain, by where it moves with the ratio.
+
+    Args:
+        gain: called with ratio, advantage and epsilon.
+    """
+
+    def told(ratio: float, advantage: float, epsilon: float = 0.2) -> float:
+        return number_from(gain, ratio, advantage, epsilon)
+
+    if abs(told(1.0, 3.0) - 3) > TOLERANCE or abs(told(1.0, -3.0) + 3) > TOLERANCE:
+        return "Where new and old probability are equal the gain is the advantage."
+    if any(abs(told(ratio, 2.0) - 2 * ratio) > TOLERANCE for ratio in (0.9, 1.1)):
+        return "Within the bounds the gain is the ratio times the advantage."
+    if any(abs(told(ratio, -2.0) + 2 * ratio) > TOLERANCE for ratio in (0.9, 1.1)):
+        return "Within the bounds the gain is the ratio times the advantage, below 0 as well."
+    return fault_of_bounds(told)
+
+
+def fault_of_bounds(told: Callable[..., float]) -> str:
+    """What is wrong with a gain where the ratio is out of bounds."""
+    good_high, good_low = (told(ratio, 2.0) for ratio in (1.5, 0.5))
+    bad_high, bad_low = (told(ratio, -2.0) for ratio in (1.5, 0.5))
+    if np.allclose([good_high, good_low, bad_high, bad_low], [3, 1, -3, -1]):
+        return "Nothing is bounded: a ratio far from 1 goes on counting in both directions."
+    if abs(good_high - 2.4) > TOLERANCE:
+        return "A good action (advantage above 0) must gain no more once the ratio is at its bound."
+    if abs(good_low - 1) > TOLERANCE:
+        return (
+            "A good action that has become much less probable has to come back. With yours there "
+            "is nothing to be gained by that: the bound holds where it should not."
+        )
+    if abs(bad_high + 3) > TOLERANCE:
+        return (
+            "A bad action (advantage below 0) that has become much more probable has to come back. "
+            "With yours there is nothing to be gained by that. Is it the smaller of the two?"
+        )
+    if abs(bad_low + 1.6) > TOLERANCE:
+        return "A bad action must gain no more by becoming still less probable than at the bound."
+    return RIGHT if abs(told(1.5, 1.0, 0.1) - 1.1) < TOLERANCE else "Epsilon is not always 0.2."
+
+
+@answering
+def check_wins(wins: Callable[..., float]) -> str:
+    """Whether a function is the probability of improvement.
+
+    Args:
+        wins: called with the scores of two agents, arrays of any two lengths.
+    """
+
+    def told(first: list[float], second: list[float]) -> float:
+        return number_from(wins, np.array(first), np.array(second))
+
+    if not -TOLERANCE <= told([2.0, 4.0], [1.0, 3.0]) <= 1 + TOLERANCE:
+        return "A share lies between 0 and 1: divide by the number of pairs."
+    if abs(told([3.0, 1.0], [2.0, 0.0]) - told([1.0, 3.0], [2.0, 0.0])) > TOLERANCE:
+        return (
+            "It depends on the order of the seeds. Each run of the one is to meet each run of the "
+            "other, and not just the one beside it."
+        )
+    ties = told([1.0, 1.0], [1.0, 1.0])
+    if abs(ties - 0.5) > TOLERANCE:
+        return f"Two agents that always tie win half each; yours says {ties:.4g}."
+    if told([3.0, 4.0], [1.0, 2.0]) < told([1.0, 2.0], [3.0, 4.0]):
+        return "It is the share that the second agent wins."
+    lost, won = told([1.0, 2.0, 2.0], [0.0, 2.0, 3.0]), told([0.0, 2.0, 3.0], [1.0, 2.0, 2.0])
+    if abs(lost + won - 1) > TOLERANCE:
+        return "What the first wins the second loses: the two shares have to make 1."
+    return fault_of_share(told, won)
+
+
+def fault_of_share(told: Callable[..., float], won: float) -> str:
+    """What is wrong with a share that is symmetrical and in bounds."""
+    other = [3.0, 4.0, 5.0]
+    if abs(told([1.0, 2.0, 9.0], other) - told([1.0, 2.0, 6.0], other)) > TOLERANCE:
+        return "How far a run is ahead must not count, only that it is."
+    if abs(won - 5 / 9) > TOLERANCE:
+        return "Three runs against three are nine pairs. Does each of them count, and all alike?"
+    if abs(told([1.0, 4.0, 5.0], [2.0, 3.0]) - 2 / 3) > TOLERANCE:
+        return "It is right where both have the same number of seeds, and only there."
+    return RIGHT
