@@ -42,8 +42,9 @@ ConnectionFileMixin.curve_secretkey.default_value = secret_key
 # A lesson is run where it lies, so that it can import its checker. One that fails fails the build.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 120
+nb_execution_timeout = 300  # of a cell, on a busy machine that has compiled nothing yet
 nb_merge_streams = True
+nb_render_markdown_format = "myst"  # it has tables
 
 # Docstrings have their names between single backticks.
 default_role = "literal"

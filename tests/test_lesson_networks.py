@@ -23,11 +23,11 @@ ROWS = "A target has to depend on the values of its own next state alone"
     ("answer", "said"),
     [
         (targets, "Right."),
-        (lambda *_: ..., "Not done yet."),
-        (lambda rewards: rewards, "It cannot be called"),
+        (lambda *_: ..., "Not done yet: the function"),
+        (lambda rewards: rewards, "It fails when it is called"),
         (lambda r, t, v, d: (r + d * v.T).T, "The shape has to be (12,), one target for each step"),
         (lambda r, t, v, d: r[:, None] + d * v.max(axis=1), "The shape has to be (12,), one targ"),
-        (lambda r, t, v, d: r + d * v.max(axis=0), "It cannot be called: operands"),
+        (lambda r, t, v, d: r + d * v.max(axis=0), "It fails when it is called: operands"),
         (lambda r, t, v, d: r + d * v.max(), ROWS),
         (lambda r, t, v, d: r + d * v.max(axis=1), "When the episode has terminated nothing"),
         (lambda r, t, v, d: r + d * t * v.max(axis=1), "It is the wrong way round"),
@@ -73,7 +73,7 @@ def lagging(first, second):
     ("answer", "said"),
     [
         (doubled(online, lagging), "Right."),
-        (lambda *_: None, "Not done yet."),
+        (lambda *_: None, "Not done yet: the function"),
         (doubled(lagging, online), "The roles are the wrong way round"),
         (doubled(lagging, lagging), "The target network chooses and judges."),
         (doubled(online, online), "The target network has no part in it"),

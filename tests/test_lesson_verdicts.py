@@ -21,8 +21,8 @@ def score(earned, optimum, baseline):
     [
         (score, "Right."),
         (lambda *_: None, "Not done yet"),
-        (lambda earned: earned, "It cannot be called"),
-        (lambda earned, best, nothing: earned / (best - best), "It cannot be called or gives no"),
+        (lambda earned: earned, "It fails when it is called"),
+        (lambda earned, best, nothing: 1 // 0, "It fails when it is called: integer"),
         (lambda earned, best, nothing: best - earned, "The optimum has the score 0"),
         (lambda earned, best, nothing: 1 - score(earned, best, nothing), "The optimum has the sco"),
         (lambda earned, best, nothing: earned / best, "The baseline has to have the score 0"),

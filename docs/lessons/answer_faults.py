@@ -84,19 +84,32 @@ def answering(check: Callable[..., str]) -> Callable[..., str]:
     return checked
 
 
+def given_back(function: Callable[..., Any], *arguments: Any) -> Any:
+    """What a function that is an answer gives.
+
+    Raises:
+        AnswerError: if it cannot be called so, or gives nothing.
+    """
+    try:
+        given = function(*arguments)
+    except (TypeError, ValueError, IndexError, ArithmeticError) as fault:
+        raise AnswerError(f"It fails when it is called: {fault}") from None
+    if given is None or given is Ellipsis:
+        raise AnswerError("Not done yet: the function gives nothing back.")
+    return given
+
+
 def number_from(function: Callable[..., Any], *arguments: Any) -> float:
     """What a function that is an answer gives, as a finite number.
 
     Raises:
         AnswerError: if it cannot be called so, or gives something else.
     """
+    given = given_back(function, *arguments)
     try:
-        given = function(*arguments)
-        if given is None or given is Ellipsis:
-            raise AnswerError("Not done yet: the function gives nothing back.")
         number = float(given)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError) as fault:
-        raise AnswerError(f"It cannot be called or gives no number: {fault}") from None
+    except (TypeError, ValueError) as fault:
+        raise AnswerError(f"It has to give a number: {fault}") from None
     if not np.isfinite(number):
         raise AnswerError(f"It gives {number}, which is not finite.")
     return number

@@ -81,6 +81,9 @@ def check_episodes(episodes: Callable[..., float]) -> str:
         "There is one move too few: the lowest cell has to be left to the right as well.": (
             epsilons / 2 / chances
         ),
+        "Those before the first success are counted. That episode itself is to be counted too.": (
+            1 / chances - 1
+        ),
         "Half of all divers are done by then. Those who are not raise the mean.": (
             np.log(2) / chances
         ),

@@ -13,6 +13,7 @@ from answer_faults import (
     Floats,
     answering,
     fault_of_array,
+    given_back,
     number_from,
 )
 
@@ -27,10 +28,7 @@ def targets_from(function: Callable[..., Any], *arguments: Any) -> Floats:
     Raises:
         AnswerError: if it cannot be called, or gives no array of one number for each step.
     """
-    try:
-        given = function(REWARDS.copy(), TERMINATED.copy(), *arguments)
-    except (TypeError, ValueError, IndexError) as fault:
-        raise AnswerError(f"It cannot be called: {fault}") from None
+    given = given_back(function, REWARDS.copy(), TERMINATED.copy(), *arguments)
     wrong = fault_of_array(given, REWARDS.shape, "one target for each step")
     if wrong:
         raise AnswerError(wrong)

@@ -13,6 +13,7 @@ from answer_faults import (
     answering,
     compared,
     fault_of_array,
+    given_back,
     looked_ahead,
     number_from,
 )
@@ -35,7 +36,10 @@ def check_return(target: Callable[..., float]) -> str:
     if abs(number_from(target, np.zeros(3), 0.9, 0.0)) > TOLERANCE:
         return "Where all rewards and the value are 0 it has to be 0."
     for n in (3, 1, 5):
-        said = fault_of_weights(weights(n, 0.9), 0.9)
+        counted = weights(n, 0.9)
+        if abs(number_from(target, np.ones(n), 0.9, 1.0) - counted.sum()) > TOLERANCE:
+            return "What one reward counts depends on the others, or on the value. It is a sum."
+        said = fault_of_weights(counted, 0.9)
         if said:
             return f"With {n} step{'s' * (n > 1)}: {said}"
     return RIGHT
@@ -110,11 +114,8 @@ def check_replacing_trace(step: Callable[..., Any]) -> str:
     Args:
         step: called with the traces, shape (S,), the state, the discount and lambda.
     """
-    before, state, discount, decay = np.array([0.2, 1.0, 0.5, 0.0]), 2, 0.9, 0.6
-    try:
-        after = step(before.copy(), state, discount, decay)
-    except (TypeError, ValueError, IndexError) as fault:
-        return f"It cannot be called: {fault}"
+    before, state, discount, decay = np.array([0.2, 1.0, 3.0, 0.0]), 2, 0.9, 0.6
+    after = given_back(step, before.copy(), state, discount, decay)
     wrong = fault_of_array(after, before.shape, "one trace for each state")
     if wrong:
         return wrong
