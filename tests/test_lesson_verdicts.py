@@ -49,7 +49,10 @@ def gain(ratio, advantage, epsilon):
         (lambda *_: ..., "Not done yet"),
         (lambda ratio, advantage, epsilon: ratio, "Where new and old probability are equal"),
         (lambda *given: -gain(*given), "Where new and old probability are"),
-        (lambda ratio, advantage, epsilon: advantage, "Within the bounds the gain is the ratio"),
+        (
+            lambda ratio, a, epsilon: a * (1 if a > 0 else ratio),
+            "Within the bounds the gain is the ratio times the advantage.",
+        ),
         (
             lambda ratio, a, epsilon: a * (ratio if a > 0 else 1),
             "Within the bounds the gain is the ratio times the advantage, below 0",
