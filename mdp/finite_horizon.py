@@ -104,6 +104,8 @@ def back_up(
     """Values one step earlier, and the actions to take there, into ``earlier`` and ``actions``."""
     action_values = np.empty(prob.shape[1])
     for state in states:
+        # Worked out here: NumPy's own maximum takes longer to compile than all of this.
+        best = -np.inf
         for action in range(prob.shape[1]):
             if not allowed[state, action]:
                 action_values[action] = -np.inf
@@ -114,7 +116,7 @@ def back_up(
                     following = values[next_state[state, action, k]]
                     value += discount * prob[state, action, k] * following
             action_values[action] = value
-        best = action_values.max()
+            best = max(best, value)
         tied = best - TIE_TOLERANCE * max(1.0, abs(best))
         action = 0
         while action_values[action] < tied:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import compiled
+from mdp.machine_code import called, compiled
 
 
 @compiled
@@ -51,7 +51,7 @@ def moments_under_limit(
     return later
 
 
-@compiled
+@called
 def _means(
     prob: Floats,
     next_state: Ints,
@@ -80,7 +80,7 @@ def _means(
                     now[4] += weight * after[4]
 
 
-@compiled
+@called
 def _variances(
     prob: Floats,
     next_state: Ints,

@@ -28,6 +28,8 @@ def reached_from(
         probability lead to.
     """
     found = start.copy()
+    # However they lie in memory, it is compiled once.
+    allowed = np.ascontiguousarray(allowed)
     _flood(prob, next_state, terminated, allowed, found)
     return found
 

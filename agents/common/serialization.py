@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
@@ -59,19 +59,23 @@ def encode(value: Any) -> Any:
     """
     if type(value) in _AS_THEY_ARE:
         return value
+    if type(value) is dict:  # as its codec has it, for the hundred of them that Monitor has told of
+        return {TYPE: "dict", "pairs": [_encode_all(pair) for pair in value.items()]}
     if isinstance(value, np.generic):
         value = value.item()
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list):
-        return [item if type(item) in _AS_THEY_ARE else encode(item) for item in value]
-    if type(value) is dict:  # as its codec has it, for the hundred of them that Monitor has told of
-        return {TYPE: "dict", "pairs": [encode(pair) for pair in _pairs(value)]}
+        return _encode_all(value)
     name = type(value).__name__
     codec = CODECS.get(name)
     if codec is None or type(value) is not codec.cls:
         raise UnknownTypeError(f"cannot be written as JSON: {type(value).__module__}.{name}")
     return {TYPE: name, **{key: encode(read(value)) for key, read in codec.fields.items()}}
+
+
+def _encode_all(values: Iterable[Any]) -> list[Any]:
+    return [value if type(value) in _AS_THEY_ARE else encode(value) for value in values]
 
 
 def decode(data: Any) -> Any:

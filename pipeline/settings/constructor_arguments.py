@@ -6,6 +6,8 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Iterable, Mapping
+from functools import cache
+from types import MappingProxyType
 from typing import Any, get_args
 
 from pipeline.errors import UserError, shown, unknown
@@ -60,7 +62,8 @@ def constructor_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
         return inspect.signature(cls).parameters
 
 
-def algorithm_parameters(cls: type) -> dict[str, inspect.Parameter]:
+@cache  # a run asks six times, and signatures take long to read
+def algorithm_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
     """The arguments of an algorithm's constructor, and those that ``**kwargs`` may hand on.
 
     ``**kwargs`` stays among them, since it may go elsewhere than to the base class. An argument
@@ -74,7 +77,7 @@ def algorithm_parameters(cls: type) -> dict[str, inspect.Parameter]:
         own = {**algorithm_parameters(owners[1]), **named, rest.name: rest}
         if "env" in named and "policy" not in named:
             own.pop("policy", None)  # which the constructor gives its base class itself
-    return {name: _annotated(parameter) for name, parameter in own.items()}
+    return MappingProxyType({name: _annotated(parameter) for name, parameter in own.items()})
 
 
 def _annotated(parameter: inspect.Parameter) -> inspect.Parameter:
