@@ -94,15 +94,23 @@ def epsilon_greedy_action(values: Floats, epsilon: float, tie_scale: float, draw
 
 
 @inlined
+def softmax_weight(value: float, highest: float, temperature: float) -> float:
+    """exp((value - highest) / temperature), and its limit where a schedule has come to 0."""
+    if temperature <= 0.0:
+        return 1.0 if value == highest else 0.0
+    return math.exp((value - highest) / temperature)
+
+
+@inlined
 def boltzmann_action(values: Floats, temperature: float, draws: Floats) -> int:
     """An action with probability proportional to exp(value / temperature)."""
     highest = highest_value(values)
     total = 0.0
     for action in range(len(values)):
-        total += math.exp((values[action] - highest) / temperature)
+        total += softmax_weight(values[action], highest, temperature)
     remaining = draws[0] * total
     for action in range(len(values) - 1):
-        remaining -= math.exp((values[action] - highest) / temperature)
+        remaining -= softmax_weight(values[action], highest, temperature)
         if remaining < 0.0:
             return action
     return len(values) - 1
@@ -157,7 +165,7 @@ def expected_value(strategy: int, values: Floats, rate: float) -> float:
     total = 0.0
     weighted = 0.0
     for action in range(len(values)):
-        weight = math.exp((values[action] - highest) / rate)
+        weight = softmax_weight(values[action], highest, rate)
         total += weight
         weighted += weight * values[action]
     return weighted / total
@@ -189,8 +197,8 @@ def action_probability(
         return rate / len(values) + (1.0 - rate) * greedy
     total = 0.0
     for other in range(len(values)):
-        total += math.exp((values[other] - highest) / rate)
-    return math.exp((values[action] - highest) / rate) / total
+        total += softmax_weight(values[other], highest, rate)
+    return softmax_weight(values[action], highest, rate) / total
 
 
 def action_probabilities(
@@ -225,7 +233,7 @@ def action_probabilities(
         values = np.where(allowed, values, -np.inf)
     highest = values.max(axis=1, keepdims=True)
     if strategy == BOLTZMANN:
-        weights = np.exp((values - highest) / rate)
+        weights = np.exp((values - highest) / rate) if rate > 0 else (values == highest) * 1.0
         return np.asarray(weights / weights.sum(axis=1, keepdims=True))
     greedy = (values == highest).astype(np.float64)
     if not random_ties:

@@ -71,6 +71,18 @@ def test_boltzmann_does_not_overflow():
     assert boltzmann_action(np.array([1e6, 0.0]), 1e-3, np.array([0.999])) == 0
 
 
+def test_a_temperature_that_has_fallen_to_0_is_the_limit():
+    values = np.array([1.0, 3.0, 3.0, 0.0])
+    chosen = [boltzmann_action(values, 0.0, np.array([u])) for u in (0.0, 0.49, 0.51, 0.99)]
+    assert chosen == [1, 1, 2, 2]
+    expected = [0.0, 0.5, 0.5, 0.0]
+    found = [action_probability(BOLTZMANN, values, 0.0, 1.0, action) for action in range(4)]
+    assert found == expected
+    matrix = action_probabilities(BOLTZMANN, values[None], 0.0, random_ties=True)
+    assert matrix.tolist() == [expected]
+    assert expected_value(BOLTZMANN, values, 0.0) == 3.0
+
+
 def test_noise_is_added_to_the_values():
     draws = np.array([0.0, -1.0, 0.0, 1.5])
     assert noisy_greedy_action(VALUES, 1.0, draws) == 3

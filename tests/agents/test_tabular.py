@@ -6,6 +6,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 
 from agents import load_algorithm
 from agents.tabular.double_q_learning import DoubleQLearning
@@ -282,3 +283,14 @@ def test_predict_takes_one_observation_or_a_row_of_them(name, deterministic):
     model = load_algorithm(name)(env=Liar(0, 0), seed=0)
     with pytest.raises(ValueError, match=r"Unexpected observation shape \(2, 2\)"):
         model.predict(np.zeros((2, 2), dtype=np.int64), deterministic=deterministic)
+
+
+@pytest.mark.parametrize("engine", ["compiled", "interpreted"])
+def test_a_temperature_may_fall_to_0(engine):
+    schedule = LinearSchedule(1.0, 0.0, 1.0)
+    model = load_algorithm("expected_sarsa")(
+        env="FrozenLake-v1", exploration="boltzmann", temperature=schedule, seed=0, engine=engine
+    ).learn(200)
+    assert model.exploration_rate == 0.0
+    assert np.isfinite(model.policy.q_table).all()
+    np.testing.assert_allclose(model.action_probabilities().sum(axis=1), 1.0)
