@@ -86,9 +86,10 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
     candidates = chosen_for_retest(ranked, tuning.retest)
     if not candidates:
         if tuning.retest:
-            say(console, "no settings but the shipped ones were judged to the end: no re-test")
+            which = "no settings but the shipped ones" if ranked else "no settings"
+            say(console, f"{which} were judged to the end: no re-test")
         _write_down(console, place, how, None)
-        return 0
+        return 0 if ranked or not place.queue.is_done() else 1
     root = place.root / FOLDER
     tell = partial(say, console)
     with folder_lock(root, partial(give_way, root, tell), tell):

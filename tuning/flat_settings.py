@@ -21,16 +21,16 @@ def flat_items(mapping: Mapping[str, Any], names: tuple[str, ...]) -> Iterator[t
 
 def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
     """Flat settings as a file holds them."""
-    nested: dict[str, Any] = {}
+    found: dict[str, Any] = {}
     for key, value in flat.items():
         outer, _, inner = key.partition(".")
         if value is LEFT_OUT:
             continue
         if inner:
-            nested.setdefault(outer, {})[inner] = value
+            found.setdefault(outer, {})[inner] = value
         else:
-            nested[outer] = value
-    return nested
+            found[outer] = value
+    return found
 
 
 def with_mappings(settings: Mapping[str, Any], keys: tuple[str, ...]) -> dict[str, Any]:

@@ -112,7 +112,7 @@ def test_the_same_command_again_does_nothing_and_says_the_same(folder, type_comm
         ([*WORDS[:4], "-params", "gama:0.9"], "did you mean 'gamma'?"),
         ([*WORDS[:4], "-n", "9", "--n-episodes", "9"], "give -n or --n-episodes, not both"),
         ([*WORDS[:6], "--sampler", "grid", "--trials", "3"], "give more trials"),
-        ([*WORDS[:6], "--storage", "."], "Is a directory"),
+        ([*WORDS[:6], "--storage", "."], "--storage journal:FILE: . is no file"),
         ([*WORDS[:4], "--search-space", "odd.yml"], "'maxx_episode_steps': did you mean"),
         ([*WORDS[:4], "--n-evaluations", "3"], "--eval-freq"),
     ],
