@@ -11,7 +11,7 @@ from distributed import LocalCluster
 
 import compare
 from experiments.cluster import cluster_launcher as launching_there
-from experiments.cluster import connections
+from experiments.cluster import connections, endings
 from experiments.cluster.addresses import SchedulerAddress
 from experiments.cluster.cluster_launcher import cluster_launcher
 from experiments.cluster.orders import Probe
@@ -124,9 +124,9 @@ def check_what_is_refused(there, folder, monkeypatch):
     """It is tried again, and then told."""
 
     def lying(planned, root, files):
-        raise launching_there.RefusedAnswerError("a stray file")
+        raise endings.RefusedAnswerError("a stray file")
 
-    monkeypatch.setattr(launching_there, "receive", lying)
+    monkeypatch.setattr(endings, "receive", lying)
     root = folder / "refused"
     root.mkdir()
     (failure,) = execute(runs_of(root)[:1], root, there(root), lambda *_: None)
