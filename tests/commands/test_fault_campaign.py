@@ -13,7 +13,7 @@ COMMANDS = ["qlearning on Warehouse-v0"]  # networks take several times as long
 
 def test_killed_trainings_end_as_they_would_have(tmp_path):
     script = ROOT / "benchmarks" / "fault_campaign.py"
-    words = ["--kills", "4", "--jobs", "2", "--only", *COMMANDS]
+    words = ["--kills", "2", "--jobs", "2", "--only", *COMMANDS]
     result = subprocess.run(
         [sys.executable, str(script), *words],
         env={
@@ -29,6 +29,6 @@ def test_killed_trainings_end_as_they_would_have(tmp_path):
     *_, total, _ = result.stdout.splitlines()
     cells = [cell.strip() for cell in total.split("│")[1:-1]]
     assert cells[0] == "all"
-    assert int(cells[2]) >= 4  # signals that were sent
+    assert int(cells[2]) >= 2  # signals that were sent
     assert int(cells[7]) >= len(COMMANDS)  # commands that came to their end
     assert cells[8:] == ["0"] * 6
