@@ -371,7 +371,7 @@ def test_a_state_of_other_sources_is_told_of_and_no_bug_of_theirs_is_a_traceback
 
     monkeypatch.setattr("pipeline.resuming.state_saver.restore", restore)
     again = replace(recorded_training(run, ()), verbose=0, pictures=False)
-    with pytest.raises(UserError, match=r"no attribute 'new'; remove it to begin the run anew$"):
+    with pytest.raises(UserError, match=r"no attribute 'new'; remove it to begin the run again$"):
         carry_out(training_of(again, keeping, run))
 
 
