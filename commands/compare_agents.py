@@ -272,6 +272,4 @@ def _prepare(
         if any(run.is_to_do for run in planned):
             place.get_ready(planned)
         activity.now("loading the libraries")
-        import commands.study_output  # noqa: F401  # what it imports takes long
-
         check_settings(study, planned)

@@ -10,13 +10,11 @@ from rich.console import Console
 
 from commands.places import Place
 from commands.study_progress import StudyProgress
+from experiments.early_results import EarlyResults
 from experiments.execution import execute
 from experiments.launching import RunFailure
-from experiments.looks import Standing
 from experiments.planned_runs import PlannedRun
-from experiments.repair import move_damaged_aside
 from experiments.replaced_runs import move_replaced_aside
-from experiments.study_results import EarlyResults, LeftOut, StudyResults, read_results
 from experiments.study_spec import StudySpec
 from pipeline.signs_of_life import Activity, doing
 
@@ -24,6 +22,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from experiments.analysis import StudyAnalysis
+    from experiments.looks import Standing
+    from experiments.study_results import LeftOut, StudyResults
     from report.page.sections import LearningPage
 
 
@@ -68,7 +68,9 @@ def read(
 ) -> StudyResults:
     """Read the runs that there are, but for those that were read early."""
     with doing(console, "reading the results") as activity:
-        return read_results(study, planned, root, activity.at, early)
+        from experiments.study_results import read_results
+
+        return read_results(study, planned, root, activity.at, early.of)
 
 
 def conclude(
@@ -131,6 +133,8 @@ def _print_mixed_versions(console: Console, results: StudyResults) -> None:
 def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) -> None:
     """Move the folders of damaged runs aside, and say so."""
     with doing(console, "looking for damaged runs") as activity:
+        from experiments.repair import move_damaged_aside
+
         moved = move_damaged_aside(study, planned, activity.at)
     for damaged, place in moved:
         say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
@@ -196,7 +200,7 @@ def do_missing(
             if failure is None:
                 early.read(planned)
 
-        return execute(missing, root, progress.watching(place.launchers), note)
+        return execute(missing, root, progress.watching(place.launchers), note, early.get_ready)
 
 
 def _judge(

@@ -21,8 +21,8 @@ from commands.tune_output import (
 )
 from commands.tune_progress import TuningProgress
 from experiments.drafts import remove_dead_drafts
+from experiments.early_results import EarlyResults
 from experiments.study_plan import plan
-from experiments.study_results import EarlyResults
 from pipeline.folder_lock import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning

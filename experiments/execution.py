@@ -24,8 +24,16 @@ Listener = Callable[[PlannedRun, RunFailure | None], None]
 Ended = tuple[PlannedRun, Future[RunFailure | None]]
 
 
+def _nothing() -> None:
+    """Wait for the runs."""
+
+
 def execute(
-    runs: Sequence[PlannedRun], root: Path, launchers: Launchers, listener: Listener
+    runs: Sequence[PlannedRun],
+    root: Path,
+    launchers: Launchers,
+    listener: Listener,
+    meanwhile: Callable[[], object] = _nothing,
 ) -> list[RunFailure]:
     """Do the runs.
 
@@ -34,6 +42,7 @@ def execute(
         root: the study's folder.
         launchers: where; it is opened only if there is something to do.
         listener: called for every run that has ended, with how it failed if it did.
+        meanwhile: called once, while the first runs are under way.
 
     Returns:
         Those that failed.
@@ -43,7 +52,7 @@ def execute(
         return []
     failures = []
     with launchers() as launcher:
-        for planned, failure in _ended(launcher, runs):
+        for planned, failure in _ended(launcher, runs, meanwhile):
             listener(planned, failure)
             if failure is not None:
                 failures.append(failure)
@@ -52,11 +61,11 @@ def execute(
 
 
 def _ended(
-    launcher: Launcher, runs: Sequence[PlannedRun]
+    launcher: Launcher, runs: Sequence[PlannedRun], meanwhile: Callable[[], object]
 ) -> Iterator[tuple[PlannedRun, RunFailure | None]]:
     """Each run when it has ended, with how it failed; a window of them is under way."""
     ended: SimpleQueue[Ended] = SimpleQueue()
-    to_do, n_under_way = iter(runs), 0
+    to_do, n_under_way, is_first = iter(runs), 0, True
     while True:
         room = WINDOW * max(launcher.n_workers, 1) - n_under_way
         for planned in islice(to_do, max(room, 0)):
@@ -65,6 +74,9 @@ def _ended(
             future.add_done_callback(partial(_note, ended, planned))
         if not n_under_way:
             return
+        if is_first:
+            meanwhile()
+            is_first = False
         with contextlib.suppress(Empty):
             planned, future = ended.get(timeout=SECONDS_BETWEEN_LOOKS)
             n_under_way -= 1

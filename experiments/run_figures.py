@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from mdp.array_types import Floats
@@ -92,8 +93,11 @@ def _table_of(content: bytes) -> Floats:
     places = [found.index(name) for name in _COLUMNS]
     if not rows.strip():
         return np.empty((0, len(places)))
-    lines = io.BytesIO(rows)
-    return np.loadtxt(lines, delimiter=",", usecols=places, comments=None, quotechar='"', ndmin=2)
+    # NumPy's own reader takes three times as long, which is half of what reading a run takes.
+    table = pd.read_csv(
+        io.BytesIO(rows), header=None, usecols=places, dtype=np.float64, na_filter=False
+    )
+    return table[places].to_numpy()
 
 
 def read_evaluations(run: Run) -> tuple[Floats, Floats]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +68,7 @@ class StudyResults:
         pulls: on bandits, figures by pull, by labels of agent and environment.
         left_out: the runs that are damaged.
         n_unchecked: how many runs recorded no digests, so that damage in them may go unseen.
+        finished: the runs that the results are of.
     """
 
     study: StudySpec
@@ -80,12 +79,7 @@ class StudyResults:
     pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
     left_out: tuple[LeftOut, ...] = ()
     n_unchecked: int = 0
-
-    @cached_property
-    def finished(self) -> list[PlannedRun]:
-        """The runs that the results are of."""
-        damaged = {one.planned.path for one in self.left_out}
-        return [run for run in self.planned if run.path not in damaged and run.is_finished]
+    finished: tuple[PlannedRun, ...] = ()
 
 
 # Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.
@@ -128,43 +122,27 @@ RUN_COLUMNS = (
 _FIGURES = ("success_rate", "exact", "optimum", "optimum_at_least", "baseline", "gap", "score")
 
 
-class EarlyResults:
-    """What runs have to say, read when each has ended, while others are still under way.
-
-    Args:
-        study: whose runs they are.
-    """
-
-    def __init__(self, study: StudySpec) -> None:
-        self.study = study
-        self._found: dict[Path, RunResults] = {}
-
-    def read(self, planned: PlannedRun) -> None:
-        """Read a run that has just ended; one that is damaged is found to be so at the end."""
-        with contextlib.suppress(DamagedFileError):
-            found = read_run(self.study, planned)
-            if found is not None:
-                self._found[planned.path] = found
-
-    def of(self, planned: PlannedRun) -> RunResults | None:
-        """As `read_run`, where that was not done before."""
-        return self._found.get(planned.path) or read_run(self.study, planned)
-
-
 def read_results(
     study: StudySpec,
     planned: Sequence[PlannedRun],
     root: Path,
     tell: Tell = tell_nobody,
-    early: EarlyResults | None = None,
+    read: Callable[[PlannedRun], RunResults | None] | None = None,
 ) -> StudyResults:
-    """Read all runs that have finished; those whose files are damaged are left out."""
+    """Read all runs that have finished; those whose files are damaged are left out.
+
+    Args:
+        study: whose runs they are.
+        planned: the runs.
+        root: the study's folder.
+        tell: told how far it is.
+        read: what to read a run with, for those that were read before; by default `read_run`.
+    """
     rows, curves, done, left_out = [], [], [], []
-    early = early or EarlyResults(study)
     for place, run in enumerate(planned, start=1):
         tell(f"run {place:,} of {len(planned):,}")
         try:
-            found = early.of(run)
+            found = read_run(study, run) if read is None else read(run)
         except DamagedFileError as error:
             left_out.append(LeftOut(run, str(error)))
             continue
@@ -181,6 +159,7 @@ def read_results(
         read_pulls(done),
         tuple(left_out),
         sum(run.n_runs for run in done if run.run.files.digests is None),
+        tuple(done),
     )
 
 

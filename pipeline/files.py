@@ -12,10 +12,14 @@ import sys
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.json_text import json_text
+
+if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
 
 # Windows takes no more than 260 characters for a whole path, Linux no more than 255 bytes a name.
 LONGEST_NAME = 100  # bytes
@@ -31,7 +35,7 @@ DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "E
 # Folders of others above one's own, and file systems that flush no folder.
 _CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
 
-SYNCED_AT_ONCE = 4
+SYNCED_AT_ONCE = 8
 _KEPT_LATER: list[Path] = []
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
@@ -188,13 +192,25 @@ def sync_together(files: Iterable[Path], folders: Iterable[Path]) -> None:
 
     A disk that is asked for one after the other has to finish each before it hears of the next.
     """
-    from concurrent.futures import ThreadPoolExecutor  # half of what this module would take to load
+    from concurrent.futures import wait  # half of what this module would take to load
 
-    with ThreadPoolExecutor(SYNCED_AT_ONCE) as pool:
-        waits = [pool.submit(sync_file, path) for path in files]
-        waits += [pool.submit(sync_folders, folder) for folder in folders]
-    for wait in waits:
-        wait.result()
+    pool = _waiting_threads(os.getpid())
+    waits = [pool.submit(sync_file, path) for path in files]
+    waits += [pool.submit(sync_folders, folder) for folder in folders]
+    wait(waits)
+    for one in waits:
+        one.result()
+
+
+@lru_cache(maxsize=1)
+def _waiting_threads(pid: int) -> ThreadPoolExecutor:
+    """The threads of a process that wait for its disk: to start them takes longer than to wait.
+
+    A process has none of those that it was forked from had.
+    """
+    from concurrent.futures import ThreadPoolExecutor
+
+    return ThreadPoolExecutor(SYNCED_AT_ONCE, f"disk-{pid}")
 
 
 def drafts_in(folder: Path) -> list[Path]:

@@ -20,6 +20,7 @@ from pipeline.errors import UserError
 
 # Single and double precision, whose scalar products are worked out by BLAS.
 _FAST = frozenset("fd")
+_FAST_TENSORS = frozenset({th.float32, th.float64})
 _WHOLE = frozenset("?bBhHiIlLqQ")
 
 
@@ -87,13 +88,19 @@ def check_model(model: Any) -> None:
             # The score of an arm that was never pulled says so by being infinite.
             is_scores = name == "scores" and isinstance(policy, BanditPolicy)
             tensor = table[policy.get_buffer("counts") > 0] if is_scores else table
-            if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
+            if not _is_finite_tensor(tensor):
                 values = tensor.detach().cpu().double().numpy()
                 raise NotFiniteError(f"a value in {name} of the agent {when}", _culprit(values))
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
         for name in ("obs_rms", "ret_rms"):
             _check_statistics(getattr(normalization, name, None), f"{name} of VecNormalize", when)
+
+
+def _is_finite_tensor(tensor: th.Tensor) -> bool:
+    if tensor.dtype in _FAST_TENSORS:
+        return is_finite(tensor.detach().cpu().numpy())
+    return not tensor.is_floating_point() or bool(th.isfinite(tensor).all())
 
 
 class FinitePlayer:

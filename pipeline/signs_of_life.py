@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import logging
 import threading
@@ -67,31 +68,30 @@ class Heartbeat:
     def __init__(self, function: Callable[[], object], seconds: float) -> None:
         self._function = function
         self._seconds = seconds
+        self._calling = threading.RLock()
         self._stopping = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Begin to call the function."""
         self.stop()
-        self._stopping.clear()
-        thread = threading.Thread(target=self._beat, daemon=True)
-        # Where the machine has no thread left, the work goes on without these signs.
+        self._stopping = threading.Event()
+        # Where the machine has no thread left, the work goes on without these signs. `Thread` would
+        # wait until the thread runs, and again until it is gone: longer than a short work takes.
         with contextlib.suppress(RuntimeError):
-            thread.start()
-            self._thread = thread
+            _thread.start_new_thread(self._beat, (self._stopping,))
 
     def stop(self) -> None:
-        """Call it no more; harmless when called again."""
-        self._stopping.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        """Call it no more, from when this returns; harmless when called again."""
+        with self._calling:
+            self._stopping.set()
 
-    def _beat(self) -> None:
+    def _beat(self, stopping: threading.Event) -> None:
         # Where nothing can be written any more, the main thread learns of it by itself.
         with contextlib.suppress(OSError):
-            while not self._stopping.wait(self._seconds):
-                self._function()
+            while not stopping.wait(self._seconds):
+                with self._calling:
+                    if not stopping.is_set():
+                        self._function()
 
 
 class CompilationNotice(logging.Handler):

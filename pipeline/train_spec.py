@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import MISSING, asdict, dataclass, fields
+from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -83,9 +85,9 @@ class TrainSpec:
 
     def as_data(self) -> dict[str, Any]:
         """The spec as JSON."""
-        data = asdict(self)
+        data = {**vars(self), "user_modules": tuple(map(asdict, self.user_modules))}
         del data["hyperparams"]
-        data["hyperparams"] = data.pop("saved_hyperparams")
+        data["hyperparams"] = deepcopy(data.pop("saved_hyperparams"))
         for name in _PATHS:
             data[name] = None if data[name] is None else str(data[name])
         return data
@@ -114,7 +116,14 @@ def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
     Args:
         recorded: what `TrainSpec.as_data` returned when the run was made.
     """
-    known = TrainSpec("", "", Hyperparams(), {}, 0).as_data()
-    required = {key.name for key in fields(TrainSpec) if key.default is MISSING}
-    defaults = {key: value for key, value in known.items() if key not in required}
+    known = _defaults()
+    defaults = {key: value for key, value in known.items() if value is not MISSING}
     return {**defaults, **{key: recorded[key] for key in known if key in recorded}}
+
+
+@cache
+def _defaults() -> Mapping[str, Any]:
+    """The fields as `TrainSpec.as_data` names them; `MISSING` where one has no default."""
+    required = {key.name for key in fields(TrainSpec) if key.default is MISSING}
+    data = TrainSpec("", "", Hyperparams(), {}, 0).as_data()
+    return {key: MISSING if key in required else value for key, value in data.items()}

@@ -32,10 +32,12 @@ from mdp import (
     optimal_choices,
     optimum_far_from_limit,
     policy_return,
+    state_values,
 )
 from mdp.array_types import Bools, Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.asked_policies import best_actions, obstacle, policy_matrix
+from pipeline.evaluation.last_policy import OfLastPolicy
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.memory_limits import observation_bytes
 from pipeline.train_spec import TrainSpec
@@ -73,7 +75,13 @@ class ExactEvaluator:
 
     def __call__(self, agent: BaseAlgorithm, deterministic: bool = True) -> Evaluation:
         """The exact worth of the agent's policy as it is."""
-        policy = self.policy(agent, deterministic)
+        return self._worth(self.policy(agent, deterministic))
+
+    @cached_property
+    def _worth(self) -> OfLastPolicy[Evaluation]:
+        return OfLastPolicy(self._worked_out)
+
+    def _worked_out(self, policy: NDArray[Any]) -> Evaluation:
         result = policy_return(self.model, policy, self.horizon, success=self.success)
         rate = result.success_rate
         return Evaluation(
@@ -83,6 +91,11 @@ class ExactEvaluator:
             exact_std=float(np.sqrt(result.return_variance)),
             yardstick=self.yardstick,
         )
+
+    @cached_property
+    def values(self) -> OfLastPolicy[Floats]:
+        """From a policy to what each state is worth under it, shape (S,), see `state_values`."""
+        return OfLastPolicy(lambda policy: state_values(self.model, policy, self.horizon))
 
     @cached_property
     def optimum(self) -> tuple[Floats, Bools]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -107,22 +108,22 @@ class Evaluation:
         """Whether the figures are expectations, computed rather than sampled."""
         return self.exact_std is not None
 
-    @property
+    @cached_property
     def mean_return(self) -> float:
         """Mean of the returns."""
         return float(self.returns.mean())
 
-    @property
+    @cached_property
     def mean_length(self) -> float:
         """Mean number of steps of an episode."""
         return float(self.lengths.mean())
 
-    @property
+    @cached_property
     def std_return(self) -> float:
         """Standard deviation of an episode's return."""
         return float(self.returns.std()) if self.exact_std is None else self.exact_std
 
-    @property
+    @cached_property
     def success_rate(self) -> float | None:
         """Share of the episodes that succeed, if the environment says so."""
         return None if self.successes is None else float(self.successes.mean())

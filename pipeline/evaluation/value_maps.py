@@ -16,7 +16,6 @@ import numpy as np
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from envs.layout import GridLayout
-from mdp import state_values
 from mdp.array_types import Bools, Floats, Ints
 from mdp.graph import reachable_states
 from mdp.policies import actions_used
@@ -80,7 +79,7 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
         layout=evaluator.layout,
         matters=model.reachable,
         initial=model.initial,
-        values=state_values(model, policy, evaluator.horizon),
+        values=evaluator.values(policy),
         actions=policy[0],
         visited=reachable_states(model, actions_used(model, policy)),
         optimal_values=optimal_values,
@@ -153,7 +152,7 @@ class ValueMapRecorder:
     def _append(self, agent: BaseAlgorithm, timesteps: int) -> None:
         policy = _deterministic_policy(self.evaluator, agent)
         if policy is not None:
-            values = state_values(self.evaluator.model, policy, self.evaluator.horizon)
+            values = self.evaluator.values(policy)
             self._maps.append((timesteps, values, policy[0]))
 
     def _write(self) -> None:

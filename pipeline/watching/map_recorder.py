@@ -15,7 +15,6 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from agents.common.callback_horizons import BlockCallback
-from mdp import state_values
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.value_maps import MAX_STATES, best_actions_of
 from pipeline.finite_numbers import NotFiniteError, check_model
@@ -95,7 +94,7 @@ class MapRecorder(BaseCallback):
         policy = best_actions_of(self.evaluator, self.model)
         if policy is None:
             return
-        values = state_values(self.evaluator.model, policy, self.evaluator.horizon)
+        values = self.evaluator.values(policy)
         log = self.model.logger.name_to_value if self.n_units else {}
         self.moments.append(
             self.n_units,

@@ -99,7 +99,7 @@ def test_a_damaged_run_is_left_out_and_said_to_be(copied, kind, name, damage):
     what = "missing" if damage is Path.unlink else "not as the run left it|damaged"
     assert any(word in left_out.reason for word in what.split("|"))
     assert str(planned[0].path / name) in left_out.reason
-    assert results.finished == planned[1:]
+    assert results.finished == tuple(planned[1:])
     assert not planned[0].is_to_do
     expected = [] if planned[0].is_batch or not planned[1:] else [1]
     assert results.summary["seed"].tolist() == expected

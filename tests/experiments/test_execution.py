@@ -234,3 +234,15 @@ def test_a_failure_whose_details_cannot_be_written_is_told_and_the_others_go_on(
     failure = launching._supervised(runs_of(tmp_path)[0], tmp_path, "compare.py", RunLimits())
     assert failure.reason.startswith(reason)
     assert failure.log is None
+
+
+def test_what_is_done_meanwhile_is_done_once_after_the_first_runs_are_handed_over(tmp_path):
+    runs, launcher, given_then = runs_of(tmp_path, n_seeds=5), Growing(), []
+    launcher.n_workers = 2
+
+    def meanwhile():
+        given_then.append(len(launcher.given))
+
+    where = contextlib.nullcontext(launcher)
+    execute(runs, tmp_path, lambda: where, lambda run, failure: None, meanwhile)
+    assert given_then == [2 * WINDOW]

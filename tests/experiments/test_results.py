@@ -13,10 +13,11 @@ from PIL import Image
 from rich.console import Console
 
 from experiments.analysis import analyse
+from experiments.early_results import EarlyResults
 from experiments.run_curves import CURVE_COLUMNS
 from experiments.seed_values import curves_by_agent, mean_curve, values_over_seeds
 from experiments.study_plan import plan
-from experiments.study_results import RUN_COLUMNS, EarlyResults, read_results, threshold_of
+from experiments.study_results import RUN_COLUMNS, read_results, threshold_of
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
 from report.conclusions import conclusion, places_without_a_run
@@ -188,12 +189,12 @@ def test_runs_that_were_read_early_are_not_read_again(tmp_path):
     write_run(second, [(20, 12.0)], [(10, 1.0)])
     expected = read_results(study, [first, second], tmp_path)
     (first.path / "evaluations.npz").write_bytes(b"damaged since")
-    found = read_results(study, [first, second], tmp_path, early=early)
+    found = read_results(study, [first, second], tmp_path, read=early.of)
     pd.testing.assert_frame_equal(found.summary, expected.summary)
     pd.testing.assert_frame_equal(found.curves, expected.curves)
     damaged = EarlyResults(study)
     damaged.read(first)  # that is said at the end
-    left_out = read_results(study, [first, second], tmp_path, early=damaged).left_out
+    left_out = read_results(study, [first, second], tmp_path, read=damaged.of).left_out
     assert [one.planned for one in left_out] == [first]
 
 

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from experiments.run_figures import read_episodes, read_evaluations
 from pipeline.file_digests import DamagedFileError
@@ -21,6 +23,11 @@ from pipeline.run_folder import Run
         "#{}\nr,l,t\n1,0,3\n",
         "#{}\nr,l,t\n1,two,3\n",
         "#{}\nr,l,t\n1e999,2,3\n",
+        "#{}\nr,l,t\n1,2,3\n1,2\n",
+        "#{}\nr,l,t\n1,2,\n",
+        "#{}\nr,l,t\n1_0,2,3\n",
+        "#{}\nr,l,t\nNA,2,3\n",
+        '#{}\nr,l,t\n1,2,3\n"1,2,3\n',
         "#{}\n\0\0\xff\n",
     ],
 )
@@ -35,6 +42,17 @@ def test_a_monitor_file_of_no_form(tmp_path, text):
 def test_a_monitor_file_without_episodes(tmp_path):
     (tmp_path / "0.monitor.csv").write_text('#{"t_start": 0}\nr,l,t\n')
     assert read_episodes(Run(tmp_path, "x")).returns.size == 0
+
+
+@given(st.lists(st.floats(-1e300, 1e300), min_size=1, max_size=20))
+def test_episodes_are_read_to_the_last_bit_whatever_stands_beside_them(tmp_path_factory, returns):
+    path = tmp_path_factory.mktemp("run") / "0.monitor.csv"
+    rows = [f'"left, or\nright",0.5,{value!r},3' for value in returns]
+    path.write_text("\n".join(['#{"t_start": 0}', "way,t,r,l", *rows, ""]))
+    episodes = read_episodes(Run(path.parent, "x"))
+    assert episodes.returns.tolist() == returns
+    assert episodes.steps.tolist() == [3 * n for n in range(1, len(returns) + 1)]
+    assert set(episodes.seconds.tolist()) == {0.5}
 
 
 @pytest.mark.parametrize(

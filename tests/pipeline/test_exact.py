@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch as th
 from gymnasium import spaces
 
 from agents import load_algorithm
@@ -10,6 +11,7 @@ from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation import asked_policies
 from pipeline.evaluation.asked_policies import policy_matrix
 from pipeline.evaluation.exact import exact_evaluator
+from pipeline.evaluation.last_policy import OfLastPolicy
 from pipeline.evaluation.sampled import Yardstick, evaluate
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -308,3 +310,36 @@ def test_figures_of_the_yardstick():
     # Sums in another order.
     nearly = Yardstick(optimum=0.3, baseline=np.nextafter(0.3, 0))
     assert (nearly.score(np.nextafter(0.3, 0)), nearly.score(0.29)) == (1.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("other", "is_same"),
+    [
+        (np.array([0, 1, 1]), True),
+        (np.array([0, 1, 2]), False),
+        (np.array([0.0, 1.0, 1.0]), False),
+        (np.array([[0, 1, 1]]), False),
+    ],
+)
+def test_what_follows_from_a_policy_is_worked_out_again_only_for_another(other, is_same):
+    asked = []
+    worth = OfLastPolicy(lambda policy: asked.append(policy.tolist()) or len(asked))
+    policy = np.array([0, 1, 1])
+    assert worth(policy) == 1
+    assert worth(other) == (1 if is_same else 2)
+    policy[0] = 2  # an agent may hand over its own array
+    assert worth(policy) == len(asked) == (2 if is_same else 3)
+    assert asked[-1] == [2, 1, 1]
+
+
+def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
+    spec = spec_of("FrozenLake")
+    evaluator, agent = exact_evaluator(spec), briefly_trained("qlearning", spec)
+    before, values = evaluator(agent), evaluator.values(evaluator.policy(agent, True))
+    assert evaluator(agent) is before
+    agent.policy.q_tables[:, 0] = -agent.policy.q_tables[:, 0] + th.arange(4)
+    assert evaluator.policy(agent, True)[0] == 3
+    after, anew = evaluator(agent), exact_evaluator(spec)(agent)
+    assert (after.mean_return, after.exact_std) == (anew.mean_return, anew.exact_std)
+    assert after.mean_return != before.mean_return
+    assert evaluator.values(evaluator.policy(agent, True))[0] != values[0]

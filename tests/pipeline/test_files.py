@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -306,3 +307,21 @@ def test_a_folder_that_is_gone_is_not_made_anew(tmp_path):
     with pytest.raises(FileNotFoundError, match="its folder is gone"), replacing(path) as draft:
         draft.parent.mkdir()
     assert not path.parent.exists()
+
+
+def test_the_disk_is_waited_for_also_in_a_process_that_was_forked(tmp_path):
+    files.sync_together([], [tmp_path])  # from here on this process has its threads
+    missing = tmp_path / "missing"
+    with pytest.raises(FileNotFoundError):
+        files.sync_together([missing, *[tmp_path] * 20], [])
+    if sys.platform == "win32":
+        return
+    child = os.fork()
+    if not child:
+        files.settle(tmp_path)
+        os._exit(7)
+    watch = threading.Timer(30, os.kill, [child, signal.SIGKILL])
+    watch.start()
+    _, status = os.waitpid(child, 0)
+    watch.cancel()
+    assert os.waitstatus_to_exitcode(status) == 7

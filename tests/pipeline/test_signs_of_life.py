@@ -186,6 +186,34 @@ def test_a_heart_beats_until_it_is_stopped_and_may_begin_again():
         assert not beats.acquire(timeout=0.02)
 
 
+def test_a_heart_that_is_stopped_has_ended_its_last_call():
+    begun, may_end, calls = threading.Event(), threading.Event(), []
+
+    def call():
+        begun.set()
+        may_end.wait(30)
+        calls.append(1)
+
+    heart = Heartbeat(call, 0.001)
+    heart.start()
+    assert begun.wait(30)
+    threading.Timer(0.05, may_end.set).start()
+    heart.stop()
+    assert calls == [1]
+
+
+def test_a_heart_may_stop_itself():
+    stopped = threading.Event()
+
+    def call():
+        heart.stop()
+        stopped.set()
+
+    heart = Heartbeat(call, 0.001)
+    heart.start()
+    assert stopped.wait(30)
+
+
 def test_a_heart_that_cannot_write_stands_still_without_a_word(capfd):
     tried = threading.Semaphore(0)
 
