@@ -17,8 +17,9 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import event
 
-from mdp.code_cache import PACKAGES, ROOT, CheckedCache, folder, numba_cache_dir
+from mdp.code_cache import PACKAGES, CheckedCache, folder, numba_cache_dir
 from mdp.code_parts import Part, called_as_part
+from mdp.source_files import ROOT
 from mdp.work_time import WorkTime
 
 Function = TypeVar("Function", bound=Callable[..., object])
