@@ -69,6 +69,7 @@ class TuningProgress(LiveProgress):
         seconds = time.monotonic() - self.started
         ended, new = len(self.values), len(self.values) - self.n_before
         text = f"{ended} of {self.n_trials} trials, {self.n_runs} runs in {duration(seconds)}"
+        text += self.place_words
         best = self.best()
         if best is not None:
             text += f"; best {best[1]:.4g} (trial {best[0]})"
