@@ -128,10 +128,11 @@ def test_so_does_the_line_of_a_search(clock):
         assert progress.figures() == "0 of 10 trials, 0 runs in 0 s"
         launchers = progress.watching(lambda: nullcontext(SimpleNamespace(words="3 workers")))
         with launchers():
+            progress.run_ended()
             progress.trial_ended(4, 0.5, "")
             clock.now += 2
             assert progress.figures() == (
-                "1 of 10 trials, 0 runs in 2 s, 3 workers; best 0.5 (trial 4); about 18 s left"
+                "1 of 10 trials, 1 run in 2 s, 3 workers; best 0.5 (trial 4); about 18 s left"
             )
 
 
