@@ -12,15 +12,13 @@ from typing import TYPE_CHECKING
 from commands.flag_values import (
     COUNT,
     COUNT_OR_NONE,
-    RUN_MEMORY,
-    RUN_TIMEOUT,
     filled,
     folder_name,
     number_at_least_zero,
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
-from commands.places import Place, add_place_flags, give_way, held, place_of
+from commands.places import Place, add_limit_flags, add_place_flags, give_way, held, place_of
 from commands.streams import go_on_unread
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
@@ -122,14 +120,8 @@ def _add_log_flags(parser: argparse.ArgumentParser) -> None:
 def _add_run_flags(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("runs")
     add_place_flags(group)
+    add_limit_flags(group)
     add = group.add_argument
-    add(
-        "--run-timeout",
-        type=RUN_TIMEOUT,
-        metavar="TIME",
-        help="end a run after this time, e.g. 10m",
-    )
-    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes more, e.g. 4GB")
     add("--repair", action="store_true", help="do damaged runs again; the old folders are kept")
     add(
         "--replace",

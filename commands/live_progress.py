@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from rich.console import Console, RenderableType
 from rich.live import Live
@@ -18,6 +20,9 @@ from pipeline.signs_of_life import (
     Silence,
     can_move,
 )
+
+if TYPE_CHECKING:
+    from experiments.launching import Launcher, Launchers
 
 
 class LiveProgress(ABC):
@@ -33,6 +38,24 @@ class LiveProgress(ABC):
         self.silence = Silence(SECONDS_BETWEEN_LINES)
         self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
         self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
+        self._launcher: Launcher | None = None
+
+    def watching(self, launchers: Launchers) -> Launchers:
+        """The same launchers, of which is shown what there is to say while one is open."""
+
+        @contextlib.contextmanager
+        def watched() -> Iterator[Launcher]:
+            with launchers() as self._launcher:
+                yield self._launcher
+            self._launcher = None
+
+        return watched
+
+    @property
+    def place_words(self) -> str:
+        """What there is to say of where runs are done, to go on a line with it; mostly nothing."""
+        words = self._launcher.words if self._launcher is not None else ""
+        return f", {words}" if words else ""
 
     @abstractmethod
     def figures(self) -> str:

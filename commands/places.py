@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from commands.flag_values import JOBS, filled
+from commands.flag_values import JOBS, RUN_MEMORY, RUN_TIMEOUT, filled
 from pipeline.errors import UserError
 
 if TYPE_CHECKING:
@@ -57,6 +57,18 @@ def add_place_flags(group: argparse._ArgumentGroup) -> None:
         action="store_true",
         help="also on a cluster without TLS: anybody who can connect to it can run code",
     )
+
+
+def add_limit_flags(group: argparse._ArgumentGroup) -> None:
+    """The flags that say what each run may take there."""
+    add = group.add_argument
+    add(
+        "--run-timeout",
+        type=RUN_TIMEOUT,
+        metavar="TIME",
+        help="end a run after this time, e.g. 10m",
+    )
+    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes more, e.g. 4GB")
 
 
 def place_of(

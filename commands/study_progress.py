@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 from rich.console import Console
 from rich.markup import escape
@@ -13,7 +12,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 
 from commands.live_progress import LiveProgress, duration
-from experiments.launching import Launcher, Launchers, RunFailure
+from experiments.launching import RunFailure
 from experiments.planned_runs import PlannedRun
 
 
@@ -36,18 +35,6 @@ class StudyProgress(LiveProgress):
         self._refused: set[str] = set()
         self.n_missing = len(runs) - len(done)
         self.n_ended = 0
-        self._launcher: Launcher | None = None
-
-    def watching(self, launchers: Launchers) -> Launchers:
-        """The same launchers, of which is shown what there is to say while one is open."""
-
-        @contextlib.contextmanager
-        def watched() -> Iterator[Launcher]:
-            with launchers() as self._launcher:
-                yield self._launcher
-            self._launcher = None
-
-        return watched
 
     def note(self, run: PlannedRun, failure: RunFailure | None) -> None:
         """Count a run that has ended now."""
@@ -83,8 +70,7 @@ class StudyProgress(LiveProgress):
         if 0 < self.n_ended < self.n_missing:
             left = seconds / self.n_ended * (self.n_missing - self.n_ended)
             text += f", about {duration(left)} left"
-        words = self._launcher.words if self._launcher is not None else ""
-        text += f", {words}" if words else ""
+        text += self.place_words
         n_failed = self.failed.total()
         return f"{text}, {n_failed} failed" if n_failed else text
 

@@ -64,7 +64,7 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
     if queue.is_done():
         return
     progress = TuningProgress(console, queue.n_trials, ended, is_cost=tuning.is_cost)
-    with progress, how.place(place.root).launchers() as launcher:
+    with progress, progress.watching(how.place(place.root).launchers)() as launcher:
         Search(
             tuning,
             place.root,

@@ -6,14 +6,13 @@ import argparse
 
 from commands.flag_values import (
     COUNT,
-    RUN_MEMORY,
     RUN_TIMEOUT,
     filled,
     folder_name,
     whole_number,
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, program_name
-from commands.places import add_place_flags
+from commands.places import add_limit_flags, add_place_flags
 from tuning.pruning import PRUNERS
 from tuning.tuning_spec import FIGURES, OBJECTIVES, SAMPLERS
 
@@ -154,13 +153,7 @@ def _add_run_flags(parser: argparse.ArgumentParser) -> None:
     add("--eval-freq", type=COUNT, metavar="N", help="steps between two evaluations")
     add("--eval-episodes", type=COUNT, metavar="N", help="episodes of a sampled evaluation (20)")
     add_place_flags(group)
-    add(
-        "--run-timeout",
-        type=RUN_TIMEOUT,
-        metavar="TIME",
-        help="end a run after this time, e.g. 10m",
-    )
-    add("--run-memory", type=RUN_MEMORY, metavar="SIZE", help="end a run that takes more, e.g. 4GB")
+    add_limit_flags(group)
 
 
 def _add_output_flags(parser: argparse.ArgumentParser) -> None:

@@ -68,7 +68,9 @@ class TuningProgress(LiveProgress):
         """How many trials have ended, the best of them, and how long the others may take."""
         seconds = time.monotonic() - self.started
         ended, new = len(self.values), len(self.values) - self.n_before
-        text = f"{ended} of {self.n_trials} trials, {self.n_runs} runs in {duration(seconds)}"
+        runs = "1 run" if self.n_runs == 1 else f"{self.n_runs} runs"
+        text = f"{ended} of {self.n_trials} trials, {runs} in {duration(seconds)}"
+        text += self.place_words
         best = self.best()
         if best is not None:
             text += f"; best {best[1]:.4g} (trial {best[0]})"

@@ -14,7 +14,6 @@ no folder can be written, nothing is kept.
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import importlib.metadata
 import logging
 import os
@@ -28,9 +27,10 @@ from typing import Any
 
 import numba
 
+from mdp.source_files import content_lines, digest_of, source_paths
+
 # Everything that is compiled, and every constant that is compiled into it, stands in these.
 PACKAGES = ("mdp", "agents")
-ROOT = Path(__file__).resolve().parent.parent
 
 # Folders of other digests that are left, so that one can go back and forth between two versions.
 KEPT_BESIDE = 3
@@ -49,7 +49,7 @@ Stamps = tuple[tuple[str, int, int], ...]
 
 def source_stamps() -> Stamps:
     """Path, time of change in nanoseconds and size of every source, in the order of their names."""
-    paths = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+    paths = source_paths(PACKAGES)
     return tuple((str(path), (at := path.stat()).st_mtime_ns, at.st_size) for path in paths)
 
 
@@ -67,10 +67,9 @@ def digest() -> str:
     lines.append(f"python {platform.python_version()}")
     settings: Any = numba.config
     lines.append(f"optimised {settings.OPT}, bounds checked {settings.BOUNDSCHECK}")
-    for path, _, _ in stamps_at_start():
-        content = hashlib.sha256(Path(path).read_bytes()).hexdigest()
-        lines.append(f"{Path(path).relative_to(ROOT)} {content}")
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    # Stamped before they are read: what changes from then on is noticed.
+    lines += content_lines(Path(path) for path, _, _ in stamps_at_start())
+    return digest_of(lines)
 
 
 def parents() -> Iterator[Path]:

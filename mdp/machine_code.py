@@ -17,8 +17,9 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import event
 
-from mdp.code_cache import PACKAGES, ROOT, CheckedCache, folder, numba_cache_dir
+from mdp.code_cache import PACKAGES, CheckedCache, folder, numba_cache_dir
 from mdp.code_parts import Part, called_as_part
+from mdp.source_files import ROOT
 from mdp.work_time import WorkTime
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -64,6 +65,8 @@ INLINED_OPTIONS: dict[str, Any] = {**BARE_OPTIONS, "forceinline": True}
 
 def inlined(function: Function) -> Function:
     """Compile a small function that allocates nothing, as a part of those that call it."""
+    if is_interpreted():
+        return function
     return cast(Function, called_as_part(_decorated(function, INLINED_OPTIONS), INLINED_OPTIONS))
 
 
@@ -110,12 +113,17 @@ def compile_timer() -> Iterator[Callable[[], WorkTime]]:
         yield lambda: timer.spent
 
 
+def is_interpreted() -> bool:
+    """Whether Python itself is to run everything, as NUMBA_DISABLE_JIT asks for."""
+    return bool(numba.config.DISABLE_JIT)  # type: ignore[attr-defined]
+
+
 def _part(function: Function, options: dict[str, Any]) -> Function:
-    return cast(Function, Part(function, options))
+    return function if is_interpreted() else cast(Function, Part(function, options))
 
 
 def _decorated(function: Function, options: dict[str, Any]) -> Function:
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if is_interpreted():
         return function
     kept_in = folder() if _is_own(function) else None
     if kept_in is None:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from functools import cache
-from pathlib import Path
 
-ROOT = Path(__file__).resolve().parents[1]
+from mdp.source_files import content_lines, digest_of, source_paths
+
 # What the objects of a training, and what is recorded of them, are made by.
 OF_TRAINING = ("safe_files", "snapshots", "mdp", "envs", "agents", "pipeline")
 
@@ -14,10 +13,4 @@ OF_TRAINING = ("safe_files", "snapshots", "mdp", "envs", "agents", "pipeline")
 @cache
 def source_digest(*more: str) -> str:
     """Of the packages `OF_TRAINING` and ``more``, as they are when it is first asked for."""
-    packages = sorted({*OF_TRAINING, *more})
-    lines = [
-        f"{path.relative_to(ROOT).as_posix()} {hashlib.sha256(path.read_bytes()).hexdigest()}"
-        for package in packages
-        for path in sorted((ROOT / package).rglob("*.py"))
-    ]
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+    return digest_of(content_lines(source_paths({*OF_TRAINING, *more})))

@@ -57,10 +57,9 @@ class OpenTuning:
         scores = {seed: sign * figure for seed, figure in figures.items()}
         # Costs have their sign turned: of what is left, higher is better.
         value = partial(judged, objective=self.tuning.objective, is_cost=False)
-        # A score of 1 is the optimum. Where nobody knows that, returns stand in its place; of some
-        # of them, all below 0, no 1 says anything.
-        seen = [score for each in (scores, *others.values()) for score in each.values()]
-        is_score = self.tuning.figure == "score" and max(seen, default=0.0) > 0
+        # A score of 1 is the optimum. Where nobody knows that, returns stand in its place, of which
+        # no 1 says anything.
+        is_score = self.queue.known_figure() == "score"
         return is_hopeless(
             scores,
             list(others.values()),

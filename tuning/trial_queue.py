@@ -69,10 +69,15 @@ class TrialQueue:
 
     def judged_by(self, figure: str) -> str:
         """What runs of the study are judged by: as those before, and the first by ``figure``."""
-        attributes = self.storage.get_study_user_attrs(self.study_id)
-        if JUDGED_BY not in attributes:
+        known = self.known_figure()
+        if known is None:
             self.storage.set_study_user_attr(self.study_id, JUDGED_BY, figure)
-        return str(attributes.get(JUDGED_BY, figure))
+        return figure if known is None else known
+
+    def known_figure(self) -> str | None:
+        """What runs of the study are judged by; None before the first."""
+        known = self.storage.get_study_user_attrs(self.study_id).get(JUDGED_BY)
+        return None if known is None else str(known)
 
     def is_done(self) -> bool:
         """Whether every trial has ended."""

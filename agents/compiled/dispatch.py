@@ -12,7 +12,6 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
-import numba
 import numpy as np
 from numba.core import types
 from numba.extending import overload
@@ -20,7 +19,7 @@ from numba.extending import overload
 from agents.common.signatures import CheckedConstructor
 from mdp.code_cache import RULE_PREFIX
 from mdp.code_parts import WITHOUT_WRAPPERS, PartCompiler
-from mdp.machine_code import INLINED_OPTIONS
+from mdp.machine_code import INLINED_OPTIONS, is_interpreted
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -35,7 +34,7 @@ class CompiledOnlyError(TypeError):
 
 def by_type(stub: Function) -> Function:
     """Make a compiled function that calls its first argument's own function of that name."""
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if is_interpreted():
         raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
     name = stub.__name__
     _NAMES.add(name)

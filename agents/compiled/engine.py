@@ -156,12 +156,17 @@ class CompiledEngine:
         agent.num_timesteps += n_steps * agent.n_envs
         # Callbacks come before the last step is learnt from: until then the counters end before it.
         self._take_over_counts(n_steps - 1, earlier)
+        if n_steps > 1:
+            self._record_earlier()
         pass_over(self.callback, n_steps - 1, earlier)
         self.callback.update_locals(self._last_step(episodes, earlier, times))
         keep_going = self.callback.on_step()
         if keep_going or self.counts_where_stopped:
             self._update_statistics(episodes, earlier, len(episodes.envs), times)
         return keep_going
+
+    def _record_earlier(self) -> None:
+        """Hand the logger what callbacks may read there of a block's steps but the last."""
 
     def _update_statistics(
         self, episodes: Episodes, start: int, stop: int, times: list[float]

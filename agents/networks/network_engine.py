@@ -94,7 +94,6 @@ class NetworkEngine(CompiledEngine):
         episodes = Episodes.of(self.log.episodes[: progress["logged_episodes"]])
         if not self._tell(episodes, n_steps):
             # As in the library, the last step is not learnt from, nor what belongs to it.
-            self.training.record()
             self.training.give_up_rollout()
             return False
         self._learn_from_last(episodes, n_steps)
@@ -103,7 +102,6 @@ class NetworkEngine(CompiledEngine):
 
     def _learn_from_last(self, episodes: Episodes, n_steps: int) -> None:
         training, progress = self.training, self.progress[0]
-        training.before_last_step()
         if not training.waits:
             training.before_training(self.log_interval)
         learn_from_last_step(self._learner(), self.envs, progress)
@@ -116,6 +114,9 @@ class NetworkEngine(CompiledEngine):
             training.learn_from_rollout(float(progress["remaining"]))
             self._take_over_counts(0, 0)
         training.record()
+
+    def _record_earlier(self) -> None:
+        self.training.record()
 
     def _begin_rollout(self) -> None:
         if not self.has_begun:

@@ -152,10 +152,6 @@ class NetworkTraining(ABC):
         """Learn from the rollout that waits, with that share of the training left."""
 
     @abstractmethod
-    def before_last_step(self) -> None:
-        """What comes between the callbacks and the counts of the last step of a block."""
-
-    @abstractmethod
     def before_training(self, log_interval: int | None) -> None:
         """What comes before learning from a rollout that ends with the last step of a block."""
 

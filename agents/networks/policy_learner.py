@@ -17,7 +17,7 @@ from agents.networks.optimizers import Optimizer
 from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.policy_updates import RolloutMinibatch
 from agents.networks.references import call
-from agents.networks.rollouts import Rollout, shuffle
+from agents.networks.rollouts import Rollout, explained_variance, shuffle
 from mdp.array_types import Ints
 from mdp.machine_code import inlined, kernel
 
@@ -54,6 +54,7 @@ PLACE = np.dtype(
         ("entropy", np.float64),
         ("clipped", np.float64),
         ("kl", np.float64),  # over its last epoch
+        ("explained", np.float64),  # share of the returns' variance, by the values before it
         ("expected", np.float64),  # value of the observation that was looked at last
         ("log_probability", np.float64),  # of the action that was drawn last
     ],
@@ -148,6 +149,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
     place, rules = learner.place[0], learner.rules[0]
     place.step, place.remaining = 0, remaining
     place.n_rollouts += 1
+    place.explained = explained_variance(learner.rollout)
     place.clip_range = schedule_value(rules.clip_range, remaining)
     place.clip_range_vf = schedule_value(rules.clip_range_vf, remaining)
     place.policy_gradient = place.value = place.entropy = place.clipped = 0.0

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.type_aliases import Schedule
-from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.utils import FloatSchedule
 
 from agents.common.callback_horizons import NEVER, Horizon
 from agents.common.schedules import ScheduleRow
@@ -212,9 +212,6 @@ class PolicyTraining(NetworkTraining):
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
         """Nothing: it logs by rollouts."""
 
-    def before_last_step(self) -> None:
-        """Nothing: it logs by rollouts."""
-
     @property
     def is_rollout_over(self) -> bool:
         return bool(self.place["step"][0] == self.agent.n_steps)
@@ -251,11 +248,9 @@ class PolicyTraining(NetworkTraining):
         self.recorded = place["n_rollouts"]
         if np.isnan(self.held.losses["total"][0]):
             raise ValueError("training has diverged: its losses are not numbers any more")
-        buffer, log = agent.rollout_buffer, agent.logger
-        explained = explained_variance(buffer.values.ravel(), buffer.returns.ravel())
-        remaining = agent._current_progress_remaining
+        log, remaining = agent.logger, agent._current_progress_remaining
         agent._update_learning_rate(agent.policy.optimizer)
-        log.record("train/explained_variance", explained)
+        log.record("train/explained_variance", place["explained"])
         log.record("train/entropy_loss", place["entropy"])
         log.record("train/value_loss", place["value"])
         log.record("train/n_updates", agent._n_updates, exclude="tensorboard")

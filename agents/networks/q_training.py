@@ -215,10 +215,6 @@ class QTraining(NetworkTraining):
         agent._n_updates += n_updates
         self._record_training()
 
-    def before_last_step(self) -> None:
-        """Training on that step comes after what is logged at the end of an episode."""
-        self._record_training()
-
     def before_training(self, log_interval: int | None) -> None:
         """Nothing: it logs by episodes."""
 

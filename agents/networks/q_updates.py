@@ -30,9 +30,17 @@ def best_of(values: Any) -> int:
 
 @kernel
 def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
-    """Take one step of gradient descent on `learner.batch`, whose number of rows is returned.
+    """Take one step of gradient descent on `learner.batch`.
 
     The loss before it is added to ``place.losses``: Huber's, or half the squared error.
+
+    Args:
+        learner: both networks, the optimizer and the minibatch.
+        learning_rate: of the optimizer.
+        _: nothing; what is called by its address takes two numbers, whoever learns.
+
+    Returns:
+        The number of rows.
     """
     layers, batch, rules = learner.layers, learner.batch, learner.rules[0]
     n = len(batch.actions)

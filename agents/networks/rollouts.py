@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
 from agents.networks.observations import show
 from mdp.array_types import Ints
-from mdp.machine_code import inlined, kernel
+from mdp.machine_code import called, inlined, kernel
 
 
 class Rollout(NamedTuple):
@@ -70,6 +71,24 @@ def estimate_advantages(learner: Any, _: float, __: float) -> int:
             rollout.returns[step, i] = np.float32(advantage + value)
             next_value, goes_on = value, 1.0 - rollout.episode_starts[step, i]
     return 0
+
+
+@called
+def explained_variance(rollout: Rollout) -> float:
+    """1 - Var(returns - values) / Var(returns), as in the library's log; nan for equal returns."""
+    n_steps, n_envs = rollout.returns.shape
+    n, mean, mean_error = n_steps * n_envs, 0.0, 0.0
+    for step in range(n_steps):
+        for i in range(n_envs):
+            mean += rollout.returns[step, i] / n
+            mean_error += (rollout.returns[step, i] - rollout.values[step, i]) / n
+    variance = unexplained = 0.0
+    for step in range(n_steps):
+        for i in range(n_envs):
+            error = rollout.returns[step, i] - rollout.values[step, i]
+            variance += (rollout.returns[step, i] - mean) ** 2
+            unexplained += (error - mean_error) ** 2
+    return 1.0 - unexplained / variance if variance > 0 else math.nan
 
 
 @inlined

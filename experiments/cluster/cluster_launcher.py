@@ -18,7 +18,7 @@ from distributed.scheduler import KilledWorker
 
 from experiments.child_processes import NO_LIMITS
 from experiments.cluster.addresses import Cluster, JobQueue, LocalWorkers
-from experiments.cluster.clusters import opened
+from experiments.cluster.clusters import Replace, opened
 from experiments.cluster.connections import Connection
 from experiments.cluster.endings import Ending, ending_of
 from experiments.cluster.orders import LEAVING, Probe, RunOrder, probing, version
@@ -135,13 +135,15 @@ class ClusterLauncher:
         self._receivers.submit(self._guarded, sent, self._send)
         return sent.future
 
-    def look(self, replace_jobs: Callable[[], object]) -> None:
+    def look(self, replace_jobs: Replace) -> None:
         """Count the workers, and see to it that there is a scheduler."""
         try:
             self._workers = self.connection.n_threads()
             if time.monotonic() > self._replaced + SECONDS_BETWEEN_REPLACEMENTS:
                 self._replaced = time.monotonic()
-                replace_jobs()
+                with self._lock:
+                    left = frozenset(self._left)
+                replace_jobs(left)
         except UserError as error:
             self._end_all(error)
         except Exception:  # noqa: BLE001  # of the library, gone just now: the next look knows more

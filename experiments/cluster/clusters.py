@@ -8,7 +8,7 @@ import math
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from multiprocessing import resource_tracker
 
 import dask
@@ -23,15 +23,18 @@ from experiments.cluster.addresses import (
     read_cluster,
 )
 from experiments.cluster.connections import SECONDS_TO_CONNECT
-from experiments.cluster.job_queues import QUEUES, has_certificates, opened_queue
+from experiments.cluster.job_queues import (
+    QUEUES,
+    SECONDS_TO_RESTART,
+    Jobs,
+    has_certificates,
+    opened_queue,
+)
 from pipeline.errors import UserError, one_line
 from pipeline.stopping import current
 
-# How long a killed worker may take to be started again, before it is given up for another: Dask's
-# 15 seconds are soon over on a machine that is busy.
-SECONDS_TO_RESTART = 60
-
 Connect = Callable[[], Client]
+Replace = Callable[[Collection[str]], object]
 
 
 def checked_cluster(text: str, is_told: bool) -> Cluster:
@@ -47,9 +50,7 @@ def checked_cluster(text: str, is_told: bool) -> Cluster:
 
 
 @contextlib.contextmanager
-def opened(
-    cluster: Cluster, n_runs: int, is_told: bool
-) -> Iterator[tuple[Connect, Callable[[], object]]]:
+def opened(cluster: Cluster, n_runs: int, is_told: bool) -> Iterator[tuple[Connect, Replace]]:
     """Have a scheduler while the ``with`` statement runs.
 
     Args:
@@ -58,8 +59,8 @@ def opened(
         is_told: whether the user has said that an open one will do.
 
     Yields:
-        What makes a client of it; and what is to be called now and then, so that workers and jobs
-        that have ended are replaced.
+        What makes a client of it; and what is to be called now and then with the addresses of
+        workers that left in good order, so that workers and jobs that have ended are replaced.
     """
     _be_quiet()
     dask.config.set({"distributed.deploy.lost-worker-timeout": SECONDS_TO_RESTART})
@@ -68,12 +69,12 @@ def opened(
     elif isinstance(cluster, LocalWorkers):
         with _local(cluster.n_workers) as local:
             n_workers = cluster.n_workers
-            yield lambda: Client(local, set_as_default=False), lambda: local.scale(n_workers)
+            yield lambda: Client(local, set_as_default=False), lambda _: local.scale(n_workers)
     else:
         n_jobs = math.ceil(n_runs / cluster.n_cores)
         with opened_queue(cluster) as queue:
-            queue.scale(jobs=n_jobs)
-            yield lambda: Client(queue, set_as_default=False), lambda: queue.scale(jobs=n_jobs)
+            jobs = Jobs(queue, n_jobs)
+            yield lambda: Client(queue, set_as_default=False), jobs.replace
 
 
 def _be_quiet() -> None:
@@ -84,7 +85,7 @@ def _be_quiet() -> None:
     warnings.filterwarnings("ignore", "Creating scratch directories")
 
 
-def _nothing() -> None:
+def _nothing(_: Collection[str]) -> None:
     """Nothing has to be done."""
 
 

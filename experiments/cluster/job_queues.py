@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib
 import re
 import signal
+import time
 import warnings
+from collections.abc import Collection
 from types import ModuleType
 from typing import Any
 
@@ -29,6 +32,11 @@ QUEUES = {
 SHARE_FOR_LEAVING = 0.1
 MOST_FOR_LEAVING = 300.0  # seconds
 
+# How long a killed worker may take to be started again, before it is given up for another: Dask's
+# 15 seconds are soon over on a machine that is busy.
+SECONDS_TO_RESTART = 60.0
+_NEVER = 1e9  # seconds
+
 _WALLTIME = re.compile(r"(?:(\d{1,4})-)?(\d{1,4}):(\d\d):(\d\d)")
 
 
@@ -45,6 +53,8 @@ def opened_queue(queue: JobQueue) -> Any:
     if not any("dashboard" in str(word) for word in words):
         settings["worker-extra-args"] = [*words, "--dashboard-address", "127.0.0.1:0"]
     dask.config.set({f"jobqueue.{queue.system}": {**_defaults(queue.system), **settings}})
+    # Else it would end the job of the same name that `Jobs` has sent instead, while that waits.
+    dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER})
     kind = getattr(_library(), QUEUES[queue.system])
     security = Security()
     if not has_certificates(security):
@@ -56,6 +66,51 @@ def opened_queue(queue: JobQueue) -> Any:
             return kind(security=security, protocol="tls://", scheduler_options=options)
     except (ValueError, TypeError, OSError, RuntimeError) as error:
         raise UserError(f"{queue.file}: {one_line(error)}") from error
+
+
+class Jobs:
+    """As many jobs as are wanted, of which those that have ended are sent again.
+
+    Dask finds out that a job has ended only where one worker is all of it.
+
+    Args:
+        queue: of dask-jobqueue, with its scheduler in this process.
+        n_jobs: how many.
+    """
+
+    def __init__(self, queue: Any, n_jobs: int) -> None:
+        self._queue, self._n_jobs = queue, n_jobs
+        self._seen: dict[str, tuple[set[str], float]] = {}  # of a job: its workers, and when
+        queue.scale(jobs=n_jobs)
+
+    def replace(self, left: Collection[str]) -> None:
+        """Send again those whose workers have gone; called now and then.
+
+        Args:
+            left: addresses of workers that left in good order: these are not started again.
+        """
+        self._queue.loop.add_callback(self._replace, frozenset(left))
+
+    def _replace(self, left: frozenset[str]) -> None:
+        jobs, now = self._queue.workers, time.monotonic()
+        for name, there in self._workers_of_jobs().items():
+            if there:
+                self._seen[name] = (there, now)
+            elif name in self._seen and name in jobs:
+                workers, last = self._seen[name]
+                if workers <= left or now > last + SECONDS_TO_RESTART:
+                    del self._seen[name]
+                    self._queue._futures.add(asyncio.ensure_future(jobs.pop(name).close()))
+        self._queue.scale(jobs=self._n_jobs)
+
+    def _workers_of_jobs(self) -> dict[str, set[str]]:
+        """The addresses of the workers that there are, by their job."""
+        workers = list(self._queue.scheduler.workers.values())
+        # One has the job's name, several have numbers behind it.
+        return {
+            job: {each.address for each in workers if f"{each.name}-".startswith(f"{job}-")}
+            for job in self._queue.worker_spec
+        }
 
 
 def _library() -> ModuleType:

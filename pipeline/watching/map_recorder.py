@@ -27,6 +27,7 @@ FEWEST_MAPS = 2  # the first and the last
 # What the library's agents log of a training, by the names that it has here.
 LOGGED = {
     "loss": "train/loss",
+    "policy_loss": "train/policy_loss",
     "value_loss": "train/value_loss",
     "entropy_loss": "train/entropy_loss",
 }

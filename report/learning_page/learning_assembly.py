@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from functools import cache
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
@@ -56,6 +57,7 @@ def write_learning_page(
     return f"{words['kind']}, {words['extent']}"
 
 
+@cache
 def page_version() -> str:
     """A digest of all that a page is made of but the data."""
     return sha256(_render({"title": "", "seed": 0, **NO_WORDS}, {}).encode()).hexdigest()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -112,5 +113,8 @@ def importances(trials: Trials) -> dict[str, float]:
             )
         )
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
-    found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    with warnings.catch_warnings():
+        # Of parameters that few trials have; the page says that few trials say little.
+        warnings.filterwarnings("ignore", "Some regimes for parameter")
+        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
     return {name: share for name, share in found.items() if share > 0}

@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from commands import live_progress, study_progress
+from commands import live_progress, study_progress, tune_progress
 from commands.study_progress import StudyProgress
+from commands.tune_progress import TuningProgress
 from experiments.launching import RunFailure
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
@@ -21,7 +22,7 @@ from pipeline import signs_of_life
 def clock(monkeypatch):
     """A clock that stands until it is told to go on."""
     fake = SimpleNamespace(now=1000.0)
-    for place in (study_progress, live_progress, signs_of_life):
+    for place in (study_progress, tune_progress, live_progress, signs_of_life):
         monkeypatch.setattr(place, "time", SimpleNamespace(monotonic=lambda: fake.now))
     # Nothing beats by itself.
     still = SimpleNamespace(start=skip, stop=skip)
@@ -119,6 +120,20 @@ def test_of_a_cluster_the_line_says_how_many_workers_there_are(clock):
         "1 of 8 runs in 11 s, about 1 min 17 s left, 3 workers, 1 failed",
         "1 of 8 runs in 22 s, about 2 min 34 s left, 1 failed",
     ]
+
+
+def test_so_does_the_line_of_a_search(clock):
+    _, console = console_of(force_terminal=False)
+    with TuningProgress(console, 10, dict, is_cost=False) as progress:
+        assert progress.figures() == "0 of 10 trials, 0 runs in 0 s"
+        launchers = progress.watching(lambda: nullcontext(SimpleNamespace(words="3 workers")))
+        with launchers():
+            progress.run_ended()
+            progress.trial_ended(4, 0.5, "")
+            clock.now += 2
+            assert progress.figures() == (
+                "1 of 10 trials, 1 run in 2 s, 3 workers; best 0.5 (trial 4); about 18 s left"
+            )
 
 
 def test_a_study_that_is_interrupted_says_how_to_go_on(clock):

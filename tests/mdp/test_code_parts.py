@@ -1,5 +1,9 @@
 """What compiled functions call is compiled as a part of them, once, and is no machine code."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from numba.core import event
@@ -57,3 +61,23 @@ def test_parts_are_compiled_once_and_only_python_is_refused():
     assert not total.overloads
     assert total(numbers, 2) == 42
     assert len(total.overloads) == 1
+
+
+def test_without_the_compiler_python_plans_and_evaluates():
+    code = """
+import gymnasium
+from envs.known_models import transition_model
+from mdp import finite_horizon_optimum, policy_return
+for name in ("envs:Warehouse-v0", "FrozenLake-v1"):
+    model = transition_model(gymnasium.make(name))
+    plan = finite_horizon_optimum(model, 100)
+    print(plan.start_value, policy_return(model, plan.policy, 100).expected_return)
+"""
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    warehouse, frozen_lake = (line.split() for line in done.stdout.splitlines())
+    assert warehouse == ["79.0", "79.0"]
+    planned, earned = map(float, frozen_lake)
+    assert earned == pytest.approx(planned, abs=1e-12)

@@ -244,6 +244,7 @@ def done(spec):
 
 
 SMALL_PPO = {"n_steps": 32, "batch_size": 32}
+SMALL_A2C = {"n_steps": 32}
 SMALL_DQN = {"learning_starts": 50, "buffer_size": 200, "train_freq": 8, "gradient_steps": 2}
 
 
@@ -290,7 +291,7 @@ class Updates(BlockCallback):
     def _on_rollout_start(self):
         log = self.model.logger.name_to_value
         if self.model._n_updates and (not self.seen or self.model._n_updates != self.seen[-1][0]):
-            loss = log.get("train/loss", np.nan)
+            loss = log.get("train/loss", log.get("train/policy_loss", np.nan))
             self.seen.append((self.model._n_updates, self.model.num_timesteps, loss))
 
     def _on_step(self):
@@ -300,7 +301,11 @@ class Updates(BlockCallback):
 @pytest.mark.parametrize("engine", ["library", "compiled"])
 @pytest.mark.parametrize(
     ("algo", "settings", "steps"),
-    [("ppo", SMALL_PPO, range(0, 321, 32)), ("dqn", SMALL_DQN, [0, *range(56, 305, 8)])],
+    [
+        ("ppo", SMALL_PPO, range(0, 321, 32)),
+        ("dqn", SMALL_DQN, [0, *range(56, 305, 8)]),
+        ("a2c", SMALL_A2C, range(0, 321, 32)),
+    ],
 )
 def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, steps, engine):
     settings = {**settings, "engine": engine}
@@ -316,10 +321,11 @@ def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, st
     assert rows["number"].tolist() == [*range(len(steps))]
     # The last one is learnt after the last rollout.
     assert heard.seen[-1][1] == rows["timesteps"][-2]
-    assert rows["loss"][1:-1].tolist() == [loss for _, _, loss in heard.seen]
-    assert rows["loss"][-1] == training.model.logger.name_to_value["train/loss"]
+    loss = "policy_loss" if algo == "a2c" else "loss"
+    assert rows[loss][1:-1].tolist() == [loss for _, _, loss in heard.seen]
+    assert rows[loss][-1] == training.model.logger.name_to_value[f"train/{loss}"]
     assert np.isnan(rows["value_loss"][1:]).any() == (algo == "dqn")
-    assert np.isnan(rows[0]["loss"])
+    assert np.isnan(rows[0][loss])
     # What the start is worth at the end is the return that was computed of the final agent.
     at_start = rows["values"] @ training.watch.evaluator.model.initial
     assert at_start[-1] == pytest.approx(outcome.final.mean_return, abs=1e-12)

@@ -64,6 +64,12 @@ def test_the_parameter_that_decides_matters_most(tuning_record, tuning_trial):
     assert sum(shares.values()) == pytest.approx(1.0)
 
 
+def test_a_parameter_that_one_trial_alone_has_is_no_reason_to_warn(tuning_record):
+    for trial in tuning_record["trials"][1:]:
+        trial["params"].pop("rate", None)
+    assert importances(trials_of(tuning_record)).keys() <= {"steps", "kind"}
+
+
 def test_where_all_are_alike_nothing_matters(tuning_record, tuning_trial):
     tuning_record["trials"] = [tuning_trial(n, 0.5, {"1": 0.5}) for n in range(5)]
     assert importances(trials_of(tuning_record)) == {}

@@ -72,6 +72,22 @@ def test_scores_are_not_compared_with_returns_of_before(toy, tmp_path):
     assert toy.states(place) == ["COMPLETE"] * 10
 
 
+@pytest.mark.parametrize(("judged_by", "hopeless"), [("score", False), ("final", True)])
+def test_only_scores_have_1_to_hope_for_where_all_are_below_0(toy, tmp_path, judged_by, hopeless):
+    """Of returns nobody knows how high they go: those seen so far have to do."""
+    place = toy.opened(toy.tuning(n_trials=2, pruner="bound"), tmp_path)
+
+    def low(entry, seed):
+        return -1.0 - seed if entry == toy.shipped else -6.0
+
+    launcher = toy.search(place, toy.Launcher(), low, judged_by=judged_by)
+    assert toy.states(place)[0] == "COMPLETE"
+    assert place.hopeless(1, {0: -6.0}) is hopeless
+    # With 1 on the last seed they come to -11 / 3, and the mean to be beaten is -2.
+    assert place.hopeless(1, {0: -6.0, 1: -6.0})
+    assert len(launcher.done) == (4 if hopeless else 5)
+
+
 def test_a_cost_is_made_small(toy, tmp_path):
     place = toy.opened(toy.tuning(figure="steps"), tmp_path)
     toy.search(place, toy.Launcher(), lambda entry, seed: 100.0 * entry["gamma"])

@@ -20,6 +20,7 @@ const mapShow = (data) => {
     ["Return of the last training episodes, mean", "training_return", null],
     ["Exploration", "exploration", null],
     ["Loss", "loss", data.logged.loss],
+    ["Loss of the policy", "policy_loss", data.logged.policy_loss],
     ["Loss of the value network", "value_loss", data.logged.value_loss],
     ["Loss of entropy", "entropy_loss", data.logged.entropy_loss],
   ].filter(([, name]) => moments[name].some((value) => value !== null));

@@ -64,10 +64,9 @@ def make(env, kind, **kwargs):
         "MlpPolicy",
         make_vec_env(ENVS[env], n_envs, seed=2),
         seed=1,
-        engine="compiled",
         learning_rate=LinearSchedule(0.01, 0.001, 1.0),
         policy_kwargs={"net_arch": [24, 8]},
-        **{**settings, **kwargs},
+        **{"engine": "compiled", **settings, **kwargs},
     )
 
 
@@ -191,6 +190,42 @@ class Stop(BlockCallback):
 
     def _on_step(self):
         return self.n_calls < self.n
+
+
+class LogReader(BlockCallback):
+    """Keeps what the log says now and then, and has it written down and forgotten now and then."""
+
+    every_n_steps = 37
+
+    def __init__(self):
+        super().__init__()
+        self.read = []
+
+    def _on_step(self):
+        said = self.logger.name_to_value.items()
+        self.read.append(
+            {name: value for name, value in said if name.startswith(("train/", "rollout/expl"))}
+        )
+        if len(self.read) % 2:
+            self.logger.dump(self.num_timesteps)
+        return True
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_callbacks_read_the_same_log(kind):
+    """What was learnt just before, and under the names that the library has."""
+    readers = {mode: LogReader() for mode in MODES}
+    for mode, reader in readers.items():
+        learn(make("CartPole", kind), mode, 500, reader, log_interval=None)
+    ours = readers["compiled"].read
+    assert len(ours) == 13
+    for read, expected in zip(ours, readers["parts"].read, strict=True):
+        assert read == pytest.approx(expected, nan_ok=True)
+    library = LogReader()
+    model = make("CartPole", kind, engine="library")
+    model.learn(500, callback=library, log_interval=None)
+    if kind != "dqn, episodes":  # which end elsewhere: it draws other numbers
+        assert [read.keys() for read in ours] == [read.keys() for read in library.read]
 
 
 class Change(BlockCallback):

@@ -1,0 +1,28 @@
+"""The sources of packages, and a digest that stands for what they say."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+
+# The folder of all packages.
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def source_paths(packages: Iterable[str]) -> list[Path]:
+    """Every source of the packages, in the order of their names."""
+    return sorted(path for package in packages for path in (ROOT / package).rglob("*.py"))
+
+
+def content_lines(paths: Iterable[Path]) -> list[str]:
+    """A line for each source: its path below the packages' folder, and a digest of what it says."""
+    return [
+        f"{path.relative_to(ROOT).as_posix()} {hashlib.sha256(path.read_bytes()).hexdigest()}"
+        for path in paths
+    ]
+
+
+def digest_of(lines: Iterable[str]) -> str:
+    """16 hexadecimal digits that stand for these lines."""
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
