@@ -32,7 +32,7 @@ LIGHT_NETWORK = Shares(usual=1 / 10, at_first=1 / 10)
 COMPILED_NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
 COMPILED_TABLE = Shares(usual=1 / 10, at_first=1 / 2)
 # Compiled learning from environments in Python.
-PYTHON_ENV = Shares(usual=1 / 32, at_first=1 / 8)
+PYTHON_ENV = Shares(usual=1 / 32, at_first=1 / 6)
 # Compiled training whose evaluation cannot be compiled.
 NETWORK_ALONE = Shares(usual=1 / 32, at_first=1 / 32)
 TABLE_ALONE = Shares(usual=1 / 2500, at_first=1 / 2500)
