@@ -20,10 +20,10 @@ STEPS_AT_ONCE = 4096
 
 
 class Plan(NamedTuple):
-    """Does in each state, or at each number that is observed, what is written down.
+    """Does at each number that is observed what is written down.
 
     Attributes:
-        actions: by number, shape (S,).
+        actions: one for each number, shape (S,).
     """
 
     actions: Ints

@@ -54,7 +54,7 @@ def both(model, env_id, wrapper, plays):
 def test_tables_and_tiles_play_the_same_bits(algo, env_id, wrapper, n_timesteps, settings):
     model = trained(algo, env_id, wrapper, n_timesteps, **settings)
     # More than one go, and further episodes that go on from where the generators were left.
-    plays = [(5, 1), (23, None), (2, None), (5, 1)]
+    plays = [(5, 1), (23, None), (2, None), (5, 0)]
     for ours, plain in both(model, env_id, wrapper, plays):
         np.testing.assert_array_equal(ours.returns, plain.returns)
         np.testing.assert_array_equal(ours.lengths, plain.lengths)
