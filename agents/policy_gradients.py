@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.common.signatures import full_signature
 from agents.networks.coverage import check_policy_agent
 from agents.networks.engine_setting import CompiledNetworks
-from agents.networks.library_networks import check_optimizer
+from agents.networks.library_networks import Network, check_optimizer
 from agents.networks.policy_training import PolicyTraining, policy_networks, policy_training
 from agents.networks.python_rollouts import collect_rollout
 
@@ -57,6 +57,9 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
 
     def _compiled_training(self, seen: Any) -> AbstractContextManager[PolicyTraining]:
         return policy_training(self, seen)
+
+    def _acting_network(self, seen: Any) -> Network:
+        return policy_networks(self.policy, seen)[0]
 
     def collect_rollouts(
         self,

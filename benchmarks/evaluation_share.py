@@ -2,6 +2,7 @@
 
     python benchmarks/evaluation_share.py                  # as typed, some twenty minutes
     python benchmarks/evaluation_share.py -n 20000         # so many steps of each
+    python benchmarks/evaluation_share.py --env CartPole-v1 --work "a2c, compiled" qlearning
 
 Each training is a process of its own: settings from our files, the budget too unless ``-n`` says
 another, and no flag for evaluation. Times are of processors. Evaluations go by steps, so that the
@@ -28,7 +29,10 @@ WORK: dict[str, tuple[str, ...]] = {
     "ppo, compiled": ("--algo", "ppo", *COMPILED),
     "dqn": ("--algo", "dqn"),
     "dqn, compiled": ("--algo", "dqn", *COMPILED),
+    "a2c": ("--algo", "a2c"),
+    "a2c, compiled": ("--algo", "a2c", *COMPILED),
     "qlearning": ("--algo", "qlearning"),
+    "semi_gradient_sarsa": ("--algo", "semi_gradient_sarsa"),
 }
 # In a process of its own: the command's flags, and what the outcome says that no file does.
 TRAINING = """

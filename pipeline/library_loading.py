@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 @contextmanager
@@ -22,3 +23,17 @@ def loading_libraries() -> Iterator[None]:
         if was_on:
             gc.freeze()
             gc.enable()
+
+
+def load_for_optimizer(model: Any) -> None:
+    """Import what PyTorch's optimizers import at their first step: its compiler, which stays idle.
+
+    That takes them more than a second, and a quarter longer while garbage is looked for.
+
+    Args:
+        model: the agent; nothing is imported if it may well train without such steps.
+    """
+    has_optimizer = getattr(getattr(model, "policy", None), "optimizer", None) is not None
+    if has_optimizer and getattr(model, "engine", "library") == "library":
+        with loading_libraries():
+            import torch._dynamo  # noqa: F401

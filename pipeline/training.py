@@ -23,6 +23,7 @@ from pipeline.finishing import draw, judge, save
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.leftovers import remove_leftovers
 from pipeline.library_errors import blame_settings, blame_weights
+from pipeline.library_loading import load_for_optimizer
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
 from pipeline.pull_recording import PullSummary
 from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
@@ -44,7 +45,6 @@ from pipeline.worker_processes import deaths_told
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12
 NEW = StateKeeping()
-
 # After a signal that asks to stop: how long the training may go on to where nothing is half done,
 # and when evaluating and drawing what was learnt has to be over.
 SECONDS_TO_A_SAFE_MOMENT = 1.0
@@ -136,6 +136,7 @@ def prepare(
         with stop.waiting(0.0), naming(run.path):
             run.keep_room()
             training = set_up(spec, run, kwargs, console, undo, keeping)
+            load_for_optimizer(training.model)
         if keeping.goes_on:
             run.reopen()
         else:

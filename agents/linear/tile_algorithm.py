@@ -22,6 +22,7 @@ from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import LearningAlgorithm
 from agents.compiled.training_records import UNDECIDED
 from agents.linear.tile_engine import TileEngine, tile_world
+from agents.linear.tile_player import TilePlayer, tile_player
 from agents.linear.tile_policy import TilePolicy
 from agents.linear.tile_settings import Bound
 from agents.linear.tile_workspace import TileWorkspace
@@ -160,6 +161,10 @@ class TileAlgorithm(LearningAlgorithm):
             room,
             handles_of([rng])[0],
         )
+
+    def greedy_player(self, seen: Any) -> TilePlayer:
+        """What plays as `predict` does on compiled environments, whose observations are read so."""
+        return tile_player(self.compiled_agent(self.rng, seen))
 
     def _begin_episodes(self) -> None:
         self._next_actions = np.full(self.n_envs, UNDECIDED)

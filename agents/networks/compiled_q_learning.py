@@ -14,7 +14,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from agents.networks.coverage import check_q_agent
 from agents.networks.engine_setting import CompiledNetworks
-from agents.networks.library_networks import check_optimizer
+from agents.networks.library_networks import Network, check_optimizer
 from agents.networks.q_training import QTraining, q_network, q_training
 
 
@@ -53,6 +53,9 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
 
     def _compiled_training(self, seen: Any) -> AbstractContextManager[QTraining]:
         return q_training(self, seen)
+
+    def _acting_network(self, seen: Any) -> Network:
+        return q_network(self.q_net, seen)
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1

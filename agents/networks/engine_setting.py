@@ -19,8 +19,10 @@ from agents.common.callback_horizons import unknown_callbacks
 from agents.common.setting_checks import check_option
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import compiled_schedule
+from agents.networks.library_networks import Network
 from agents.networks.matrix_products import one_thread
 from agents.networks.network_engine import NetworkEngine
+from agents.networks.network_playing import NetworkPlayer, network_player
 from agents.networks.network_training import NetworkTraining
 from agents.networks.network_worlds import network_world
 from agents.networks.observations import Numbers, OwnVectors
@@ -75,6 +77,18 @@ class CompiledNetworks(BaseAlgorithm):
     @abstractmethod
     def _compiled_training(self, seen: Any) -> AbstractContextManager[NetworkTraining]:
         """Let the agent and compiled code share memory for a while."""
+
+    @abstractmethod
+    def _acting_network(self, seen: Any) -> Network:
+        """The network whose largest output is the best action."""
+
+    def greedy_player(self, seen: Any) -> NetworkPlayer:
+        """What plays as `predict` does on compiled environments, but for rounding.
+
+        Args:
+            seen: how observations are read, of `agents.networks.observations`.
+        """
+        return network_player(self._acting_network(seen), seen)
 
     def _schedules(self) -> list[Schedule]:
         """What a training in the compiled loop works out by itself."""

@@ -18,9 +18,8 @@ from agents.reference import RandomAgent
 from agents.tabular.q_table_policy import QTablePolicy
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from mdp.array_types import Bools, Floats, Ints
-from pipeline.evaluation.evaluation_budget import is_network
 from pipeline.evaluation.mask_telling import takes_masks
-from pipeline.evaluation.policy_kinds import has_memory
+from pipeline.evaluation.policy_kinds import has_memory, is_network
 from pipeline.evaluation.sampled import KNOWN_LIBRARIES
 
 # Numbers that a network is handed at once, and at all: beyond, asking for every state takes longer

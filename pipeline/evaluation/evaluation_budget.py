@@ -6,24 +6,21 @@ It goes by steps and never by the clock, so that the same seed gives the same fi
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from pipeline.evaluation.bracketed import bracketed_yardstick
+from pipeline.evaluation.evaluation_shares import allowed_steps, shares_of
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
 from pipeline.train_spec import TrainSpec
 
-# Steps of evaluation for one of training, so that they take a fifth of its time or less: by a
-# network, which learns for longer than it plays, and by a table; and the same where training runs
-# on compiled code, which evaluation does not. Figures: `benchmarks/evaluation_share.py`.
-SHARES = {"network": 1 / 4, "table": 1 / 100}
-SHARES_COMPILED = {"network": 1 / 32, "table": 1 / 2500}
-# Of short trainings; half a second in most environments.
-STEPS_IN_ANY_CASE = 10_000
-# The final evaluation has the rest.
+if TYPE_CHECKING:
+    from pipeline.evaluation.compiled_play import CompiledCopy
+
+# The final evaluation has the rest, and no less where those before took more than they had.
 PART_DURING_TRAINING = 1 / 2
 
 # Episodes of an evaluation: the first number, and the next until the standard error is small.
@@ -57,7 +54,7 @@ class SampledEvaluator:
         self.training_episodes = spec.hyperparams.n_episodes
         self.n_steps = 0
         self._left = math.inf
-        self._usual_length = 1.0
+        self._last_length: float | None = None
 
     def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
         """Whether the training has come far enough for another evaluation.
@@ -72,9 +69,9 @@ class SampledEvaluator:
             if self.training_episodes is not None:
                 progress = n_episodes / self.training_episodes
             planned = n_trained / progress if progress > 0 else 0.0
-            allowed = allowed_steps(planned, share_of(model)) * min(progress, 1.0)
+            allowed = self._allowed(model, planned) * min(progress, 1.0)
             self._left = allowed * PART_DURING_TRAINING - self.n_steps
-        return STAGES[0] * self._usual_length <= self._left
+        return STAGES[0] * self._usual_length(model) <= self._left
 
     def __call__(self, model: BaseAlgorithm) -> Evaluation:
         """An evaluation during training."""
@@ -83,9 +80,12 @@ class SampledEvaluator:
 
     def at_the_end(self, model: BaseAlgorithm) -> Evaluation:
         """The final evaluation, by episodes of its own."""
-        stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
         n_trained = model.num_timesteps - model._num_timesteps_at_start
-        left = allowed_steps(n_trained, share_of(model)) - self.n_steps
+        allowed = self._allowed(model, n_trained)
+        left = max(allowed - self.n_steps, allowed * (1 - PART_DURING_TRAINING))
+        stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
+        if self.n_final is None and not self._is_known_to_fit(stages[0], left):
+            stages = (STAGES[0], *stages)
         return self._evaluate(model, stages, PRECISION_AT_THE_END, left, purpose=2)
 
     def _evaluate(
@@ -98,28 +98,48 @@ class SampledEvaluator:
     ) -> Evaluation:
         """Play episodes, until the mean is sure enough or more of them would be too many steps."""
         seed = evaluation_seed(self.seed, purpose)
-        found = evaluate(model, self.env, stages[0], seed)
+        copy = self._compiled_copy(model)
+        found = self._play(model, copy, stages[0], seed)
         for n_episodes in stages[1:]:
             n_more = n_episodes - len(found.returns)
             if is_sure(found, precision) or found.lengths.sum() + n_more * found.mean_length > most:
                 break
             # Not seeded again, the environments go on to other episodes.
-            found = found.joined(evaluate(model, self.env, n_more, seed=None))
+            found = found.joined(self._play(model, copy, n_more, None))
         self.n_steps += int(found.lengths.sum())
-        self._usual_length = found.mean_length
+        self._last_length = found.mean_length
         return found.measured_by(self.yardstick)
 
+    def _allowed(self, model: BaseAlgorithm, n_trained: float) -> float:
+        is_compiled = self._compiled_copy(model) is not None
+        return allowed_steps(n_trained, shares_of(model, plays_compiled=is_compiled))
 
-def share_of(model: BaseAlgorithm) -> float:
-    """Steps of evaluation for one of the model's training."""
-    is_compiled = getattr(model, "engine_in_use", "").startswith("compiled")
-    shares = SHARES_COMPILED if is_compiled else SHARES
-    return shares["network" if is_network(model) else "table"]
+    def _is_known_to_fit(self, n_episodes: int, left: float) -> bool:
+        return self._last_length is not None and n_episodes * self._last_length <= left
 
+    def _usual_length(self, model: BaseAlgorithm) -> float:
+        """Steps of an episode: of those evaluated last, or else of training's last ones."""
+        if self._last_length is not None:
+            return self._last_length
+        lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
+        return float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
 
-def allowed_steps(n_trained: float, share: float) -> float:
-    """Steps that all evaluations of a training of so many may take."""
-    return max(share * n_trained, STEPS_IN_ANY_CASE)
+    def _play(
+        self, model: BaseAlgorithm, copy: CompiledCopy | None, n_episodes: int, seed: int | None
+    ) -> Evaluation:
+        if copy is None:
+            return evaluate(model, self.env, n_episodes, seed)
+        from pipeline.evaluation.compiled_play import evaluate_compiled
+
+        return evaluate_compiled(model, copy, n_episodes, seed)
+
+    def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
+        """The environments in compiled code, if it is that what the agent was trained on."""
+        if getattr(model, "engine_in_use", "") != "compiled":
+            return None
+        from pipeline.evaluation.compiled_play import compiled_copy
+
+        return compiled_copy(self.env)
 
 
 def is_sure(evaluation: Evaluation, precision: float) -> bool:
@@ -135,9 +155,3 @@ def is_sure(evaluation: Evaluation, precision: float) -> bool:
 def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
     """How many environments to play on at once: no more than there are episodes."""
     return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
-
-
-def is_network(model: BaseAlgorithm) -> bool:
-    """Whether the agent's policy has weights."""
-    policy = getattr(model, "policy", None)
-    return isinstance(policy, th.nn.Module) and next(policy.parameters(), None) is not None

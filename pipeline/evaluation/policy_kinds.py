@@ -1,10 +1,17 @@
-"""Whether a policy acts by more than what it observes now."""
+"""Whether a policy has weights, and whether it acts by more than what it observes now."""
 
 from __future__ import annotations
 
 import sys
 
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+
+
+def is_network(model: BaseAlgorithm) -> bool:
+    """Whether the agent's policy has weights."""
+    policy = getattr(model, "policy", None)
+    return isinstance(policy, th.nn.Module) and next(policy.parameters(), None) is not None
 
 
 def has_memory(agent: BaseAlgorithm) -> bool:

@@ -10,12 +10,9 @@ from rich.console import Console
 
 from agents import load_algorithm
 from pipeline.evaluation import evaluation_budget as budget
-from pipeline.evaluation.evaluation_budget import (
-    SampledEvaluator,
-    allowed_steps,
-    is_sure,
-    share_of,
-)
+from pipeline.evaluation import evaluation_shares as shares
+from pipeline.evaluation.evaluation_budget import SampledEvaluator, is_sure
+from pipeline.evaluation.evaluation_shares import allowed_steps, shares_of
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -48,23 +45,33 @@ def test_when_a_mean_is_sure():
 
 
 @pytest.mark.parametrize(
-    ("algo", "engine_in_use", "steps"),
+    ("algo", "engine_in_use", "plays_compiled", "of_long", "of_short"),
     [
-        ("ppo", "library", 250_000),
-        ("ppo", "library: it masks actions", 250_000),
-        ("ppo", "compiled", 31_250),
-        ("ppo", "compiled but for the environment: none is known", 31_250),
-        ("qlearning", "interpreted: asked for", 10_000),
-        ("qlearning", "compiled", 400),
+        ("ppo", "library", False, 250_000, 2500),
+        ("ppo", "library: it masks actions", False, 250_000, 2500),
+        ("a2c", "library", False, 100_000, 2000),
+        ("ppo", "compiled", True, 250_000, 2500),
+        ("ppo", "compiled", False, 31_250, 2000),
+        ("ppo", "compiled but for the environment: none is known", False, 31_250, 2000),
+        ("qlearning", "interpreted: asked for", False, 10_000, 2000),
+        ("qlearning", "compiled", True, 100_000, 2500),
+        ("qlearning", "compiled", False, 2000, 2000),
     ],
 )
-def test_what_is_allowed(algo, engine_in_use, steps):
+def test_what_is_allowed(algo, engine_in_use, plays_compiled, of_long, of_short):
     env = gym.make("FrozenLake-v1")
-    model = load_algorithm(algo)(env=env, **({"policy": "MlpPolicy"} if algo == "ppo" else {}))
+    is_table = algo == "qlearning"
+    model = load_algorithm(algo)(env=env, **({} if is_table else {"policy": "MlpPolicy"}))
     model.engine_in_use = engine_in_use
-    assert 1e6 * share_of(model) == steps
-    assert allowed_steps(1e8, share_of(model)) == 100 * steps
-    assert allowed_steps(1000, share_of(model)) == budget.STEPS_IN_ANY_CASE
+    found = shares_of(model, plays_compiled=plays_compiled)
+    assert allowed_steps(1e6, found) == of_long
+    assert allowed_steps(5000, found) == of_short
+    assert allowed_steps(1, found) == shares.STEPS_IN_ANY_CASE
+
+
+def test_short_trainings_are_allowed_more():
+    found = [allowed_steps(n, shares.NETWORK) for n in (2000, 10_000, 20_000, 40_000, 60_000)]
+    assert found == [2000, 5000, 10_000, 10_000, 15_000]
 
 
 def played(monkeypatch, returns, length):
@@ -85,41 +92,58 @@ class Model:
     policy = None
 
 
+# Of so few steps of training, 2,000 steps of evaluation are allowed.
 @pytest.mark.parametrize(
     ("returns", "length", "expected"),
     [
         ([1.0] * 100, 1, [10]),
         ([0.0, 9.0] * 50, 1, [10, 15, 25, 50]),
-        ([0.0, 9.0] * 50, 300, [10, 15]),  # the next 25 would be 15,000 steps
-        ([0.0, 9.0] * 50, 1001, [10]),  # ten there are in any case
+        ([0.0, 9.0] * 50, 50, [10, 15]),  # the next 25 would make it 2,500 steps
+        ([0.0, 9.0] * 50, 190, [5]),  # the evaluation before took 1,900
+        ([0.0, 9.0] * 50, 900, [5]),  # five there are in any case
     ],
 )
 def test_the_last_evaluation_ends_when_it_is_sure_or_dear(
     monkeypatch, tmp_path, returns, length, expected
 ):
-    asked = played(monkeypatch, returns, length)
+    asked = played(monkeypatch, [*[3.0] * 10, *returns], length)
     evaluator = SampledEvaluator(spec_of(tmp_path), None)
+    assert len(evaluator(Model()).returns) == 10
+    asked.clear()
     found = evaluator.at_the_end(Model())
     assert [n for n, _ in asked] == expected
     assert [goes_on for _, goes_on in asked] == [False, *[True] * (len(expected) - 1)]
     assert len(found.returns) == sum(expected)
-    assert evaluator.n_steps == sum(expected) * length
+    assert evaluator.n_steps == (10 + sum(expected)) * length
 
 
-def test_evaluations_are_left_out_while_they_are_too_dear(monkeypatch, tmp_path):
+def test_where_no_length_is_known_the_last_evaluation_begins_with_five(monkeypatch, tmp_path):
+    asked = played(monkeypatch, [0.0, 9.0] * 50, length=100)
+    SampledEvaluator(spec_of(tmp_path), None).at_the_end(Model())
+    assert [n for n, _ in asked] == [5, 5]
+
+
+@pytest.mark.parametrize(
+    ("trained_on", "expected"),
+    [([], [2000, 20_000, 30_000, 40_000]), ([900, *[200] * 5], [10_000, 20_000, 30_000, 40_000])],
+)
+def test_evaluations_are_left_out_while_they_are_too_dear(
+    monkeypatch, tmp_path, trained_on, expected
+):
     asked = played(monkeypatch, [1.0, 5.0] * 500, length=200)
-    evaluator, model = SampledEvaluator(spec_of(tmp_path, n_timesteps=20_000), None), Model()
+    evaluator, model = SampledEvaluator(spec_of(tmp_path, n_timesteps=40_000), None), Model()
+    model.ep_info_buffer = [{"l": length} for length in trained_on]
     done = []
-    for step in range(1000, 20_001, 1000):
+    for step in range(2000, 40_001, 2000):
         model.num_timesteps = step
         if evaluator.can_afford(model, 0):
             evaluator(model)
             done.append(step)
-    # Five episodes are 1,000 steps, and half of 10,000 are allowed over the whole training; of the
-    # first nobody knows how long it takes.
-    assert done == [1000, 8000, 12_000, 16_000, 20_000]
-    assert [n for n, _ in asked] == [5] * 5
-    assert evaluator.n_steps == 5000
+    # Five episodes are 1,000 steps, and half of 8,000 are allowed over the whole training. How long
+    # the first takes, training's episodes tell, if there are any.
+    assert done == expected
+    assert [n for n, _ in asked] == [5] * 4
+    assert evaluator.n_steps == 4000
 
 
 def test_what_is_asked_for_is_done(tmp_path):
@@ -132,10 +156,9 @@ def test_what_is_asked_for_is_done(tmp_path):
     assert len(np.load(often.evaluations_path)["timesteps"]) == 50
 
 
-def test_a_run_says_what_its_evaluations_took(tmp_path, monkeypatch):
-    monkeypatch.setattr(budget, "STEPS_IN_ANY_CASE", 4000)
+def test_a_run_says_what_its_evaluations_took(tmp_path):
     outcome = run_of(spec_of(tmp_path, "ppo", n_timesteps=500))
-    assert 0 < outcome.evaluation_steps <= budget.STEPS_IN_ANY_CASE
+    assert outcome.evaluation_steps > 0
     info = json.loads(outcome.run.info_path.read_text())
     assert info["evaluation_steps"] == outcome.evaluation_steps
     evaluations = np.load(outcome.run.evaluations_path)
