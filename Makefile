@@ -19,7 +19,8 @@ PINS := constraints.txt requirements.txt
 BENCHMARKS := 'tabular_speed.py --repeats 2' 'plain_loops.py' 'network_speed.py --repeats 1' \
   'network_settings.py --repeats 1' 'against_rl_zoo3.py --repeats 1' 'startup.py' \
   'coursework_sweeps.py' 'bandit_testbed.py --rounds 1' 'bandit_speed.py --rounds 2' \
-  'exact_evaluation.py' 'evaluation_share.py -n 20000' 'planning_scale.py' 'page_scale.py'
+  'exact_evaluation.py' 'evaluation_share.py -n 20000 --env CartPole-v1 Acrobot-v1' \
+  'planning_scale.py' 'page_scale.py'
 
 # One thread per process: more of them slow networks this small down, and tests run side by side.
 export OMP_NUM_THREADS ?= 1

@@ -2,6 +2,7 @@
 
 import io
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -43,7 +44,7 @@ def terminal(request, monkeypatch, tmp_path):
 def test_training_and_playing(terminal):
     code, out = terminal(train, *ANGLE, "--seed", "0", "-n", "300")
     assert code == 0
-    assert "over 100 episodes" in out
+    assert re.search(r"over \d+ episodes", out)
     code, out = terminal(enjoy, *ANGLE, "--render", "none", "--n-episodes", "2")
     assert code == 0
     assert " ± " in out or " +- " in out

@@ -1,6 +1,7 @@
 """What a user sees whose environment does other than its P says."""
 
 import json
+import re
 import sys
 from types import SimpleNamespace
 
@@ -74,7 +75,7 @@ def test_the_figures_are_those_of_step(type_command, tmp_path):
     assert "; figures are sampled" in out
     assert f"engine interpreted: {REFUSAL}" in out
     assert "(exact)" not in out
-    assert "over 100 episodes" in out
+    assert re.search(r"over \d+ episodes", out)
     info = json.loads((tmp_path / "logs/qlearning/Windy-v0_1/run.json").read_text())
     assert info["model_refused"].startswith(REFUSAL)
     assert not info["final"]["exact"]
