@@ -11,7 +11,6 @@ from pipeline.library_loading import loading_libraries
 def collector():
     before = gc.isenabled()
     yield
-    gc.unfreeze()
     (gc.enable if before else gc.disable)()
 
 
