@@ -28,7 +28,7 @@ def pictures():
 
 @pytest.fixture(autouse=True)
 def no_pictures_elsewhere(request, monkeypatch):
-    """They take two thirds of a short run."""
+    """They take most of a short run."""
     if "pictures" not in request.fixturenames:
         monkeypatch.setattr("pipeline.finishing._draw", lambda *_: None)
 
