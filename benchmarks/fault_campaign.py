@@ -25,6 +25,7 @@ import tempfile
 import time
 from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -37,15 +38,21 @@ TARGETS = ("driver", "worker", "all")
 MOST_STARTS = 200  # of one command: it should have come to its end by then
 
 
-def disturbed(case: Case, seed: int) -> int:
-    """Run the command until it is done, with a signal each time; the number of signals."""
+def disturbed(case: Case, seed: int, most: int) -> int:
+    """Run the command until it is done, with a signal each time; the number of signals.
+
+    Args:
+        case: the command.
+        seed: of the moments.
+        most: signals after which it is left alone.
+    """
     draw = random.Random(f"{case.name} {seed}")  # noqa: S311  # to be repeated, not kept secret
     logs = case.folder_of(f"disturbed {seed}")
     signals = 0
     for _ in range(MOST_STARTS):
         process = case.start(logs)
         try:
-            process.wait(draw.uniform(0.0, case.seconds))
+            process.wait(draw.uniform(0.0, case.seconds) if signals < most else None)
         except subprocess.TimeoutExpired:
             signals += 1
             _disturb(case, process, draw)
@@ -163,7 +170,7 @@ def main() -> int:
             list(pool.map(Case.prepare, chosen))
             list(pool.map(Case.run_in_peace, chosen))
             while signals < args.kills:
-                signals += sum(pool.map(disturbed, chosen, [seed] * len(chosen)))
+                signals += sum(pool.map(partial(disturbed, seed=seed, most=args.kills), chosen))
                 seed += 1
                 print(f"{signals:,} signals", flush=True)
                 Console(width=180).print(table(chosen))

@@ -1,11 +1,14 @@
 """What holds for every test: no window, one thread, unhurried property tests; and a small study."""
 
+import copy
 import dataclasses
+import gc
 import multiprocessing
 import os
 import signal
 import sys
 import tempfile
+from functools import cache
 from types import SimpleNamespace
 
 import hypothesis
@@ -33,6 +36,32 @@ multiprocessing.set_forkserver_preload(PRELOADED)
 # are the same every time, so that a failure there can be repeated.
 hypothesis.settings.register_profile("yardstick", deadline=None, derandomize="CI" in os.environ)
 hypothesis.settings.load_profile("yardstick")
+
+
+# What is imported and collected stays to the end. To look for garbage among it, again and again,
+# took two fifths of the processor time of collecting, and some of each test after it.
+gc.disable()
+
+
+def pytest_collection_finish():
+    """From here on the collector goes through what tests make, and through nothing older."""
+    gc.freeze()
+    gc.enable()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def shipped_settings_are_parsed_once():
+    """Each run asks for them, and to parse a file takes longer than to check what it says."""
+    from pipeline.settings import hyperparam_entries as entries
+
+    read, parsed = entries.read_yaml, cache(entries.read_yaml)
+
+    def read_once(path):
+        return copy.deepcopy(parsed(path)) if path.parent == entries._FOLDER else read(path)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(entries, "read_yaml", read_once)
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -23,6 +23,15 @@ SIZES = '''"""Made up."""
 def doubled(value):
     return 2 * value
 '''
+# It sleeps, so that waiting for it takes no processor.
+COUNTDOWN = """from time import sleep
+
+
+def countdown(n):
+    while n > 0 and not sleep(0.1):
+        n -= 1
+    return n
+"""
 GOOD = """from toy import limits
 
 
@@ -112,16 +121,16 @@ def test_a_hang_counts_as_caught(toy, drawing):
     import imports
     import running
 
-    loop = "def countdown(n):\n    while n > 0:\n        n -= 1\n    return n\n"
-    (toy / "toy/sizes.py").write_text(loop)
+    (toy / "toy/sizes.py").write_text(COUNTDOWN)
     (toy / "tests/toy/test_sizes.py").write_text(
         "from toy.sizes import countdown\n\n\ndef test_it():\n    assert countdown(3) == 0\n"
     )
     copy = running.Checkout(toy, toy.parent / "copy")
-    [mutant] = [m for m in drawing.mutants_of("toy/sizes.py", loop.encode()) if m.new == "pass"]
+    errors = drawing.mutants_of("toy/sizes.py", COUNTDOWN.encode())
+    [mutant] = [error for error in errors if error.new == "pass"]
     found = imports.Imports(toy, ["toy", "tests"])
     assert copy.judge(mutant, found, (), limit=5) == "a time-out"
-    assert (copy.path / "toy/sizes.py").read_text() == loop
+    assert (copy.path / "toy/sizes.py").read_text() == COUNTDOWN
 
 
 def test_the_same_seed_draws_the_same_errors(toy, drawing):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
+from functools import cache
 from typing import Any, Literal, get_type_hints
 
 from pipeline.errors import UserError, shown
@@ -108,6 +109,11 @@ class Hyperparams:
 SPECIAL_KEYS = tuple(key.name for key in fields(Hyperparams) if key.name != "algorithm")
 
 
+@cache  # they stand there as texts, which take longer to evaluate than the rest of an entry
+def _special_key_types() -> Mapping[str, Any]:
+    return get_type_hints(Hyperparams)
+
+
 def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperparams:
     """Tell the special keys of an entry from the algorithm's arguments, and check them.
 
@@ -124,7 +130,7 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
     special = {key: value for key in special_keys if (value := entry.get(key)) is not None}
     if isinstance(special.get("normalize"), bool):
         special["normalize"] = {} if special["normalize"] else None
-    hints = get_type_hints(Hyperparams)
+    hints = _special_key_types()
     for key, value in special.items():
         if key in _WRAPPERS:
             special[key] = component_specs(value, f"{where}: {key}")

@@ -22,6 +22,18 @@ def nothing_takes_long(monkeypatch):
 
 
 @pytest.fixture
+def pictures():
+    """For tests that look at what a run draws."""
+
+
+@pytest.fixture(autouse=True)
+def no_pictures_elsewhere(request, monkeypatch):
+    """They take most of a short run."""
+    if "pictures" not in request.fixturenames:
+        monkeypatch.setattr("pipeline.finishing._draw", lambda *_: None)
+
+
+@pytest.fixture
 def type_command(monkeypatch, capsys, tmp_path):
     """Run a command line in this process, inside an empty folder: exit code, output, errors."""
     monkeypatch.chdir(tmp_path)

@@ -31,6 +31,7 @@ def contents(folder):
     return sorted(path.name for path in folder.rglob("*"))
 
 
+@pytest.mark.usefixtures("pictures")
 def test_a_run_folder_is_whole(type_command, tmp_path):
     code, out, err = type_command("train.py", *QUICK, "--save-freq", "200")
     assert (code, err) == (0, "")

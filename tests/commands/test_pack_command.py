@@ -4,6 +4,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.usefixtures("pictures")
+
 
 @pytest.fixture
 def lake(type_command):

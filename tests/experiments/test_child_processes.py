@@ -105,6 +105,23 @@ def chores(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "study_chores")
 
 
+@pytest.fixture
+def light_server(method, monkeypatch):
+    """What children are forked from has imported nothing, for tests that end it."""
+    if method == "spawn":
+        yield
+        return
+    preloaded, heavy = fork_server.PRELOADED, fork_server.server_pid()
+    fork_server.end_server()
+    if heavy is not None:
+        wait_for(lambda: not is_alive(heavy) or is_zombie(heavy))
+    monkeypatch.setattr(fork_server, "PRELOADED", [])
+    fork_server.start_server()
+    yield
+    fork_server.end_server()
+    multiprocessing.set_forkserver_preload(preloaded)
+
+
 def nothing():
     pass
 
@@ -247,6 +264,7 @@ def test_within_its_limits_a_task_is_left_alone(chores):
     assert supervise(chores.add, 1, 1, clean_up=nothing, limits=limits)[0] == 2
 
 
+@pytest.mark.usefixtures("light_server")
 def test_when_the_server_is_killed_all_go_on(chores, tmp_path, method, caplog):
     if method == "spawn":
         return
@@ -270,11 +288,11 @@ def is_zombie(pid):
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
 
 
+@pytest.mark.usefixtures("light_server")
 def test_a_stop_does_not_wait_for_a_server_that_imports(chores, tmp_path, method, monkeypatch):
     """Where it is still at that, no child can be started, and the one who waits is let go."""
     if method == "spawn":
         return
-    fork_server.end_server()
     with local_executor(1) as executor:
         os.kill(fork_server.server_pid(), signal.SIGSTOP)
         future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)

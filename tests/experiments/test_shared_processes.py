@@ -65,7 +65,6 @@ def runs_of(root, n_seeds=2, agents=AGENTS, environments=ENVIRONMENTS):
 @pytest.fixture(scope="module", autouse=True)
 def server():
     """One that has imported the libraries, so that no child has to."""
-    fork_server.end_server()
     fork_server.start_server()
 
 

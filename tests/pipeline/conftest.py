@@ -1,4 +1,4 @@
-"""What several tests of runs and their settings need."""
+"""What tests of settings need."""
 
 import copy
 from functools import cache

@@ -31,8 +31,6 @@ ENTRIES = [(algo, key) for algo, read in READ.items() for key in read if key != 
 # Agents of one environment alone have no entry that stands in for others.
 SPECIALISTS = {"angle"}
 
-pytestmark = pytest.mark.usefixtures("files_parsed_once")
-
 
 class Valid(gym.Env):
     """A step long, of two actions; the second is valid."""

@@ -14,7 +14,6 @@ from pipeline.library_loading import load_for_optimizer, loading_libraries
 def collector():
     before = gc.isenabled()
     yield
-    gc.unfreeze()
     (gc.enable if before else gc.disable)()
 
 
