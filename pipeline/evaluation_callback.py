@@ -78,7 +78,7 @@ class EvaluationCallback(EvalCallback):
         self.taken = WorkTime()
         self.n_episodes: list[int] = []
         self._is_written = True
-        self._written_at = time.monotonic()
+        self._written_at = -np.inf
 
     def horizon(self) -> Horizon:
         """When the next evaluation is due."""

@@ -113,10 +113,13 @@ def light_server(method, monkeypatch):
         return
     preloaded, heavy = fork_server.PRELOADED, fork_server.server_pid()
     fork_server.end_server()
-    if heavy is not None:
-        wait_for(lambda: not is_alive(heavy) or is_zombie(heavy))
     monkeypatch.setattr(fork_server, "PRELOADED", [])
-    fork_server.start_server()
+
+    def is_there():
+        fork_server.start_server()
+        return fork_server.server_pid() != heavy
+
+    wait_for(is_there)  # one with threads is not gone as soon as it is a zombie
     yield
     fork_server.end_server()
     multiprocessing.set_forkserver_preload(preloaded)

@@ -112,7 +112,7 @@ def test_agents_without_a_run_of_their_own_are_named(done, made_up, tmp_path):
     batch = SimpleNamespace(
         agent="ucb", environment="lake", is_batch=True, is_finished=True, path=tmp_path
     )
-    results = replace(analysis.results, planned=(batch,))
+    results = replace(analysis.results, planned=(batch,), finished=(batch,))
     pages, _ = done(replace(analysis, results=results))
     assert pages["ucb"].words == first_runs.BATCH
     assert pages["fails"].words == "no run of it has finished"
