@@ -112,7 +112,7 @@ def own_folder(monkeypatch, tmp_path):
     (tmp_path / "own").mkdir()
     folder = (tmp_path / "own").resolve()
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
     tables = [(table, dict(table)) for table in (ALGORITHMS, gym.registry, sys.modules)]
     yield folder
     for table, before in tables:
