@@ -24,7 +24,12 @@ from types import ModuleType
 
 from pipeline.errors import UserError, one_line, shown
 
+# Where this project is installed, libraries lie beside it.
 _PROJECT = Path(__file__).resolve().parents[1]
+_OWN = (
+    "safe_files snapshots mdp verdicts envs agents pipeline experiments tuning report commands "
+    "textbook train enjoy compare tune"
+)
 
 
 @dataclass(frozen=True)
@@ -212,7 +217,7 @@ def is_ours(name: str) -> bool:
     """Whether a module of that name is one of this project's."""
     top = name.partition(".")[0]
     own = {_PROJECT / f"{top}.py", _PROJECT / top / "__init__.py"}
-    return not own.isdisjoint(_places(top))
+    return top in _OWN.split() and not own.isdisjoint(_places(top))
 
 
 def _what_failed(error: BaseException, module: UserModule) -> str:

@@ -5,12 +5,15 @@ import importlib.metadata
 import importlib.util
 import os
 import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from pipeline import user_modules
 from pipeline.environments import check_env_id, make_env
 from pipeline.errors import UserError
 from pipeline.module_records import as_flag, check_recorded, keep_copies
@@ -72,6 +75,17 @@ def test_what_is_installed_has_no_path():
     assert import_typed(["gymnasium.wrappers"]) == (
         UserModule("gymnasium.wrappers", "gymnasium.wrappers"),
     )
+
+
+def test_a_library_beside_us_is_not_ours(tmp_path):
+    """As where all are installed into one folder."""
+    shutil.copytree(Path(user_modules.__file__).parent, tmp_path / "pipeline")
+    (tmp_path / "neighbour.py").touch()
+    code = "from pipeline.user_modules import import_typed\nprint(import_typed(['neighbour']))"
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, env=env, cwd=tmp_path.parent, capture_output=True, check=True)
+    assert b"name='neighbour'" in done.stdout
 
 
 def test_our_own_need_not_be_kept(own_folder):
