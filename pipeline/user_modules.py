@@ -61,29 +61,30 @@ class _TypedFolder(MetaPathFinder):
 
     def __init__(self, folder: str, typed: str) -> None:
         self.folder = folder
-        self.typed = {typed}
+        self.names = {typed}
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> ModuleSpec | None:
         spec = PathFinder.find_spec(fullname, [self.folder]) if path is None else None
-        return spec if spec and (fullname in self.typed or self._is_named(fullname)) else None
+        if spec is None or not (fullname in self.names or self._is_named(fullname)):
+            return None
+        self.names.add(fullname)
+        return spec
 
     def _is_named(self, name: str) -> bool:
-        word = re.compile(rf"\b{name}\b")
-        files = [getattr(module, "__file__", None) for module in list(sys.modules.values())]
-        return any(
-            word.search(Path(file).read_text(encoding="utf-8", errors="replace"))
-            for file in files
-            if file and Path(file).is_relative_to(self.folder) and Path(file).is_file()
-        )
+        """Whether the code of a module that was found here has the name in it."""
+        found = [m for n, m in list(sys.modules.items()) if n.partition(".")[0] in self.names]
+        files = [Path(file) for module in found if (file := getattr(module, "__file__", None))]
+        texts = (f.read_text(encoding="utf-8", errors="replace") for f in files if f.is_file())
+        return any(re.search(rf"\b{name}\b", text) for text in texts)
 
 
 def _search(folder: str, typed: str) -> None:
     """Let a top-level module that was typed be found in a folder, and what its code names."""
     for finder in sys.meta_path:
         if isinstance(finder, _TypedFolder) and finder.folder == folder:
-            finder.typed.add(typed)
+            finder.names.add(typed)
             return
     sys.meta_path.append(_TypedFolder(folder, typed))
 

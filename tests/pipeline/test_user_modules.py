@@ -1,8 +1,8 @@
 """Modules of the user's: found where they lie, never taken for others, imported when typed."""
 
 import dataclasses
+import importlib
 import importlib.metadata
-import importlib.util
 import os
 import shutil
 import subprocess
@@ -179,15 +179,18 @@ def test_a_module_that_fails_is_told_with_its_line(write, text, complaint):
 # --- only what was typed -------------------------------------------------------------------------
 
 
-def test_what_lies_beside_is_found_for_the_users_own_code_alone(write, own_folder):
+def test_what_lies_beside_is_found_for_the_users_own_code_alone(write, own_folder, monkeypatch):
     """A library that looks for another one, or for plugins, does not find a stranger's."""
     write(my_first="def later():\n    import my_second\n", my_second="x = 1", not_mine="x = 2")
     (own_folder / "not_mine-1.dist-info").mkdir()
     (own_folder / "not_mine-1.dist-info" / "METADATA").write_text("Name: not_mine\nVersion: 1\n")
     plugin = "[torch.backends]\nnot_mine = not_mine:x\n"
     (own_folder / "not_mine-1.dist-info" / "entry_points.txt").write_text(plugin)
+    write(installed__in__library="def later(): import not_mine")  # as in a virtual environment
+    monkeypatch.syspath_prepend(str(own_folder / "installed"))
     import_typed(["my_first"])
-    assert importlib.util.find_spec("not_mine") is None
+    with pytest.raises(ModuleNotFoundError, match="not_mine"):
+        importlib.import_module("library").later()
     assert "not_mine" not in importlib.metadata.entry_points(group="torch.backends").names
     sys.modules["my_first"].later()
     assert sys.modules["my_second"].x == 1
