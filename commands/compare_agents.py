@@ -178,7 +178,7 @@ def _compare(args: argparse.Namespace) -> int:
     from experiments.fork_server import end_server
     from experiments.run_limits import RunLimits
     from experiments.study_plan import plan
-    from pipeline.folder_lock import folder_lock
+    from pipeline.folder_lock import folder_lock, told_if_gone
 
     go_on_unread()
     root = Path(args.log_folder) / study.name
@@ -189,7 +189,7 @@ def _compare(args: argparse.Namespace) -> int:
     )
     planned = plan(study, root)
     console.print(study.title, style="bold", markup=False, highlight=False)
-    with folder_lock(root, partial(give_way, root, say), say):
+    with folder_lock(root, give_way, say), told_if_gone(root):
         try:
             if args.until_decided:
                 return _grow_study(args, study, root, console, place)

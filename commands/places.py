@@ -177,10 +177,9 @@ def held(launchers: Launchers) -> Iterator[Launchers]:
         yield again
 
 
-def give_way(root: Path, say: Callable[[str], object]) -> None:
-    """Stop, since another driver does the study in this folder."""
+def give_way() -> None:
+    """Stop, since the study's folder is another driver's, or gone."""
     from experiments.child_processes import stop_all
 
-    say(f"{root}: another driver has taken this one for dead; this one stops")
     stop_all()
     _thread.interrupt_main(signal.SIGTERM)

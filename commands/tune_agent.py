@@ -49,12 +49,13 @@ def _tune(args: argparse.Namespace) -> int:
 
             how.place(root).get_ready([shipped_run(tuning, root)])
             from commands.tune_driving import drive
+            from pipeline.folder_lock import told_if_gone
             from tuning.opening import open_tuning
             from tuning.trial_storage import failing_in_a_line
 
             with failing_in_a_line(args.storage):
                 opened = open_tuning(tuning, root, args.storage)
-        with failing_in_a_line(args.storage):
+        with told_if_gone(root), failing_in_a_line(args.storage):
             return drive(console, opened, how)
     except KeyboardInterrupt:
         end_server()

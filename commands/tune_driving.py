@@ -92,7 +92,7 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
         return 0 if ranked or not place.queue.is_done() else 1
     root = place.root / FOLDER
     tell = partial(say, console)
-    with folder_lock(root, partial(give_way, root, tell), tell):
+    with folder_lock(root, give_way, tell):
         code, outcome = _retested(console, place, how, ranked, candidates)
         winner = next((c for c in candidates if _is(c, outcome)), None)
         path = None

@@ -13,6 +13,7 @@ from queue import Empty, SimpleQueue
 from experiments.drafts import remove_dead_drafts, run_name
 from experiments.launching import Launcher, Launchers, RunFailure
 from experiments.planned_runs import PlannedRun
+from pipeline.folder_lock import FolderGoneError, is_gone
 
 # Runs that are handed over at a time, for each that is done at once: enough that no worker waits
 # for the next, and few enough that a hundred thousand are no burden to whoever does them.
@@ -46,13 +47,16 @@ def execute(
 
     Returns:
         Those that failed.
+
+    Raises:
+        FolderGoneError: if somebody removes the folder.
     """
     remove_dead_drafts(root, {run_name(run) for run in runs})
     if not runs:
         return []
     failures = []
     with launchers() as launcher:
-        for planned, failure in _ended(launcher, runs, meanwhile):
+        for planned, failure in _ended(launcher, runs, root, meanwhile):
             listener(planned, failure)
             if failure is not None:
                 failures.append(failure)
@@ -61,12 +65,14 @@ def execute(
 
 
 def _ended(
-    launcher: Launcher, runs: Sequence[PlannedRun], meanwhile: Callable[[], object]
+    launcher: Launcher, runs: Sequence[PlannedRun], root: Path, meanwhile: Callable[[], object]
 ) -> Iterator[tuple[PlannedRun, RunFailure | None]]:
     """Each run when it has ended, with how it failed; a window of them is under way."""
     ended: SimpleQueue[Ended] = SimpleQueue()
     to_do, n_under_way, is_first = iter(runs), 0, True
     while True:
+        if is_gone(root):
+            raise FolderGoneError(root)
         room = WINDOW * max(launcher.n_workers, 1) - n_under_way
         for planned in islice(to_do, max(room, 0)):
             future = launcher.submit(planned)

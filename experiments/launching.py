@@ -24,12 +24,13 @@ from experiments.child_processes import (
     local_executor,
     supervise,
 )
-from experiments.drafts import leave_drafts, make_folder, run_name
+from experiments.drafts import leave_drafts, run_name
 from experiments.planned_runs import PlannedRun
 from experiments.run_limits import RunLimits
 from experiments.study_spec import file_name
 from pipeline.errors import one_line
 from pipeline.files import write_text
+from pipeline.folder_lock import is_gone
 from pipeline.plain_runs import is_plain
 
 
@@ -115,7 +116,8 @@ def _supervised(
     planned: PlannedRun, root: Path, command: str, limits: RunLimits
 ) -> RunFailure | None:
     try:
-        do_supervised(planned, root, command, limits)
+        if not is_gone(root):  # a run would make it anew
+            do_supervised(planned, root, command, limits)
     except StoppedError:
         return None
     except TaskFailedError as error:
@@ -169,7 +171,7 @@ def failed(planned: PlannedRun, root: Path, reason: str, details: str) -> RunFai
     """The failure of a run, with its details written down; where the disk is full, without."""
     log = failure_log(root, planned)
     try:
-        make_folder(log.parent)
+        log.parent.mkdir(exist_ok=True)
         write_text(log, details)
     except OSError:
         return RunFailure(planned, reason, None)

@@ -7,6 +7,7 @@ from contextlib import ExitStack, suppress
 from pipeline.errors import UserError, one_line
 from pipeline.exhaustion import exhaustion
 from pipeline.files import DISK_ERRORS
+from pipeline.folder_lock import FolderGoneError, is_gone
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.library_errors import LibraryError
 from pipeline.preparation import Training
@@ -37,9 +38,11 @@ def give_up(training: Training, error: BaseException) -> None:
 
     Raises:
         UserError: in that case, where the agent's settings are at fault; and where the disk takes
-            no more.
+            no more, or somebody has removed the folder.
     """
     run, is_new = training.run, not training.keeping.goes_on
+    if is_gone(run.path):
+        raise FolderGoneError(run.path) from error
     is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt | LibraryError)
     if is_new and is_expected and not has_begun(training):
         run.discard()

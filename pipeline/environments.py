@@ -220,6 +220,11 @@ def _make_vec_env(
         env = make_env(spec.env_id, given)
         return env if wrap_innermost is None else wrap_innermost(env)
 
+    def wrap_elsewhere(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        wrap = env_wrapper(spec, training, monitor_folder)  # its classes would be unpickled sooner
+        return env if wrap is None else wrap(env)
+
+    wrapper = env_wrapper(spec, training, monitor_folder)
     env: Any = make_vec_env(
         make,
         n_envs=n_envs,
@@ -227,7 +232,7 @@ def _make_vec_env(
         env_kwargs={**kwargs, **(extra or {})},
         monitor_dir=None if monitor_folder is None else str(monitor_folder),
         monitor_kwargs=spec.hyperparams.monitor_kwargs,
-        wrapper_class=env_wrapper(spec, training, monitor_folder),
+        wrapper_class=wrap_elsewhere if spec.vec_env == "subproc" else wrapper,
         vec_env_cls=getattr(vec_env, TRAINING_VEC_ENVS[spec.vec_env if training else "dummy"]),
     )
     wrappers = spec.hyperparams.vec_env_wrapper

@@ -39,6 +39,41 @@ class FolderInUseError(UserError):
     """Another process is at work in the folder."""
 
 
+class FolderGoneError(UserError):
+    """A folder that this process works on has been removed or renamed."""
+
+    def __init__(self, root: Path) -> None:
+        super().__init__(f"{root}: this folder is gone: somebody has removed or renamed it")
+
+
+def is_gone(path: Path) -> bool:
+    """Whether there is no such file or folder, which is more than that it cannot be reached."""
+    try:
+        path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return True
+    except OSError:
+        return False
+    return False
+
+
+@contextmanager
+def told_if_gone(root: Path) -> Iterator[None]:
+    """Say that a folder is gone, in place of whatever fails by that in the ``with`` statement.
+
+    Raises:
+        FolderGoneError: if it is.
+    """
+    try:
+        yield
+    except Exception as error:
+        if is_gone(root):
+            raise FolderGoneError(root) from error
+        raise
+    if is_gone(root):
+        raise FolderGoneError(root)
+
+
 @contextmanager
 def folder_lock(
     root: Path, on_loss: Callable[[], object], say: Callable[[str], object]
@@ -47,26 +82,41 @@ def folder_lock(
 
     Args:
         root: the folder; it is made, and removed again if nothing else came into it.
-        on_loss: called in another thread if another process has taken this one for dead.
+        on_loss: called in another thread if the lock is lost: it has to end the work.
         say: told in a line why it takes long, where it does.
 
     Raises:
-        FolderInUseError: if another process is at work, saying who.
+        FolderInUseError: if another process is at work, saying who; also at the end, if one has
+            taken this one for dead.
+        FolderGoneError: if somebody has removed the folder.
     """
+    lost: list[UserError] = []
+
+    def lose(error: UserError) -> None:
+        if not lost:
+            lost.append(error)
+            on_loss()
+
     made = _make_folders(root)
     path, token = root / LOCK, secrets.token_hex(16)
     try:
         _take(path, token, say)
         remove_remains(root)
-        heart = Heartbeat(lambda: _beat(path, token, on_loss), SECONDS_BETWEEN_SIGNS)
+        heart = Heartbeat(lambda: _beat(path, token, lose), SECONDS_BETWEEN_SIGNS)
         heart.start()
         try:
             yield
+        except KeyboardInterrupt as stop:
+            if lost:  # nobody else asked for it
+                raise lost[0] from stop
+            raise
         finally:
             heart.stop()
             remove_remains(root)
             if _read(path).get("token") == token:
                 path.unlink(missing_ok=True)
+        if lost:
+            raise lost[0]
     finally:
         for folder in made:
             with contextlib.suppress(OSError):
@@ -169,13 +219,17 @@ def _remove_dead(path: Path, owner: dict[str, Any]) -> None:
             grave.rmdir()
 
 
-def _beat(path: Path, token: str, on_loss: Callable[[], object]) -> None:
+def _beat(path: Path, token: str, lose: Callable[[UserError], object]) -> None:
     owner = _read(path)
     if owner.get("token") == token:
         with contextlib.suppress(OSError):
             give_sign(path)
-    elif owner or not path.exists():  # and not merely out of reach
-        on_loss()
+    elif owner:
+        lose(FolderInUseError(f"{_words(path.parent, owner)}: it took this one for dead"))
+    elif is_gone(path.parent):
+        lose(FolderGoneError(path.parent))
+    elif is_gone(path):
+        lose(UserError(f"{path}: somebody has removed it, so others may be at work here"))
 
 
 def _words(root: Path, owner: dict[str, Any]) -> str:

@@ -6,6 +6,7 @@ import _thread
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from pipeline.errors import UserError
@@ -20,17 +21,12 @@ def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
 
     Args:
         run: the run folder.
-        say: told in a line what this waits for, and that the lock was lost.
+        say: told in a line what this waits for.
 
     Raises:
-        UserError: if another process is at work on it.
+        UserError: if another process is at work on it, or it is gone.
     """
-
-    def stop() -> None:
-        say(f"{run.path}: another process has taken this one for dead; this one stops")
-        _thread.interrupt_main(signal.SIGTERM)
-
-    with folder_lock(run.path, stop, say):
+    with folder_lock(run.path, partial(_thread.interrupt_main, signal.SIGTERM), say):
         yield
 
 

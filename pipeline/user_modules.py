@@ -1,9 +1,9 @@
 """Modules of the user's: environments and agents that live outside of this project.
 
 They are imported because the user typed their names on the command line, and for no other reason: a
-file may say what it needs, and is told what to type. Their folders go to the end of Python's search
-path, so that an ``agents.py`` of the user's never comes before ours; where two modules share a
-name, it is refused instead.
+file may say what it needs, and is told what to type. What lies beside them is found for their own
+code alone, and after all else, so that an ``agents.py`` of the user's never comes before ours;
+where two modules share a name, it is refused instead.
 """
 
 from __future__ import annotations
@@ -11,17 +11,25 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import os
+import re
 import shlex
 import sys
 import traceback
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib.abc import MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 from types import ModuleType
 
 from pipeline.errors import UserError, one_line, shown
 
+# Where this project is installed, libraries lie beside it.
 _PROJECT = Path(__file__).resolve().parents[1]
+_OWN = (
+    "safe_files snapshots mdp verdicts envs agents pipeline experiments tuning report commands "
+    "textbook train enjoy compare tune"
+)
 
 
 @dataclass(frozen=True)
@@ -40,8 +48,45 @@ class UserModule:
 
     @property
     def search_folder(self) -> str | None:
-        """The folder that Python has to search for it; None where it searches it anyway."""
+        """The folder that has to be searched for it; None where Python searches it anyway."""
         return None if self.path is None else str(Path(self.path).parents[self.name.count(".")])
+
+
+class _TypedFolder(MetaPathFinder):
+    """Finds modules in a folder: one that was typed, and those that code from there names.
+
+    On Python's search path, the folder would give a library whatever that looks for and is not
+    installed, and the plugins that any ``*.dist-info`` in it announces.
+    """
+
+    def __init__(self, folder: str, typed: str) -> None:
+        self.folder = folder
+        self.names = {typed}
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        spec = PathFinder.find_spec(fullname, [self.folder]) if path is None else None
+        if spec is None or not (fullname in self.names or self._is_named(fullname)):
+            return None
+        self.names.add(fullname)
+        return spec
+
+    def _is_named(self, name: str) -> bool:
+        """Whether the code of a module that was found here has the name in it."""
+        found = [m for n, m in list(sys.modules.items()) if n.partition(".")[0] in self.names]
+        files = [Path(file) for module in found if (file := getattr(module, "__file__", None))]
+        texts = (f.read_text(encoding="utf-8", errors="replace") for f in files if f.is_file())
+        return any(re.search(rf"\b{name}\b", text) for text in texts)
+
+
+def _search(folder: str, typed: str) -> None:
+    """Let a top-level module that was typed be found in a folder, and what its code names."""
+    for finder in sys.meta_path:
+        if isinstance(finder, _TypedFolder) and finder.folder == folder:
+            finder.names.add(typed)
+            return
+    sys.meta_path.append(_TypedFolder(folder, typed))
 
 
 def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[UserModule, ...]:
@@ -62,7 +107,7 @@ def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[Use
     for typed in dict.fromkeys([*words, *filter(None, prefixes)]):
         module = _at_path(typed) if _is_path(typed) else _by_name(typed)
         _import(module)
-        if not _is_ours(module.name):
+        if not is_ours(module.name):
             modules.append(module)
     return tuple(modules)
 
@@ -126,12 +171,11 @@ def _source(folder: Path, name: str) -> Path | None:
 
 
 def _import(module: UserModule) -> ModuleType:
-    """Import one module, with its folder at the end of the search path."""
+    """Import one module; its folder is searched last."""
     importlib.invalidate_caches()
     folder = module.search_folder
     if folder is not None:
-        if folder not in sys.path:
-            sys.path.append(folder)
+        _search(folder, module.name.partition(".")[0])
         _check_name(module, Path(folder))
     try:
         return importlib.import_module(module.name)
@@ -149,7 +193,7 @@ def _check_name(module: UserModule, folder: Path) -> None:
     wanted = _source(folder, top) or folder / top
     found = _places(top)
     if not found & {wanted.resolve(), (wanted / "__init__.py").resolve()}:
-        if _is_ours(top):
+        if is_ours(top):
             whose = f"{top} is the name of one of Yardstick's own modules"
         elif not found or top in sys.stdlib_module_names:
             whose = f"{top} is the name of one of Python's own modules"
@@ -170,11 +214,11 @@ def _places(top: str) -> set[Path]:
     return {Path(place).resolve() for place in places if place}
 
 
-def _is_ours(name: str) -> bool:
+def is_ours(name: str) -> bool:
     """Whether a module of that name is one of this project's."""
     top = name.partition(".")[0]
     own = {_PROJECT / f"{top}.py", _PROJECT / top / "__init__.py"}
-    return not own.isdisjoint(_places(top))
+    return top in _OWN.split() and not own.isdisjoint(_places(top))
 
 
 def _what_failed(error: BaseException, module: UserModule) -> str:

@@ -11,7 +11,9 @@ class UnsafeFileError(ValueError):
     """
 
     def __init__(self, message: str, key: str | None = None) -> None:
-        super().__init__(" ".join(message.split()))
+        # What a terminal obeys instead of showing it is spelt out.
+        signs = (c if c.isprintable() else repr(c)[1:-1] for c in " ".join(message.split()))
+        super().__init__("".join(signs))
         self.key = key
 
 

@@ -112,7 +112,7 @@ def own_folder(monkeypatch, tmp_path):
     (tmp_path / "own").mkdir()
     folder = (tmp_path / "own").resolve()
     monkeypatch.chdir(folder)
-    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setattr(sys, "meta_path", list(sys.meta_path))
     tables = [(table, dict(table)) for table in (ALGORITHMS, gym.registry, sys.modules)]
     yield folder
     for table, before in tables:
@@ -131,9 +131,10 @@ def type_in_own_folder(own_folder, monkeypatch, capsys):
     import compare
     import enjoy
     import train
+    import tune
     from commands.parsing import run_command
 
-    commands = {"train.py": train.main, "enjoy.py": enjoy.main, "compare.py": compare.main}
+    commands = {f"{each.__name__}.py": each.main for each in (train, enjoy, compare, tune)}
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", [str(word) for word in words])

@@ -17,6 +17,7 @@ from experiments.planned_runs import PlannedRun
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import DISK_ERRORS
+from pipeline.folder_lock import FolderGoneError, is_gone
 from pipeline.json_text import plain
 from tuning.judging import RunOutcome, UnjudgedError, judged, outcome_of
 from tuning.suggesting import Suggestions
@@ -116,6 +117,8 @@ class Search:
         """
         try:
             while not self._is_at_end():
+                if is_gone(self.root):
+                    raise FolderGoneError(self.root)
                 self._hand_out()
                 self._look()
         finally:

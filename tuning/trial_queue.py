@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline import liveness
-from pipeline.folder_lock import FolderInUseError, folder_lock
+from pipeline.folder_lock import FolderGoneError, FolderInUseError, folder_lock, is_gone
 from pipeline.signs_of_life import Heartbeat
 
 if TYPE_CHECKING:
@@ -187,6 +187,8 @@ class TrialQueue:
     @contextlib.contextmanager
     def _turn(self) -> Iterator[None]:
         """Be the only driver at the queue: SQLite lets two of them take the same place."""
+        if is_gone(self.root):
+            raise FolderGoneError(self.root)
         with turn(self.root):
             yield
 

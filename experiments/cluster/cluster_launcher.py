@@ -61,7 +61,7 @@ def cluster_launcher(
         n_runs: for how many runs at once jobs are to be started, in a queue.
         is_told: whether the user has said that a scheduler open to the network will do.
         warm_ups: what workers are to compile once, see `experiments.warm_ups`.
-        tell: told where the dashboard is.
+        tell: told where the dashboard is, if there is one.
 
     Raises:
         UserError: if there is no such cluster.
@@ -73,7 +73,8 @@ def cluster_launcher(
         prepare = partial(launcher.prepare, plugin)
         launcher.connection = connection = Connection(connect, prepare, is_told)
         connection.begin()
-        tell(f"dashboard: {connection.client().dashboard_link}")
+        if link := connection.client().dashboard_link:
+            tell(f"dashboard: {link}")
         heart = Heartbeat(partial(launcher.look, replace_jobs), SECONDS_BETWEEN_LOOKS)
         heart.start()
         try:

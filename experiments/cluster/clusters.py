@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator
 from multiprocessing import resource_tracker
 
 import dask
-from distributed import Client, LocalCluster
+from distributed import Client, Nanny, SpecCluster
 from distributed.security import Security
 
 from experiments.cluster.addresses import (
@@ -30,6 +30,7 @@ from experiments.cluster.job_queues import (
     has_certificates,
     opened_queue,
 )
+from experiments.cluster.working import ClosedScheduler, ClosedWorker
 from pipeline.errors import UserError, one_line
 from pipeline.stopping import current
 
@@ -114,20 +115,25 @@ def _left_to_driver() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _local(n_workers: int) -> Iterator[LocalCluster]:
+def _local(n_workers: int) -> Iterator[SpecCluster]:
     """Workers on this machine, and nobody but them and this process can talk to the scheduler.
 
     Loopback alone would not do: any user of the machine could, and have their code run by this one.
     """
+    security = Security.temporary()
+    common = {"host": "127.0.0.1", "protocol": "tls://", "security": security, "dashboard": False}
+    worker = {
+        **common,
+        "nthreads": 1,
+        "memory_limit": 0,  # a run's memory is its child's, and what --run-memory is about
+        "silence_logs": logging.CRITICAL,
+        "worker_class": ClosedWorker,
+    }
     with current().held(), _left_to_driver():
-        cluster = LocalCluster(
-            n_workers=0,
-            threads_per_worker=1,
-            host="127.0.0.1",
-            protocol="tls://",
-            security=Security.temporary(),
-            dashboard_address="127.0.0.1:0",
-            memory_limit=0,  # a run's memory is its child's, and what --run-memory is about
+        cluster = SpecCluster(
+            scheduler={"cls": ClosedScheduler, "options": {**common, "port": 0}},
+            worker={"cls": Nanny, "options": worker},
+            security=security,
             silence_logs=logging.CRITICAL,
         )
     try:
@@ -138,4 +144,4 @@ def _local(n_workers: int) -> Iterator[LocalCluster]:
         # Workers that are about to start make it fail; they end with this process.
         with contextlib.suppress(Exception):
             cluster.close()
-        LocalCluster._instances.discard(cluster)  # it would try again at the end
+        SpecCluster._instances.discard(cluster)  # it would try again at the end

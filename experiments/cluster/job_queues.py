@@ -13,9 +13,11 @@ from types import ModuleType
 from typing import Any
 
 import dask
+from distributed import Scheduler
 from distributed.security import Security
 
 from experiments.cluster.addresses import JobQueue
+from experiments.cluster.working import ClosedScheduler, ClosedWorker
 from pipeline.errors import UserError, one_line
 
 # The classes of dask-jobqueue, by the names of their systems.
@@ -51,7 +53,8 @@ def opened_queue(queue: JobQueue) -> Any:
     settings = {**queue.settings, **_retiring(queue)}
     words = settings.get("worker-extra-args") or []
     if not any("dashboard" in str(word) for word in words):
-        settings["worker-extra-args"] = [*words, "--dashboard-address", "127.0.0.1:0"]
+        closed = f"{ClosedWorker.__module__}.{ClosedWorker.__name__}"
+        settings["worker-extra-args"] = [*words, "--no-dashboard", "--worker-class", closed]
     dask.config.set({f"jobqueue.{queue.system}": {**_defaults(queue.system), **settings}})
     # Else it would end the job of the same name that `Jobs` has sent instead, while that waits.
     dask.config.set({"distributed.deploy.lost-worker-timeout": _NEVER})
@@ -59,11 +62,17 @@ def opened_queue(queue: JobQueue) -> Any:
     security = Security()
     if not has_certificates(security):
         security = Security.temporary()
-    options = {"dashboard_address": "127.0.0.1:0", **settings.get("scheduler-options", {})}
+    options = settings.get("scheduler-options") or {}
+    is_closed = "dashboard_address" not in options
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return kind(security=security, protocol="tls://", scheduler_options=options)
+            return kind(
+                security=security,
+                protocol="tls://",
+                scheduler_options={"dashboard": not is_closed, **options},
+                scheduler_cls=ClosedScheduler if is_closed else Scheduler,
+            )
     except (ValueError, TypeError, OSError, RuntimeError) as error:
         raise UserError(f"{queue.file}: {one_line(error)}") from error
 

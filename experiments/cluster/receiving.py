@@ -14,6 +14,7 @@ from experiments.planned_runs import PlannedRun
 from pipeline.errors import UserError
 from pipeline.file_digests import FIELD, RECORD, RecordedFiles
 from pipeline.files import sync_file, sync_folders
+from pipeline.folder_lock import is_gone
 
 # Network folders show what others have written with a delay.
 SECONDS_TO_APPEAR = 10.0
@@ -51,6 +52,8 @@ def receive(planned: PlannedRun, root: Path, files: Mapping[str, bytes]) -> None
     run, log = _part(files, "run/"), _part(files, "tensorboard/")
     if len(run) + len(log) != len(files) or (log and planned.spec.tensorboard_log is None):
         raise RefusedAnswerError("it holds files of no run")
+    if is_gone(root):
+        raise RefusedAnswerError("the folder of the study is gone")
     draft = draft_path(root, planned)
     claim_draft(draft)
     try:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from distributed import Worker, WorkerPlugin, get_worker
+from distributed import Scheduler, Worker, WorkerPlugin, get_worker
 
 from experiments import child_processes, fork_server
 from experiments.child_processes import StoppedError, TaskFailedError
@@ -21,6 +21,21 @@ from experiments.run_limits import RunLimits
 SECONDS_BETWEEN_LOOKS = 0.5
 # The states of a task that its driver has given up, or that was lost with its scheduler.
 _UNWANTED = ("cancelled", "released", "forgotten")
+
+
+class _Closed:
+    """Opens no port for pages: these would answer every user of the machine, without TLS."""
+
+    def start_http_server(self, *args: Any, **kwargs: Any) -> None:
+        """Dask has no setting that leaves this out."""
+
+
+class ClosedScheduler(_Closed, Scheduler):
+    """A scheduler that speaks TLS alone."""
+
+
+class ClosedWorker(_Closed, Worker):
+    """A worker that speaks TLS alone."""
 
 
 class Supervisors(WorkerPlugin):

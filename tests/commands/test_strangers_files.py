@@ -209,3 +209,49 @@ def test_a_study_asks_for_a_module(type_in_own_folder, own_folder, name):
         answer = type_in_own_folder("compare.py", path, "--no-report")
         check_refused(answer, path.with_name("mark"), f"--gym-packages {name}")
         assert name not in sys.modules
+
+
+ZOO = ("rl_zoo3/wrappers.py",)
+STRANGERS = {
+    "a package": ("rl_zoo3.wrappers", (*ZOO, "rl_zoo3/__init__.py")),
+    "a package that lacks its __init__": ("rl_zoo3.wrappers", ZOO),
+    "one that says it is installed": (
+        "rl_zoo3.wrappers",
+        (*ZOO, "rl_zoo3/__init__.py", "rl_zoo3-2.9.2.dist-info/METADATA"),
+    ),
+    "a part of a library": ("stable_baselines3.extra", ("stable_baselines3/extra.py",)),
+    "one of the same name as Python's": ("gymnasium.this", ("gymnasium/this.py",)),
+}
+
+
+@pytest.mark.parametrize("road", ["beside a typed module", "PYTHONPATH", "loaded by a typed one"])
+@pytest.mark.parametrize("way", STRANGERS)
+def test_settings_name_a_class_of_a_strangers(
+    type_in_own_folder, own_folder, monkeypatch, way, road
+):
+    """A name in a file means a class of what is installed, or of a module that was typed."""
+    module, files = STRANGERS[way]
+    for name in files:
+        path = own_folder / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("import gymnasium\nclass Stray(gymnasium.Wrapper): pass\n" + MODULE)
+    if "says" in way:
+        record = "".join(f"{name},,\n" for name in files)
+        (own_folder / "rl_zoo3-2.9.2.dist-info" / "RECORD").write_text(record)
+        metadata = "Metadata-Version: 2.1\nName: rl_zoo3\nVersion: 2.9.2\n"
+        (own_folder / "rl_zoo3-2.9.2.dist-info" / "METADATA").write_text(metadata)
+    (own_folder / "mine.py").write_text("x = 1\n")
+    if road == "PYTHONPATH":
+        monkeypatch.setattr(sys, "path", [str(own_folder), *sys.path])
+    elif road == "loaded by a typed one":
+        text = f"try:\n    import {module}\nexcept ImportError:\n    pass\n"
+        (own_folder / "mine.py").write_text(text)
+    settings = f"CartPole-v1:\n  n_timesteps: 8\n  env_wrapper: {module}.Stray\n"
+    (own_folder / "settings.yml").write_text(settings)
+    words = ["--algo", "random", "--env", "CartPole-v1", "--conf-file", "settings.yml"]
+    code, _, err = type_in_own_folder("train.py", *words, "--gym-packages", "mine")
+    assert (code, err.count("\n")) == (2, 1), err
+    assert f"env_wrapper: {module}.Stray: " in err
+    if road != "loaded by a typed one":
+        assert not list(own_folder.rglob("mark"))
+    assert not (own_folder / "logs").exists()

@@ -1,19 +1,25 @@
 """Runs on a cluster of two workers on this machine: killed, sent, refused."""
 
 import contextlib
+import gc
+import os
+import socket
+import ssl
 import subprocess
 import sys
 from functools import partial
 from pathlib import Path
 
 import pytest
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 import compare
 from experiments.cluster import cluster_launcher as launching_there
 from experiments.cluster import connections, endings
-from experiments.cluster.addresses import SchedulerAddress
+from experiments.cluster.addresses import JobQueue, LocalWorkers, SchedulerAddress
 from experiments.cluster.cluster_launcher import cluster_launcher
+from experiments.cluster.clusters import opened
+from experiments.cluster.job_queues import opened_queue
 from experiments.cluster.orders import Probe
 from experiments.drafts import draft_path
 from experiments.execution import execute
@@ -144,6 +150,75 @@ def test_a_cluster_does_what_this_machine_does_whatever_dies(there, tmp_path, mo
     check_what_dies(there, tmp_path, here)
     check_what_is_sent(there, tmp_path, here, monkeypatch)
     check_what_is_refused(there, tmp_path, monkeypatch)
+
+
+def listening_in(pid):
+    """The ports that a process and those that it has started listen to, with whose they are."""
+    owners, pids = {}, [pid]
+    for one in pids:
+        for file in Path(f"/proc/{one}").glob("task/*/children"):
+            pids += map(int, file.read_text().split())
+        for link in Path(f"/proc/{one}/fd").glob("*"):
+            with contextlib.suppress(OSError):
+                owners[str(link.readlink())] = one
+    ports = {}
+    for name in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
+            _, local, _, state, *_, inode = line.split()[:10]
+            if state == "0A" and f"socket:[{inode}]" in owners:
+                ports[int(local.rpartition(":")[2], 16)] = owners[f"socket:[{inode}]"]
+    return ports
+
+
+def answer_of(port, context=None):
+    """What a port says to somebody who has no certificate; nothing if it closes."""
+    try:
+        with contextlib.ExitStack() as stack:
+            asker = stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10))
+            if context is not None:
+                asker = stack.enter_context(context.wrap_socket(asker))
+            asker.sendall(b"GET /json/identity.json HTTP/1.0\r\n\r\n")
+            return asker.recv(100)
+    except (ConnectionError, ssl.SSLError):
+        return b""
+
+
+def check_ports(n_processes):
+    """All sockets of so many processes speak TLS, with those alone who have a certificate."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
+    ports = listening_in(os.getpid())
+    assert len(set(ports.values())) == n_processes
+    for port in ports:
+        assert answer_of(port) == b""
+        assert answer_of(port, context) == b""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_all_ports_of_workers_here_want_a_certificate():
+    with opened(LocalWorkers(1), 1, is_told=False) as (connect, _), connect() as client:
+        client.wait_for_workers(1, timeout=60)
+        assert client.dashboard_link == ""
+        check_ports(2)  # this one, with the scheduler and the nanny, and the worker
+
+
+@pytest.mark.filterwarnings("ignore:unclosed file")  # dask-jobqueue's, which hold the keys
+@pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
+def test_all_ports_of_jobs_want_a_certificate(tmp_path):
+    """The queue is played by a shell, which does what the script of a job says."""
+    settings = {"cores": 1, "memory": "1GB", "shared-temp-directory": str(tmp_path)}
+    settings |= {"interface": "lo", "python": sys.executable, "local-directory": str(tmp_path)}
+    queue = opened_queue(JobQueue("slurm", settings, 1, tmp_path / "slurm.yml"))
+    with queue, Client(queue, set_as_default=False) as client:
+        job = subprocess.Popen(["bash", "-c", queue.job_script()], stderr=subprocess.DEVNULL)
+        try:
+            client.wait_for_workers(1, timeout=60)
+            check_ports(3)  # this one, with the scheduler, the nanny and the worker
+        finally:
+            client.shutdown()
+            job.wait(30)
+    del queue, client
+    gc.collect()
 
 
 def test_no_scheduler_is_one_line(tmp_path, monkeypatch):

@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import threading
@@ -12,6 +13,7 @@ import pytest
 
 from pipeline import folder_lock as locks
 from pipeline import liveness
+from pipeline.errors import UserError
 from pipeline.file_digests import LOCK
 from pipeline.folder_lock import FolderInUseError, folder_lock
 
@@ -193,14 +195,46 @@ def test_where_nothing_can_be_written_no_lock_is_left(tmp_path, monkeypatch):
 def test_who_was_taken_for_dead_learns_of_it(tmp_path, monkeypatch):
     monkeypatch.setattr(locks, "SECONDS_BETWEEN_SIGNS", 0.01)
     lost = threading.Event()
-    with lock(tmp_path, on_loss=lost.set):
-        before = (tmp_path / LOCK).stat().st_mtime_ns
-        wait_for(lambda: (tmp_path / LOCK).stat().st_mtime_ns > before)
-        assert not lost.is_set()
-        leave_lock(tmp_path, FOREIGN)
-        assert lost.wait(10)
+    told = "on elsewhere is at work on it since .*: it took this one for dead$"
+
+    def work():
+        with lock(tmp_path, on_loss=lost.set):
+            before = (tmp_path / LOCK).stat().st_mtime_ns
+            wait_for(lambda: (tmp_path / LOCK).stat().st_mtime_ns > before)
+            assert not lost.is_set()
+            leave_lock(tmp_path, FOREIGN)
+            assert lost.wait(10)
+
+    with pytest.raises(FolderInUseError, match=told):
+        work()
     # That of the other is left to it.
     assert json.loads((tmp_path / LOCK).read_text()) == FOREIGN
+
+
+@pytest.mark.parametrize(
+    ("remove", "told"),
+    [
+        (shutil.rmtree, "study: this folder is gone: somebody has removed or renamed it$"),
+        (lambda root: root.rename(root.with_name("other")), "study: this folder is gone: "),
+        (lambda root: (root / LOCK).unlink(), "lock: somebody has removed it, so others may be"),
+    ],
+)
+def test_who_loses_the_folder_learns_of_it_once(tmp_path, monkeypatch, remove, told):
+    """A stop that comes of it is told as that, and nothing is made anew."""
+    monkeypatch.setattr(locks, "SECONDS_BETWEEN_SIGNS", 0.01)
+    lost = []
+
+    def work():
+        with lock(tmp_path / "study", on_loss=lambda: lost.append(1)):
+            remove(tmp_path / "study")
+            wait_for(lambda: lost)
+            time.sleep(0.1)  # ten more looks
+            raise KeyboardInterrupt
+
+    with pytest.raises(UserError, match=told):
+        work()
+    assert lost == [1]
+    assert not (tmp_path / "study").exists()
 
 
 def wait_for(condition):

@@ -1,14 +1,19 @@
 """Modules of the user's: found where they lie, never taken for others, imported when typed."""
 
 import dataclasses
+import importlib
+import importlib.metadata
 import os
 import shutil
+import subprocess
 import sys
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
+from pipeline import user_modules
 from pipeline.environments import check_env_id, make_env
 from pipeline.errors import UserError
 from pipeline.module_records import as_flag, check_recorded, keep_copies
@@ -54,7 +59,7 @@ def test_a_module_is_found_by_its_name_and_by_its_path(write, own_folder):
     ]
     assert {module.search_folder for module in modules} == {str(own_folder)}
     assert sys.modules["my_package"].x == 2
-    assert sys.path[-1] == str(own_folder)
+    assert str(own_folder) not in sys.path
 
 
 def test_a_path_is_found_from_elsewhere_and_in_the_home_folder(write, monkeypatch, tmp_path):
@@ -72,6 +77,17 @@ def test_what_is_installed_has_no_path():
     )
 
 
+def test_a_library_beside_us_is_not_ours(tmp_path):
+    """As where all are installed into one folder."""
+    shutil.copytree(Path(user_modules.__file__).parent, tmp_path / "pipeline")
+    (tmp_path / "neighbour.py").touch()
+    code = "from pipeline.user_modules import import_typed\nprint(import_typed(['neighbour']))"
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, env=env, cwd=tmp_path.parent, capture_output=True, check=True)
+    assert b"name='neighbour'" in done.stdout
+
+
 def test_our_own_need_not_be_kept(own_folder):
     assert import_typed(["envs"], ["envs:Warehouse-v0", "CartPole-v1"]) == ()
 
@@ -80,7 +96,7 @@ def test_another_process_imports_from_anywhere(write, monkeypatch, tmp_path):
     folder = write(my_first="x = 1")
     modules = import_typed(["my_first"])
     del sys.modules["my_first"]
-    sys.path.remove(str(folder))
+    sys.meta_path.pop()
     monkeypatch.chdir(tmp_path)
     import_again(modules)
     assert sys.modules["my_first"].__file__ == str(folder / "my_first.py")
@@ -163,6 +179,23 @@ def test_a_module_that_fails_is_told_with_its_line(write, text, complaint):
 # --- only what was typed -------------------------------------------------------------------------
 
 
+def test_what_lies_beside_is_found_for_the_users_own_code_alone(write, own_folder, monkeypatch):
+    """A library that looks for another one, or for plugins, does not find a stranger's."""
+    write(my_first="def later():\n    import my_second\n", my_second="x = 1", not_mine="x = 2")
+    (own_folder / "not_mine-1.dist-info").mkdir()
+    (own_folder / "not_mine-1.dist-info" / "METADATA").write_text("Name: not_mine\nVersion: 1\n")
+    plugin = "[torch.backends]\nnot_mine = not_mine:x\n"
+    (own_folder / "not_mine-1.dist-info" / "entry_points.txt").write_text(plugin)
+    write(installed__in__library="def later(): import not_mine")  # as in a virtual environment
+    monkeypatch.syspath_prepend(str(own_folder / "installed"))
+    import_typed(["my_first"])
+    with pytest.raises(ModuleNotFoundError, match="not_mine"):
+        importlib.import_module("library").later()
+    assert "not_mine" not in importlib.metadata.entry_points(group="torch.backends").names
+    sys.modules["my_first"].later()
+    assert sys.modules["my_second"].x == 1
+
+
 def test_an_id_imports_nothing(write):
     write(my_first="raise SystemExit('it was imported')")
     told = "'my_first:FrozenLake-v1': its module is not imported because a file asks: "
@@ -226,10 +259,13 @@ def test_worker_processes_of_a_training_know_the_modules(write):
     from pipeline.train_spec import TrainSpec
 
     env = "gymnasium.register('my/Lake-v0', 'gymnasium.envs.toy_text:FrozenLakeEnv')"
-    write(my_first=f"import gymnasium\n{env}")
-    raw = {"n_envs": 1}
+    wrapper = "class Plain(gymnasium.Wrapper):\n    pass"
+    write(my_first=f"import gymnasium\n{env}\n{wrapper}")
+    raw = {"n_envs": 1, "env_wrapper": "my_first.Plain"}
     spec = TrainSpec("ppo", "my/Lake-v0", split(raw), raw, 0, vec_env="subproc")
-    spec = dataclasses.replace(spec, user_modules=import_typed(["my_first"]))
+    modules = import_typed(["my_first"])
+    spec = dataclasses.replace(spec, user_modules=modules, gym_packages=("my_first",))
     env = make_training_env(spec, None)
     assert np.array_equal(env.reset(), [0])
+    assert env.env_is_wrapped(sys.modules["my_first"].Plain) == [True]
     env.close()

@@ -185,9 +185,9 @@ def test_settings_out_of_proportion_are_refused(genuine, tmp_path, key, value):
     assert refusal.value.key in {key, "n_steps"}
 
 
-def tensors(content):
+def tensors(content, **options):
     file = io.BytesIO()
-    th.save(content, file)
+    th.save(content, file, **options)
     return file.getvalue()
 
 
@@ -273,12 +273,58 @@ def test_the_tensors_of_a_trained_model_are_loaded(trained, tmp_path):
     assert isinstance(load_model(SAC, write(tmp_path / "model.zip", trained)), SAC)
 
 
-def test_a_pickle_among_the_tensors_is_not_run(genuine, tmp_path):
+def with_members(content, **members):
+    """A file of tensors with other members, or more of them."""
+    archive = zipfile.ZipFile(io.BytesIO(content))
+    old = {Path(name).stem: (name, archive.read(name)) for name in archive.namelist()}
+    new = {stem: (f"archive/{stem}.pkl", member) for stem, member in members.items()}
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, member in {**old, **new}.values():
+            archive.writestr(name, member)
+    return out.getvalue()
+
+
+def not_tensors(mark):
+    """Files that stand in the place of tensors, and what is said of each."""
+    zeros, old = tensors({BIAS: th.zeros(1)}), {"_use_new_zipfile_serialization": False}
+    deep = b"\x80\x02" + b"]" * 5000 + b"a" * 4999 + b"."
+    something = "holds something else than tensors"
+    return {
+        "a call": (tensors(Attack(mark)), f"{something}: posix.mkdir"),
+        "a call in the old format": (tensors(Attack(mark), **old), f"{something}: posix.mkdir"),
+        "a call of protocol 4": (tensors(Attack(mark), pickle_protocol=4), something),
+        "a pickle": (pickle.dumps(Attack(mark)), something),
+        "a network": (tensors(th.nn.Linear(1, 1)), f"{something}: torch.nn.modules.linear.Linear"),
+        "an array": (tensors(np.ones(1)), f"{something}: numpy._core.multiarray._reconstruct"),
+        "signs that a terminal obeys": (with_members(zeros, data=b"ca\x1b[2J\nb\n."), something),
+        "TorchScript": (with_members(zeros, constants=b""), something),
+        "a cut one": (zeros[:-30], "holds tensors that cannot be read: Pytorch"),
+        "one of no bytes": (b"", "holds tensors that cannot be read: EOFError"),
+        "lists in lists": (with_members(zeros, data=deep), "nests dictionaries and lists deeper"),
+        "a tensor of tensors": (
+            tensors({"x": th.nested.nested_tensor([th.ones(1)])}),
+            "x is not made of real numbers",
+        ),
+        "a tensor of nothing": (tensors({"x": th.ones(1, device="meta")}), "x is not made of real"),
+    }
+
+
+@pytest.mark.filterwarnings("always", "ignore:.*nested tensors")
+def test_what_is_no_tensor_is_told_in_one_line_of_ours(genuine, tmp_path, recwarn):
+    """PyTorch warns, and explains in several lines how to have the code run after all."""
     mark = tmp_path / "mark"
-    path = write(tmp_path / "model.zip", {**genuine, "policy.pth": tensors(Attack(mark))})
-    with pytest.raises(UnsafeFileError, match="cannot be read"):
-        load_model(PPO, path)
-    assert not mark.exists()
+    for what, (content, told) in not_tensors(mark).items():
+        path = write(tmp_path / "model.zip", {**genuine, "policy.pth": content})
+        recwarn.clear()
+        with pytest.raises(UnsafeFileError) as refused:
+            load_model(PPO, path)
+        line = str(refused.value)
+        assert told in line, what
+        assert line.isprintable(), what
+        assert "weights_only" not in line.lower().replace(" ", "_"), what
+        assert not recwarn.list, what
+        assert not mark.exists()
 
 
 def test_tensors_that_were_deflated_are_refused(genuine, tmp_path):
