@@ -8,6 +8,7 @@ from typing import Any
 
 from safe_files import gymnasium_spaces, library_objects, library_schedules, numpy_objects
 from safe_files.library_classes import library_classes
+from safe_files.limits import Budget
 from safe_files.pickle_trees import read_tree
 from safe_files.rebuilding import Admitted, Maker, rebuild
 
@@ -28,6 +29,7 @@ def read_pickle(
     pickled: bytes,
     classes: Mapping[str, type] | None = None,
     makers: Mapping[str, Maker] | None = None,
+    budget: Budget | None = None,
 ) -> Any:
     """What a pickle stands for, made without unpickling.
 
@@ -35,10 +37,12 @@ def read_pickle(
         pickled: the pickle.
         classes: further classes that it may name, by their full names.
         makers: what makes further objects in it, likewise.
+        budget: pays for it; None for that of a file that is this pickle.
 
     Raises:
         UnsafeFileError: if it is damaged, or holds what may not stand in it.
     """
+    budget = budget or Budget(len(pickled))
     usual = admitted()
     here = Admitted({**usual.makers, **(makers or {})}, {**usual.classes, **(classes or {})})
-    return rebuild(read_tree(pickled), here)
+    return rebuild(read_tree(pickled, budget), here, budget)

@@ -17,9 +17,11 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.her.goal_selection_strategy import GoalSelectionStrategy
 
+from safe_files import tensors
+from safe_files.limits import Budget
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, Maker, arguments, fields, wrong
-from safe_files.tensors import load_tensors
+from safe_files.tensors import lone_storage
 
 _COMMON = "stable_baselines3.common"
 _NUMBERS = (int, float, np.number, np.ndarray)
@@ -109,18 +111,9 @@ def _device(made: Made, build: Build) -> th.device:
     return th.device("cpu")
 
 
-def _storage(made: Made, build: Build) -> Any:
+def _storage(made: Made, build: Build) -> th.Tensor:
     (data,) = arguments(made, build, bytes)
-    return load_tensors(data)
-
-
-def _tensor(made: Made, build: Build) -> th.Tensor:
-    storage, offset, size, stride, requires_grad = (build(arg) for arg in made.args[:5])
-    if made.state is not None or len(made.args) > 7:
-        raise wrong(made)
-    flat = th.tensor([], dtype=storage.dtype).set_(storage._untyped_storage)
-    tensor: th.Tensor = flat.as_strided(size, stride, offset).clone()
-    return tensor.requires_grad_(bool(requires_grad))
+    return lone_storage(data, Budget(len(data)))
 
 
 MAKERS: Mapping[str, Maker] = {
@@ -135,5 +128,5 @@ MAKERS: Mapping[str, Maker] = {
     "stable_baselines3.her.goal_selection_strategy.GoalSelectionStrategy": _goal_selection,
     "torch.device": _device,
     "torch.storage._load_from_bytes": _storage,
-    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_tensor_v2": tensors.MAKERS["torch._utils._rebuild_tensor_v2"],
 }

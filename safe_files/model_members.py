@@ -7,8 +7,8 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from safe_files.archives import check_tensors, read_members
-from safe_files.limits import MAX_INTEGER_BITS, MAX_SETTINGS_BYTES
+from safe_files.archives import opened_zip, read_members
+from safe_files.limits import MAX_INTEGER_BITS, Budget
 from safe_files.refusals import UnsafeFileError, shown
 
 SETTINGS = "data"
@@ -26,6 +26,9 @@ TENSORS = frozenset(
 )
 MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
 
+# The most that one of JSON's values takes, beside its text: an empty dictionary with its place.
+_BYTES_PER_VALUE = 100
+
 # Algorithms of the user's may keep further files of tensors.
 _TENSORS = re.compile(r"\w[\w.]*\.pth", re.ASCII)
 
@@ -42,7 +45,8 @@ def first_look(content: bytes) -> dict[str, Any]:
     Raises:
         UnsafeFileError: if it is no zip of a model, whosever the algorithm is.
     """
-    members = read_members(content)
+    budget = Budget(len(content))
+    members = read_members(content, budget=budget)
     strange = sorted(name for name in members if not _may_stand(name))
     if strange:
         raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
@@ -50,26 +54,33 @@ def first_look(content: bytes) -> dict[str, Any]:
     if SETTINGS not in members or not tensors:
         raise UnsafeFileError("lacks parts that a model has")
     for name in tensors:
-        check_tensors(members[name])
-    return parse_settings(members)
+        with opened_zip(members[name], budget):
+            pass
+    return parse_settings(members, budget)
 
 
 def _may_stand(name: str) -> bool:
     return name in MEMBERS or _TENSORS.fullmatch(name) is not None
 
 
-def parse_settings(members: Mapping[str, bytes]) -> dict[str, Any]:
+def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
     """The settings of a model as JSON.
+
+    Args:
+        members: of the zip.
+        budget: pays for the settings.
 
     Raises:
         UnsafeFileError: if there are none, or they are no JSON, or too large.
     """
     if SETTINGS not in members:
         raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
-    if len(members[SETTINGS]) > MAX_SETTINGS_BYTES:
-        raise UnsafeFileError(f"has more than {MAX_SETTINGS_BYTES:,} bytes of settings")
+    text = members[SETTINGS]
+    # Of characters that are not of ASCII, one can make all others four bytes wide.
+    budget.charge(len(text) * (2 if text.isascii() else 8))
+    budget.charge(sum(map(text.count, (b"[", b"{", b",", b":"))) * _BYTES_PER_VALUE)
     try:
-        data = json.loads(members[SETTINGS], parse_int=_integer)
+        data = json.loads(text.decode(), parse_int=_integer)
     except (ValueError, RecursionError) as error:
         raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
     if not isinstance(data, dict):

@@ -182,7 +182,7 @@ def test_settings_out_of_proportion_are_refused(genuine, tmp_path, key, value):
     path = write(tmp_path / "model.zip", with_settings(genuine, **{key: value}))
     with pytest.raises(UnsafeFileError) as refusal:
         load_model(PPO, path)
-    assert refusal.value.key in {key, "n_steps"}
+    assert refusal.value.key in ({None} if key == "policy_kwargs" else {key, "n_steps"})
 
 
 def tensors(content):
@@ -297,7 +297,7 @@ def test_a_zip_that_unpacks_out_of_proportion_is_refused(genuine, tmp_path):
     assert path.stat().st_size < 1 << 20
     tracemalloc.start()
     try:
-        with pytest.raises(UnsafeFileError, match="out of proportion"):
+        with pytest.raises(UnsafeFileError, match="would take more memory"):
             load_model(PPO, path)
         assert tracemalloc.get_traced_memory()[1] < 20e6
     finally:
