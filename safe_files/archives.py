@@ -69,7 +69,7 @@ def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
             if len({info.filename for info in infos}) != len(infos):
                 raise UnsafeFileError("holds a member twice")
             if any(info.compress_type not in _METHODS for info in infos):
-                raise UnsafeFileError("is compressed in a way that is not read here")
+                raise UnsafeFileError("has a compression method that is not read here")
             yield archive
     except UnsafeFileError:
         raise

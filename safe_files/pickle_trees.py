@@ -11,7 +11,7 @@ import io
 import pickle
 import pickletools
 import struct
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain
@@ -25,15 +25,24 @@ from safe_files.refusals import UnsafeFileError
 KEYS = (str, int, float, bytes, type(None))
 _END_OF_INTEGERS = (1 << 61) - 1
 
+# What protocols 4 and 5 write, which the library has used throughout its second version. Left out
+# are persistent ids, extension codes, buffers out of band, and keyword arguments.
+_INSTRUCTIONS = (
+    "PROTO FRAME STOP NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT "
+    "SHORT_BINUNICODE BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 BYTEARRAY8 "
+    "EMPTY_LIST EMPTY_TUPLE EMPTY_DICT EMPTY_SET TUPLE1 TUPLE2 TUPLE3 TUPLE FROZENSET MARK POP "
+    "POP_MARK APPEND APPENDS ADDITEMS SETITEM SETITEMS MEMOIZE BINGET LONG_BINGET STACK_GLOBAL "
+    "REDUCE NEWOBJ BUILD"
+)
+INSTRUCTIONS = frozenset(_INSTRUCTIONS.split())
+# The most bytes that an instruction makes beside those that stand in the file, and a key.
+_BYTES, _BYTES_OF_AN_OBJECT, _BYTES_PER_KEY = 128, 320, 160
+_MAKES_AN_OBJECT = frozenset({"EMPTY_SET", "FROZENSET", "REDUCE", "NEWOBJ", "BINPERSID"})
+
 
 @dataclass(frozen=True, slots=True)
 class Name:
-    """A class or function that the file refers to.
-
-    Attributes:
-        module: its module's dotted name.
-        qualname: its name in there.
-    """
+    """A class or function that the file refers to, by its module's name and its own in there."""
 
     module: str
     qualname: str
@@ -44,21 +53,13 @@ class Name:
 
 @dataclass(eq=False, slots=True)
 class Made:
-    """An object that the file asks for.
+    """An object that the file asks for."""
 
-    Attributes:
-        maker: the class or function to call, or what is to make it first.
-        args: what to call it with.
-        state: what to give it as its state, or None.
-        items: what to append to it.
-        pairs: keys and values to set in it.
-    """
-
-    maker: Name | Made
-    args: tuple[Any, ...]
-    state: Any = None
-    items: list[Any] = field(default_factory=list)
-    pairs: list[tuple[Any, Any]] = field(default_factory=list)
+    maker: Name | Made  # the class or function to call, or what is to make it first
+    args: tuple[Any, ...]  # what to call it with
+    state: Any = None  # what to give it as its state
+    items: list[Any] = field(default_factory=list)  # what to append to it
+    pairs: list[tuple[Any, Any]] = field(default_factory=list)  # keys and values to set in it
 
 
 Plain = None | bool | int | float | str | bytes
@@ -99,12 +100,11 @@ def read_tree(pickled: bytes, budget: Budget | None = None) -> Tree:
     return tree
 
 
-# For each key that is set, a row of a table that grows by doubling.
-_BYTES_PER_KEY = 160
-
-
 class TreeReader(pickle._Unpickler):
-    """Python's own reader of pickles, which calls nothing and imports nothing."""
+    """Python's own reader of pickles, which calls nothing and imports nothing.
+
+    What ``run_`` an instruction does takes the place of Python's own.
+    """
 
     dispatch: ClassVar[dict[int, Any]]
     stack: list[Any]
@@ -136,80 +136,75 @@ class TreeReader(pickle._Unpickler):
         """Note down a name; the machine calls this where it would import something."""
         return Name(module, name)
 
-    def call(self) -> None:
+    def run_reduce(self) -> None:
         args, maker = self.stack.pop(), self.stack.pop()
         if not (isinstance(maker, Name | Made) and isinstance(args, tuple)):
             raise UnsafeFileError("a pickle that calls what is no name")
         self.stack.append(Made(maker, args))
 
-    def build(self) -> None:
+    run_newobj = run_reduce
+
+    def run_build(self) -> None:
         state, top = self.stack.pop(), self.stack[-1]
         if not isinstance(top, Made) or top.state is not None:
             raise UnsafeFileError("a pickle that sets the state of what is no new object")
         top.state = state
 
-    def throw_away(self) -> None:
-        """Take what is on top; a call in vain may have been meant to change what it is given."""
+    def run_pop(self) -> None:
+        # A call in vain may have been meant to change what it is given.
         top = self.stack.pop()
         if isinstance(top, Made) and str(top.maker).endswith("._function_setstate"):
             self.stack.extend(top.args)
-            self.build()
+            self.run_build()
             self.stack.pop()
 
-    def long_number(self, read: Callable[[TreeReader], None]) -> None:
-        read(self)
-        if self.stack[-1].bit_length() > MAX_INTEGER_BITS:
-            raise UnsafeFileError("an absurdly large number")
-
-    def text(self, read: Callable[[TreeReader], None]) -> None:
-        read(self)
-        # Of characters that are not of ASCII, one can make all others four bytes wide.
-        self.budget.charge(0 if self.stack[-1].isascii() else 4 * len(self.stack[-1]))
-
-    def byte_array(self) -> None:
+    def run_bytearray8(self) -> None:
         (size,) = struct.unpack("<Q", self.read(8))
         # Python's own would make room for all that it says, before it finds how much there is.
         self.stack.append(self.read(size))
 
-    def append_one(self) -> None:
+    def run_append(self) -> None:
         self._extend([self.stack.pop()])
 
-    def append_many(self) -> None:
+    def run_appends(self) -> None:
         self._extend(self.pop_mark())
+
+    run_additems = run_appends
+
+    def run_frozenset(self) -> None:
+        items = self.pop_mark()
+        self.stack.append(set())
+        self._extend(items)
 
     def _extend(self, values: list[Any]) -> None:
         """Append to the list, set or object on top."""
-        top = self.stack[-1]
-        if isinstance(top, set):
-            top.update(map(self._key, values))
-            return
-        if not isinstance(top, list | Made):
-            raise TypeError(f"nothing can be appended to a {type(top).__name__}")
-        (top.items if isinstance(top, Made) else top).extend(values)
+        match self.stack[-1]:
+            case Made() as made:
+                made.items.extend(values)
+            case list() as items:
+                items.extend(values)
+            case set() as items:
+                items.update(map(self._key, values))
+            case top:
+                raise TypeError(f"nothing can be appended to a {type(top).__name__}")
 
-    def set_one(self) -> None:
-        values = self.stack[-2:]
-        del self.stack[-2:]
-        self._set(values)
+    def run_setitem(self) -> None:
+        value, key = self.stack.pop(), self.stack.pop()
+        self._set([(key, value)])
 
-    def set_many(self) -> None:
-        self._set(self.pop_mark())
+    def run_setitems(self) -> None:
+        values = self.pop_mark()
+        self._set(zip(values[::2], values[1::2], strict=True))
 
-    def _set(self, values: list[Any]) -> None:
-        """Set keys, each followed by its value, in the dictionary or object on top."""
-        top = self.stack[-1]
-        pairs = list(zip(values[::2], values[1::2], strict=True))
-        if isinstance(top, Made):
-            self.budget.charge(_BYTES_PER_KEY * len(pairs))
-            top.pairs.extend(pairs)
-        elif isinstance(top, dict):
-            top.update((self._key(key), value) for key, value in pairs)
-        else:
-            raise TypeError(f"no keys can be set in a {type(top).__name__}")
-
-    def frozen(self) -> None:
-        items = self.pop_mark()
-        self.stack.append(set(map(self._key, items)))
+    def _set(self, pairs: Iterable[tuple[Any, Any]]) -> None:
+        """Set keys and values in the dictionary or object on top."""
+        match self.stack[-1]:
+            case Made() as made:
+                made.pairs.extend(pairs)
+            case dict() as items:
+                items.update((self._key(key), value) for key, value in pairs)
+            case top:
+                raise TypeError(f"no keys can be set in a {type(top).__name__}")
 
     def _key(self, key: Any) -> Any:
         self.budget.charge(_BYTES_PER_KEY)
@@ -219,56 +214,32 @@ class TreeReader(pickle._Unpickler):
             raise UnsafeFileError("uses an absurdly large number as the key of a dictionary")
         return key
 
-
-_Run = Callable[[TreeReader], None]
-_RUN: dict[str, Any] = {
-    op.name: pickle._Unpickler.dispatch[ord(op.code)] for op in pickletools.opcodes
-}
-
-
-def _longer(run: Callable[..., None], *names: str) -> dict[str, _Run]:
-    return {name: partial(run, read=_RUN[name]) for name in names}
-
-
-_OWN: Mapping[str, _Run] = {
-    **_longer(TreeReader.long_number, "LONG1", "LONG4"),
-    **_longer(TreeReader.text, "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
-    "BYTEARRAY8": TreeReader.byte_array,
-    "POP": TreeReader.throw_away,
-    "APPEND": TreeReader.append_one,
-    "APPENDS": TreeReader.append_many,
-    "ADDITEMS": TreeReader.append_many,
-    "SETITEM": TreeReader.set_one,
-    "SETITEMS": TreeReader.set_many,
-    "FROZENSET": TreeReader.frozen,
-    "REDUCE": TreeReader.call,
-    "NEWOBJ": TreeReader.call,
-    "BUILD": TreeReader.build,
-}
-# What protocols 4 and 5 write, which the library has used throughout its second version, and the
-# most bytes that each makes beside those that stand in the file. Left out are persistent ids,
-# extension codes, buffers out of band, and keyword arguments.
-COSTS = {
-    64: "PROTO FRAME BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT NONE NEWTRUE NEWFALSE BINGET "
-    "LONG_BINGET EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 TUPLE POP POP_MARK APPEND APPENDS ADDITEMS "
-    "SETITEM SETITEMS BUILD STOP",
-    128: "SHORT_BINUNICODE BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 BYTEARRAY8 "
-    "EMPTY_LIST EMPTY_DICT MARK MEMOIZE STACK_GLOBAL",
-    320: "EMPTY_SET FROZENSET REDUCE NEWOBJ",
-}
+    def check_top(self) -> None:
+        """Hold what was read last against its limits."""
+        top = self.stack[-1] if self.stack else None
+        if isinstance(top, int) and top.bit_length() > MAX_INTEGER_BITS:
+            raise UnsafeFileError("an absurdly large number")
+        if isinstance(top, str) and not top.isascii():
+            # One character can make all others four bytes wide.
+            self.budget.charge(4 * len(top))
 
 
-def instructions(costs: Mapping[int, str]) -> dict[int, _Run]:
-    """What a reader does at each code: what those cost that it knows, and no others."""
-    cost = {name: n_bytes for n_bytes, names in costs.items() for name in names.split()}
-
-    def step(reader: TreeReader, name: str) -> None:
-        if name not in cost:
-            raise UnsafeFileError(f"a pickle with the instruction {name}")
-        reader.budget.charge(cost[name])
-        (_OWN.get(name) or _RUN[name])(reader)
-
-    return {ord(op.code): partial(step, name=op.name) for op in pickletools.opcodes}
+def instructions(known: Iterable[str]) -> dict[int, Callable[[TreeReader], None]]:
+    """What a reader does at each code: it pays, or refuses what is not known."""
+    return {
+        ord(op.code): partial(_step, op, op.name if op.name in known else None)
+        for op in pickletools.opcodes
+    }
 
 
-TreeReader.dispatch = instructions(COSTS)
+def _step(op: pickletools.OpcodeInfo, known: str | None, reader: TreeReader) -> None:
+    if known is None:
+        raise UnsafeFileError(f"a pickle with the instruction {op.name}")
+    reader.budget.charge(_BYTES_OF_AN_OBJECT if known in _MAKES_AN_OBJECT else _BYTES)
+    own = getattr(reader, f"run_{known.lower()}", None)
+    pythons: Any = pickle._Unpickler.dispatch
+    own() if own is not None else pythons[ord(op.code)](reader)
+    reader.check_top()
+
+
+TreeReader.dispatch = instructions(INSTRUCTIONS)

@@ -17,7 +17,7 @@ import torch as th
 
 from safe_files.archives import opened_zip
 from safe_files.limits import Budget
-from safe_files.pickle_trees import COSTS, Made, Name, TreeReader, instructions
+from safe_files.pickle_trees import INSTRUCTIONS, Made, Name, TreeReader, instructions
 from safe_files.rebuilding import Admitted, Build, Maker, rebuild, wrong
 from safe_files.refusals import UnsafeFileError, shown
 
@@ -42,7 +42,7 @@ class TensorReader(TreeReader):
     """Reads pickles of protocol 2, as PyTorch writes them: storages stand beside the pickle."""
 
     dispatch: ClassVar[dict[int, Any]] = instructions(
-        {**COSTS, 129: "GLOBAL BINPUT LONG_BINPUT", 320: f"{COSTS[320]} BINPERSID"}
+        INSTRUCTIONS | {"GLOBAL", "BINPUT", "LONG_BINPUT", "BINPERSID"}
     )
 
     def __init__(self, file: io.BytesIO, budget: Budget) -> None:
