@@ -21,6 +21,8 @@ MAX_ROWS = 1_000_000_000
 # What may be made of a file: so many times its own bytes, and these.
 TIMES = 4
 FREE_BYTES = 64 << 20
+# Of an empty dictionary, with its place in what holds it: no value takes more beside its text.
+_BYTES_PER_JSON_VALUE = 100
 # Where no system tells; many machines have as much.
 MEMORY_IF_UNKNOWN = 16 << 30
 
@@ -48,6 +50,12 @@ class Budget:
                 f"would take more memory than {TIMES} times its {self.n_bytes:,} bytes and "
                 f"{FREE_BYTES >> 20} MB"
             )
+
+    def charge_json(self, text: bytes) -> None:
+        """Take what Python makes of a text of JSON; see `charge`."""
+        # Of characters that are not of ASCII, one can make all others four bytes wide.
+        self.charge(len(text) * (2 if text.isascii() else 8))
+        self.charge(sum(map(text.count, (b"[", b"{", b",", b":"))) * _BYTES_PER_JSON_VALUE)
 
 
 def memory_bytes() -> int:

@@ -26,9 +26,6 @@ TENSORS = frozenset(
 )
 MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
 
-# The most that one of JSON's values takes, beside its text: an empty dictionary with its place.
-_BYTES_PER_VALUE = 100
-
 # Algorithms of the user's may keep further files of tensors.
 _TENSORS = re.compile(r"\w[\w.]*\.pth", re.ASCII)
 
@@ -76,9 +73,7 @@ def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, An
     if SETTINGS not in members:
         raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
     text = members[SETTINGS]
-    # Of characters that are not of ASCII, one can make all others four bytes wide.
-    budget.charge(len(text) * (2 if text.isascii() else 8))
-    budget.charge(sum(map(text.count, (b"[", b"{", b",", b":"))) * _BYTES_PER_VALUE)
+    budget.charge_json(text)
     try:
         data = json.loads(text.decode(), parse_int=_integer)
     except (ValueError, RecursionError) as error:

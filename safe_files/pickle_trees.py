@@ -127,7 +127,7 @@ class TreeReader(pickle._Unpickler):
         except UnsafeFileError:
             raise
         except Exception as error:  # a damaged one can fail at any instruction
-            raise UnsafeFileError(f"is no whole pickle: {error}") from error
+            raise UnsafeFileError(f"is no whole pickle: {str(error) or type(error).__name__}") from error
         if self.stack or self.metastack:
             raise UnsafeFileError("is no whole pickle: something is left over")
         return tree

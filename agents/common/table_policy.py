@@ -64,6 +64,7 @@ class TablePolicy(BasePolicy):
         if not (isinstance(saved, dict) and isinstance(saved.get("data"), str)):
             raise UnsafeFileError(f"{path} holds no policy of this kind")
         check_values({"the policy": saved.get("state_dict")})
+        budget.charge_json(saved["data"].encode())
         try:
             data = {name: decode(value) for name, value in json.loads(saved["data"]).items()}
             with charged_tensors(budget):
