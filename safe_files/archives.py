@@ -1,15 +1,29 @@
-"""Zips, of which no more is unpacked than the budget of their file allows."""
+"""The zips of models, looked at before a library is imported: members, and settings as text.
+
+No more is unpacked than the budget of the file allows.
+"""
 
 from __future__ import annotations
 
 import io
+import json
+import re
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
-from safe_files.limits import MAX_MEMBERS, Budget
+from safe_files.limits import MAX_INTEGER_BITS, MAX_MEMBERS, Budget
 from safe_files.refusals import UnsafeFileError, shown
+
+SETTINGS = "data"
+_NETWORKS = "policy policy.optimizer actor.optimizer critic.optimizer ent_coef_optimizer"
+TENSORS = frozenset(f"{name}.pth" for name in f"{_NETWORKS} pytorch_variables tensors".split())
+MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
+
+# Algorithms of the user's may keep further files of tensors.
+_TENSORS = re.compile(r"\w[\w.]*\.pth", re.ASCII)
 
 # What begins each entry of a zip's list of members, and what Python makes of one.
 _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
@@ -57,11 +71,7 @@ def read_members(
 
 @contextmanager
 def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
-    """A zip in which no member stands twice.
-
-    Raises:
-        UnsafeFileError: if it is none, or is damaged where it is read meanwhile.
-    """
+    """A zip in which no member stands twice."""
     budget.charge(content.count(_ENTRY) * _BYTES_PER_ENTRY)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -75,3 +85,47 @@ def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
         raise
     except _DAMAGE as error:
         raise UnsafeFileError(f"is no whole zip: {error}") from error
+
+
+def first_look(content: bytes) -> dict[str, Any]:
+    """The settings in a zip, which is one of a model as far as can be said without the libraries.
+
+    What is pickled in them stays text.
+    """
+    budget = Budget(len(content))
+    members = read_members(content, budget=budget)
+    strange = sorted(name for name in members if not _may_stand(name))
+    if strange:
+        raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
+    tensors = [name for name in members if name.endswith(".pth")]
+    if SETTINGS not in members or not tensors:
+        raise UnsafeFileError("lacks parts that a model has")
+    for name in tensors:
+        with opened_zip(members[name], budget):
+            pass
+    return parse_settings(members, budget)
+
+
+def _may_stand(name: str) -> bool:
+    return name in MEMBERS or _TENSORS.fullmatch(name) is not None
+
+
+def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
+    """The settings of a model as JSON."""
+    if SETTINGS not in members:
+        raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
+    text = members[SETTINGS]
+    budget.charge_json(text)
+    try:
+        data = json.loads(text.decode(), parse_int=_integer)
+    except (ValueError, RecursionError) as error:
+        raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise UnsafeFileError("has settings that do not map names to values")
+    return data
+
+
+def _integer(digits: str) -> int:
+    if len(digits) > MAX_INTEGER_BITS:
+        raise UnsafeFileError("holds an absurdly large number")
+    return int(digits)

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_files.admission import read_pickle
-from safe_files.archives import read_members
-from safe_files.library_classes import all_policy_classes
+from safe_files.archives import MEMBERS, TENSORS, parse_settings, read_members
 from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
-from safe_files.model_members import MEMBERS, TENSORS, parse_settings
 from safe_files.models import NOT_READ, SERIALIZED, decoded
+from safe_files.objects import all_policy_classes, read_pickle
 from safe_files.pickle_trees import Name, parts_of, read_tree
 from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown

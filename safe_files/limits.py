@@ -14,6 +14,7 @@ MAX_STATISTICS_BYTES = 64 << 20
 MAX_BUFFER_BYTES = 32 << 30
 MAX_MEMBERS = 64
 MAX_DEPTH = 40
+MAX_DIMENSIONS = 32
 # Of no use beyond this: counters of steps are far below.
 MAX_INTEGER_BITS = 128
 # Of a buffer.
@@ -39,11 +40,7 @@ class Budget:
         self.left = FREE_BYTES + TIMES * n_bytes
 
     def charge(self, n_bytes: int) -> None:
-        """Take so many bytes.
-
-        Raises:
-            UnsafeFileError: if fewer are left.
-        """
+        """Take so many bytes."""
         self.left -= n_bytes
         if self.left < 0:
             raise UnsafeFileError(

@@ -15,17 +15,14 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from safe_files.admission import read_pickle
-from safe_files.archives import read_members
-from safe_files.library_classes import policy_classes
+from safe_files.archives import MEMBERS, SETTINGS, TENSORS, parse_settings, read_members
 from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
-from safe_files.model_members import MEMBERS, SETTINGS, TENSORS, parse_settings
+from safe_files.objects import policy_classes, read_pickle
 from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import Source, content_of
-from safe_files.sizes import charged_tensors, check_sizes
 from safe_files.tensors import check_values, first_line, load_tensors
-from safe_files.weights import check_fit, check_variable
+from safe_files.weights import charged_tensors, check_fit, check_sizes, check_variable
 
 # What is trained and part of no network: the entropy coefficient of SAC and its kin.
 VARIABLES = frozenset({"log_ent_coef", "ent_coef_tensor"})
@@ -50,15 +47,10 @@ Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 @dataclass(frozen=True)
 class Settings:
-    """A model's attributes.
+    """A model's attributes."""
 
-    Attributes:
-        plain: those that are plain data.
-        pickled: those that the library pickles, as pickles.
-    """
-
-    plain: Mapping[str, Any]
-    pickled: Mapping[str, bytes]
+    plain: Mapping[str, Any]  # those that are plain data
+    pickled: Mapping[str, bytes]  # those that the library pickles, as pickles
 
     def __contains__(self, name: str) -> bool:
         return name in self.plain or name in self.pickled
@@ -143,11 +135,7 @@ def _with_tensors(algorithm: type[Algorithm], tensors: Mapping[str, Any]) -> typ
 def read_settings(
     members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
 ) -> Settings:
-    """The attributes in a zip, those left out that a reader decides; the budget pays for them.
-
-    Raises:
-        UnsafeFileError: if they are no attributes of such a model.
-    """
+    """The attributes in a zip, those left out that a reader decides; the budget pays for them."""
     data = parse_settings(members, budget)
     plain: dict[str, Any] = {}
     pickled: dict[str, bytes] = {}
@@ -182,11 +170,7 @@ def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozens
 
 
 def decoded(key: str, text: Any) -> bytes:
-    """The pickle that stands in JSON as base64.
-
-    Raises:
-        UnsafeFileError: if it is none.
-    """
+    """The pickle that stands in JSON as base64."""
     try:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, TypeError, ValueError) as error:

@@ -80,19 +80,9 @@ def parts_of(tree: Tree) -> Iterable[Any]:
 
 
 def read_tree(pickled: bytes, budget: Budget | None = None) -> Tree:
-    """Read one pickle.
+    """What a pickle of protocol 4 or 5 says; a part that the file shares is shared.
 
-    Args:
-        pickled: a pickle of protocol 4 or 5.
-        budget: pays for the tree; None for that of such a file.
-
-    Returns:
-        What it says: plain data, lists, tuples, dictionaries and sets as they are, and the classes
-        of this module for the rest. A part that the file shares is shared.
-
-    Raises:
-        UnsafeFileError: if it is no whole pickle, takes too much, or uses instructions that files
-            of this kind have no use for.
+    Without a budget, that of such a file pays for it.
     """
     budget = budget or Budget(len(pickled))
     budget.charge(len(pickled))
@@ -117,17 +107,15 @@ class TreeReader(pickle._Unpickler):
         self.budget = budget
 
     def load(self) -> Any:
-        """The next pickle of the file as a tree.
-
-        Raises:
-            UnsafeFileError: see `read_tree`.
-        """
+        """The next pickle of the file as a tree."""
         try:
             tree = super().load()
         except UnsafeFileError:
             raise
         except Exception as error:  # a damaged one can fail at any instruction
-            raise UnsafeFileError(f"is no whole pickle: {str(error) or type(error).__name__}") from error
+            raise UnsafeFileError(
+                f"is no whole pickle: {str(error) or type(error).__name__}"
+            ) from error
         if self.stack or self.metastack:
             raise UnsafeFileError("is no whole pickle: something is left over")
         return tree

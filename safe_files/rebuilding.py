@@ -22,29 +22,14 @@ _REFUSED = "which may not stand in such a file"
 
 @dataclass(frozen=True)
 class Admitted:
-    """What a file may hold beside plain data.
+    """What a file may hold beside plain data, by the full names of classes and functions."""
 
-    Attributes:
-        makers: by the full name of a class or function, what makes the object from what the file
-            says, and refuses what does not fit.
-        classes: by their full names, classes that a file may name.
-    """
-
-    makers: Mapping[str, Maker]
-    classes: Mapping[str, type]
+    makers: Mapping[str, Maker]  # what makes an object, and refuses what does not fit
+    classes: Mapping[str, type]  # those that a file may name
 
 
 def rebuild(tree: Tree, admitted: Admitted, budget: Budget) -> Any:
-    """Make what a tree stands for.
-
-    Args:
-        tree: as `safe_files.pickle_trees.read_tree` returns it.
-        admitted: what it may hold beside plain data.
-        budget: pays for it.
-
-    Raises:
-        UnsafeFileError: if it holds anything else, refers to itself, is too deep or too large.
-    """
+    """Make what a tree stands for."""
     rebuilding = _Rebuilding(admitted, budget)
     try:
         size, _ = rebuilding.measure(tree)
@@ -141,11 +126,7 @@ def _what(name: Name | Made) -> str:
 
 
 def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
-    """The arguments of a call, which must be of these kinds, and nothing besides them.
-
-    Raises:
-        UnsafeFileError: if they are others, or the object is given more than arguments.
-    """
+    """The arguments of a call, which must be of these kinds, and nothing besides them."""
     values = tuple(build(arg) for arg in made.args)
     fits = len(values) == len(kinds) and all(map(isinstance, values, kinds))
     if not fits or made.state is not None or made.items or made.pairs:
@@ -154,11 +135,7 @@ def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tupl
 
 
 def fields(made: Made, build: Build) -> dict[str, Any]:
-    """The attributes that an object is given.
-
-    Raises:
-        UnsafeFileError: if it is given anything else, or attributes that are not names.
-    """
+    """The attributes that an object is given."""
     state = {} if made.state is None else build(made.state)
     fits = isinstance(state, dict) and all(isinstance(key, str) for key in state)
     if not fits or made.args or made.items or made.pairs:
@@ -167,11 +144,7 @@ def fields(made: Made, build: Build) -> dict[str, Any]:
 
 
 def chosen_fields(made: Made, build: Build, names: Iterable[str]) -> dict[str, Any]:
-    """Those of an object's attributes that are asked for; the others are not looked at.
-
-    Raises:
-        UnsafeFileError: if the object has no attributes, or one of these is missing.
-    """
+    """Those of an object's attributes that are asked for; the others are not looked at."""
     trees = made.state if isinstance(made.state, dict) else {}
     if not trees.keys() >= set(names):
         raise wrong(made)

@@ -16,7 +16,7 @@ import numpy as np
 import torch as th
 
 from safe_files.archives import opened_zip
-from safe_files.limits import Budget
+from safe_files.limits import MAX_DIMENSIONS, Budget
 from safe_files.pickle_trees import INSTRUCTIONS, Made, Name, TreeReader, instructions
 from safe_files.rebuilding import Admitted, Build, Maker, rebuild, wrong
 from safe_files.refusals import UnsafeFileError, shown
@@ -90,11 +90,7 @@ def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
 
 
 def flat(made: Made, content: bytes) -> th.Tensor:
-    """The tensor of one dimension that a storage is.
-
-    Raises:
-        UnsafeFileError: if it is of another size than it says.
-    """
+    """The tensor of one dimension that a storage is."""
     _, kind, _, _, size, *_ = made.args
     dtype = _DTYPES[str(kind)]
     if size * dtype.itemsize != len(content):
@@ -116,7 +112,8 @@ def lone_storage(content: bytes, budget: Budget) -> th.Tensor:
 def _tensor(made: Made, build: Build) -> th.Tensor:
     """A view of a storage in which no two elements lie at the same place."""
     storage, offset, shape, strides, requires_grad = (build(arg) for arg in made.args[:5])
-    if made.state is not None or len(made.args) > 7 or not isinstance(storage, th.Tensor):
+    is_tensor = isinstance(storage, th.Tensor) and len(shape) <= MAX_DIMENSIONS
+    if made.state is not None or len(made.args) > 7 or not is_tensor:
         raise wrong(made)
     end = 1
     for stride, size in sorted(zip(strides, shape, strict=True)):
@@ -125,7 +122,8 @@ def _tensor(made: Made, build: Build) -> th.Tensor:
         end += stride * (size - 1)
     if min((offset, *shape, *strides)) < 0 or (0 not in shape and offset + end > len(storage)):
         raise UnsafeFileError("a tensor that is larger than its storage")
-    return storage.as_strided(shape, strides, offset).requires_grad_(bool(requires_grad))
+    tensor: th.Tensor = storage.as_strided(shape, strides, offset)
+    return tensor.requires_grad_(bool(requires_grad))
 
 
 def _parameter(made: Made, build: Build) -> th.nn.Parameter:
@@ -148,14 +146,7 @@ MAKERS: Mapping[str, Maker] = {
 
 
 def check_values(files: Mapping[str, Any]) -> None:
-    """Make sure that all tensors are finite numbers.
-
-    Args:
-        files: what files of tensors hold, by their names.
-
-    Raises:
-        UnsafeFileError: if one is not; it names the tensor.
-    """
+    """Make sure that all tensors are finite numbers."""
     for name, content in files.items():
         for path, tensor in tensors_in(content):
             where = f"{name}: {shown(path)[1:-1]}"

@@ -21,14 +21,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
 from agents.common.serialization import UnknownTypeError, decode, encode
-from safe_files.archives import read_members
+from safe_files.archives import MEMBERS, parse_settings, read_members
 from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
-from safe_files.model_members import MEMBERS, parse_settings
 from safe_files.models import hides
 from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import content_of
-from safe_files.sizes import charged_tensors
 from safe_files.tensors import check_values, load_tensors
+from safe_files.weights import charged_tensors
 
 FORMAT_VERSION = 1
 TENSORS = frozenset({"policy.pth"})

@@ -14,8 +14,8 @@ from agents.common.serialization import decode, encode
 from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import read_file
-from safe_files.sizes import charged_tensors
 from safe_files.tensors import check_values, load_tensors
+from safe_files.weights import charged_tensors
 
 
 class TablePolicy(BasePolicy):

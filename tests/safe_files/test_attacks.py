@@ -17,8 +17,8 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.utils import ConstantSchedule
 
 from safe_files import UnsafeFileError, inspect_model, load_model
-from safe_files.admission import read_pickle
-from safe_files.model_members import first_look
+from safe_files.archives import first_look
+from safe_files.objects import read_pickle
 from safe_files.vec_normalize import read_normalization
 
 UTILS = "stable_baselines3.common.utils"
