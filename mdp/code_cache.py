@@ -9,7 +9,13 @@ old code; nor does another processor, which Numba itself keeps apart.
 Not kept on disk is code that depends on sources outside of this project, such as a user's own
 update rule, and whatever is compiled in a process whose sources have changed since it began. Where
 no folder can be written, nothing is kept.
+
+Numba unpickles what it finds, which can run any code. So a folder serves only if no other user but
+root can put a file into it, or another folder in its place; and a file only if it is the user's.
 """
+
+# mypy: allow-untyped-calls
+# Numba's classes are not typed.
 
 from __future__ import annotations
 
@@ -19,13 +25,16 @@ import logging
 import os
 import platform
 import shutil
+import stat
+import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 
 from mdp.source_files import content_lines, digest_of, source_paths
 
@@ -84,19 +93,83 @@ def parents() -> Iterator[Path]:
 
 @cache
 def folder() -> Path | None:
-    """Where this process keeps machine code; None where no folder can be written."""
+    """Where this process keeps machine code; None where no folder is the user's, or writable."""
+    reason = "no folder for machine code can be written"
     for parent in parents():
-        chosen = parent / digest()
         try:
-            chosen.mkdir(parents=True, exist_ok=True)
+            chosen = own_folder(parent / digest())
             tempfile.TemporaryFile(dir=chosen, prefix="n" * LONGEST_NAME).close()
             os.utime(chosen)
+        except NotOwnError as error:
+            reason = f"no folder for machine code is safe: {error}"
+            continue
         except OSError:
             continue
-        remove_old(parent)
+        remove_old(chosen.parent)
         return chosen
-    logger.warning("no folder for machine code can be written: it is compiled anew in each process")
+    logger.warning("%s: it is compiled anew in each process", reason)
     return None
+
+
+class NotOwnError(OSError):
+    """Another user could have written what would be unpickled."""
+
+
+def own_folder(path: Path) -> Path:
+    """A folder, made where it is missing, whose files only the user and root can have written.
+
+    Returns:
+        The folder, without the links on the way to it.
+
+    Raises:
+        NotOwnError: if another user could write in it, or replace a folder on the way to it.
+        OSError: if it cannot be made.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.mkdir(mode=0o700, exist_ok=True)
+    path = path.resolve()
+    _check_owner(path, path.stat(), 0o077)
+    for parent in path.parents:
+        status = parent.stat()
+        # Of a folder such as /tmp, everybody can take away what is their own alone.
+        is_sticky = status.st_mode & stat.S_ISVTX
+        _check_owner(parent, status, 0 if is_sticky else 0o022, root_too=True)
+    return path
+
+
+def _check_owner(path: Path, status: os.stat_result, mask: int, root_too: bool = False) -> None:
+    """Refuse what belongs to another user, or that the users in the mask have a right to."""
+    if sys.platform == "win32":
+        return
+    owners = {os.geteuid(), 0} if root_too else {os.geteuid()}
+    if status.st_uid not in owners:
+        raise NotOwnError(f"{path} belongs to another user")
+    if status.st_mode & mask:
+        raise NotOwnError(f"{path} is open to other users, mode {stat.S_IMODE(status.st_mode):o}")
+
+
+class OwnFiles(IndexDataCacheFile):
+    """The files of Numba's cache of one function: unpickled only if they are the user's."""
+
+    def _load_index(self) -> Any:
+        self._check(Path(self._index_path))
+        return super()._load_index()
+
+    def _load_data(self, name: str) -> Any:
+        self._check(Path(self._data_path(name)))
+        return super()._load_data(name)
+
+    def _check(self, path: Path) -> None:
+        with contextlib.suppress(FileNotFoundError):
+            _check_owner(path, path.lstat(), 0o022)
+            # Its folder lies in ours, which nobody else enters.
+            _check_owner(path.parent, path.parent.lstat(), 0)
+
+    @contextlib.contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
+        with super()._open_for_write(filepath) as file:
+            Path(file.name).chmod(0o600)  # whatever the umask is
+            yield file
 
 
 def remove_old(parent: Path) -> None:
@@ -124,6 +197,15 @@ def numba_cache_dir(path: Path) -> Iterator[None]:
         config.CACHE_DIR = before
 
 
+class OwnCache(FunctionCache):
+    """Numba's cache of one function, in files that only the user can have written."""
+
+    def __init__(self, function: Callable[..., object]) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = OwnFiles(self._cache_path, self._impl.filename_base, stamp)
+
+
 class CheckedCache:
     """Numba's cache of one function, asked only where what it holds is sure to be right.
 
@@ -148,7 +230,7 @@ class CheckedCache:
             try:
                 found = self._cache.load_overload(signature, target_context)
             except Exception as error:  # noqa: BLE001  # a damaged file can fail in any way
-                logger.warning("the machine code of %s is damaged: %s", self._name, error)
+                logger.warning("the machine code of %s cannot be used: %s", self._name, error)
                 self._forget()
         if found is None:
             logger.info("compiling %s", self._name)

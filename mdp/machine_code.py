@@ -17,7 +17,7 @@ from typing import Any, TypeVar, cast
 import numba
 from numba.core import event
 
-from mdp.code_cache import PACKAGES, CheckedCache, folder, numba_cache_dir
+from mdp.code_cache import PACKAGES, CheckedCache, OwnCache, folder, numba_cache_dir
 from mdp.code_parts import Part, called_as_part
 from mdp.source_files import ROOT
 from mdp.work_time import WorkTime
@@ -126,11 +126,10 @@ def _decorated(function: Function, options: dict[str, Any]) -> Function:
     if is_interpreted():
         return function
     kept_in = folder() if _is_own(function) else None
-    if kept_in is None:
-        dispatcher = numba.njit(**options)(function)
-    else:
+    dispatcher = numba.njit(**options)(function)
+    if kept_in is not None:
         with numba_cache_dir(kept_in):
-            dispatcher = numba.njit(cache=True, **options)(function)
+            dispatcher._cache = OwnCache(function)
     dispatcher._cache = CheckedCache(dispatcher._cache, function.__qualname__)
     return cast(Function, dispatcher)
 

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from pipeline.errors import one_line
 from pipeline.file_digests import DamagedFileError
+from safe_files.limits import Budget
 
-MOST_UNPACKED = 1 << 30  # bytes, of an archive that is compressed
 MOST_ARRAYS = 1000
 _KINDS = "biuf"  # booleans, integers, floats
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -79,8 +79,8 @@ def _check_members(infos: list[zipfile.ZipInfo], n_bytes: int) -> None:
         raise ValueError("it holds what is no array")
     if not all(info.compress_type in _METHODS for info in infos):
         raise ValueError("it is compressed in a way that is not read here")
-    if sum(info.file_size for info in infos) > max(MOST_UNPACKED, n_bytes):
-        raise ValueError(f"it unpacks to more than {MOST_UNPACKED:,} bytes")
+    # The bytes, those without the header, and the array.
+    Budget(n_bytes).charge(3 * sum(info.file_size for info in infos))
 
 
 def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 
 from pipeline.errors import UserError, one_line
 from pipeline.json_text import plain
+from safe_files.limits import Budget
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import opened, read_file
 
@@ -142,7 +143,9 @@ def read_record(path: Path) -> dict[str, Any]:
         DamagedFileError: if it holds anything else than a run's record, or was changed.
     """
     try:
-        record = json.loads(read_file(path, LARGEST_RECORD))
+        content = read_file(path, LARGEST_RECORD)
+        Budget(len(content)).charge_json(content)
+        record = json.loads(content)
     except FileNotFoundError:
         raise
     except OSError as error:

@@ -1,19 +1,34 @@
-"""Zips held against their limits before anything of them is unpacked."""
+"""The zips of models, looked at before a library is imported: members, and settings as text.
+
+No more is unpacked than the budget of the file allows.
+"""
 
 from __future__ import annotations
 
 import io
+import json
+import re
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
 
-from safe_files.limits import MAX_ARCHIVE_BYTES, MAX_MEMBERS, MAX_TENSOR_RECORDS
+from safe_files.limits import MAX_INTEGER_BITS, MAX_MEMBERS, Budget
 from safe_files.refusals import UnsafeFileError, shown
 
-# The library stores members as they are. Whoever packs a zip anew may deflate them, and weights
-# become a little smaller; what becomes much smaller is a bomb, unless it is small.
-FREELY_UNPACKED = 64 << 20
-MOST_TIMES = 20
+SETTINGS = "data"
+_NETWORKS = "policy policy.optimizer actor.optimizer critic.optimizer ent_coef_optimizer"
+TENSORS = frozenset(f"{name}.pth" for name in f"{_NETWORKS} pytorch_variables tensors".split())
+MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
+
+# Algorithms of the user's may keep further files of tensors.
+_TENSORS = re.compile(r"\w[\w.]*\.pth", re.ASCII)
+
+# What begins each entry of a zip's list of members, and what Python makes of one.
+_ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
+# The library stores members as they are. Whoever packs a zip anew may deflate them.
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 # What the library raises at zips that are damaged, encrypted, or of a kind that it does not know.
 _DAMAGE = (
@@ -27,61 +42,90 @@ _DAMAGE = (
 )
 
 
-def read_members(content: bytes, expected: frozenset[str] | None = None) -> Mapping[str, bytes]:
+def read_members(
+    content: bytes, expected: frozenset[str] | None = None, budget: Budget | None = None
+) -> dict[str, bytes]:
     """The members of a zip, by their names.
 
     Args:
         content: the zip.
         expected: the names that members may have; None for any.
+        budget: pays for the members; None for that of such a file.
 
     Raises:
         UnsafeFileError: if it is no whole zip, unpacks to too much, or has other members.
     """
+    budget = budget or Budget(len(content))
+    with opened_zip(content, budget) as archive:
+        infos = archive.infolist()
+        names = [info.filename for info in infos]
+        strange = [] if expected is None else sorted(set(names) - expected)
+        if strange:
+            raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
+        if len(names) > MAX_MEMBERS:
+            raise UnsafeFileError(f"holds more than {MAX_MEMBERS} members")
+        budget.charge(sum(info.file_size for info in infos))
+        # A member that unpacks to more than it says fails its own check.
+        return {name: archive.read(name) for name in names}
+
+
+@contextmanager
+def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
+    """A zip in which no member stands twice."""
+    budget.charge(content.count(_ENTRY) * _BYTES_PER_ENTRY)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             infos = archive.infolist()
-            names = [info.filename for info in infos]
-            strange = [] if expected is None else sorted(set(names) - expected)
-            if strange:
-                raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
-            if len(names) != len(set(names)) or len(names) > MAX_MEMBERS:
+            if len({info.filename for info in infos}) != len(infos):
                 raise UnsafeFileError("holds a member twice")
-            _check_sizes(infos)
-            unpacked = sum(info.file_size for info in infos)
-            if unpacked > max(FREELY_UNPACKED, MOST_TIMES * len(content)):
-                raise UnsafeFileError(
-                    f"unpacks to {unpacked:,} bytes, out of proportion to its {len(content):,}"
-                )
-            # A member that unpacks to more than it says fails its own check.
-            return {name: archive.read(name) for name in names}
+            if any(info.compress_type not in _METHODS for info in infos):
+                raise UnsafeFileError("has a compression method that is not read here")
+            yield archive
     except UnsafeFileError:
         raise
     except _DAMAGE as error:
         raise UnsafeFileError(f"is no whole zip: {error}") from error
 
 
-def check_tensors(content: bytes) -> None:
-    """Hold a file of tensors against its limits: PyTorch would inflate whatever it holds.
+def first_look(content: bytes) -> dict[str, Any]:
+    """The settings in a zip, which is one of a model as far as can be said without the libraries.
 
-    Raises:
-        UnsafeFileError: if it unpacks to too much.
+    What is pickled in them stays text.
     """
+    budget = Budget(len(content))
+    members = read_members(content, budget=budget)
+    strange = sorted(name for name in members if not _may_stand(name))
+    if strange:
+        raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
+    tensors = [name for name in members if name.endswith(".pth")]
+    if SETTINGS not in members or not tensors:
+        raise UnsafeFileError("lacks parts that a model has")
+    for name in tensors:
+        with opened_zip(members[name], budget):
+            pass
+    return parse_settings(members, budget)
+
+
+def _may_stand(name: str) -> bool:
+    return name in MEMBERS or _TENSORS.fullmatch(name) is not None
+
+
+def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
+    """The settings of a model as JSON."""
+    if SETTINGS not in members:
+        raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
+    text = members[SETTINGS]
+    budget.charge_json(text)
     try:
-        if not zipfile.is_zipfile(io.BytesIO(content)):
-            return
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            infos = archive.infolist()
-    except _DAMAGE as error:
-        raise UnsafeFileError(f"holds tensors that are no whole zip: {error}") from error
-    if len(infos) > MAX_TENSOR_RECORDS:
-        raise UnsafeFileError(f"holds more than {MAX_TENSOR_RECORDS:,} tensors")
-    # PyTorch stores its records as they are; one that was deflated is a bomb.
-    if any(info.compress_type != zipfile.ZIP_STORED for info in infos):
-        raise UnsafeFileError("holds compressed tensors, which PyTorch does not write")
-    _check_sizes(infos)
+        data = json.loads(text.decode(), parse_int=_integer)
+    except (ValueError, RecursionError) as error:
+        raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
+    if not isinstance(data, dict):
+        raise UnsafeFileError("has settings that do not map names to values")
+    return data
 
 
-def _check_sizes(infos: list[zipfile.ZipInfo]) -> None:
-    size = sum(info.file_size for info in infos)
-    if size > MAX_ARCHIVE_BYTES:
-        raise UnsafeFileError(f"unpacks to {size:,} bytes, more than {MAX_ARCHIVE_BYTES:,}")
+def _integer(digits: str) -> int:
+    if len(digits) > MAX_INTEGER_BITS:
+        raise UnsafeFileError("holds an absurdly large number")
+    return int(digits)

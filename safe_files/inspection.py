@@ -7,13 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from safe_files.admission import read_pickle
-from safe_files.archives import read_members
-from safe_files.library_classes import all_policy_classes
-from safe_files.limits import MAX_ARCHIVE_BYTES
-from safe_files.model_members import MEMBERS, TENSORS, parse_settings
+from safe_files.archives import MEMBERS, TENSORS, parse_settings, read_members
+from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
 from safe_files.models import NOT_READ, SERIALIZED, decoded
-from safe_files.pickle_trees import Grouped, Made, Mapped, Name, read_tree
+from safe_files.objects import all_policy_classes, read_pickle
+from safe_files.pickle_trees import Name, parts_of, read_tree
 from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import read_file
@@ -48,16 +46,18 @@ def inspect_model(path: Path | str, makers: Mapping[str, Maker] | None = None) -
         UnsafeFileError: if it is no zip of a model at all.
         OSError: if it cannot be read.
     """
-    members = read_members(read_file(Path(path), MAX_ARCHIVE_BYTES), MEMBERS)
+    content = read_file(Path(path), MAX_ARCHIVE_BYTES)
+    budget = Budget(len(content))
+    members = read_members(content, MEMBERS, budget)
     settings: dict[str, str] = {}
     suspicious: list[str] = []
-    for key, value in parse_settings(members).items():
-        settings[shown(key).strip("'")], doubts = _setting(key, value, makers)
+    for key, value in parse_settings(members, budget).items():
+        settings[shown(key).strip("'")], doubts = _setting(key, value, makers, budget)
         suspicious += doubts
     weights: dict[str, tuple[int, ...]] = {}
     for name in sorted(TENSORS & set(members)):
         try:
-            tensors = load_tensors(members[name])
+            tensors = load_tensors(members[name], budget)
             check_values({name: tensors})
         except UnsafeFileError as error:
             suspicious.append(f"{name} {error}")
@@ -68,7 +68,9 @@ def inspect_model(path: Path | str, makers: Mapping[str, Maker] | None = None) -
     return Report(sizes, weights, settings, tuple(suspicious))
 
 
-def _setting(key: str, value: Any, makers: Mapping[str, Maker] | None) -> tuple[str, list[str]]:
+def _setting(
+    key: str, value: Any, makers: Mapping[str, Maker] | None, budget: Budget
+) -> tuple[str, list[str]]:
     """An attribute in one line, and what is suspicious about it."""
     is_odd = key in NOT_READ - {"tensorboard_log"} and value
     name = shown(key).strip("'")
@@ -77,12 +79,12 @@ def _setting(key: str, value: Any, makers: Mapping[str, Maker] | None) -> tuple[
         return shown(value), doubts
     try:
         pickled = decoded(key, value[SERIALIZED])
-        names = sorted({shown(str(one)).strip("'") for one in names_in(read_tree(pickled))})
+        names = sorted({shown(str(one)).strip("'") for one in names_in(read_tree(pickled, budget))})
         text = "a pickle of " + (", ".join(names) if names else "plain data")
     except UnsafeFileError as error:
         return "a pickle that cannot be read", [*doubts, f"{name} {error}"]
     try:
-        read_pickle(pickled, all_policy_classes(), makers)
+        read_pickle(pickled, all_policy_classes(), makers, budget)
     except UnsafeFileError as error:
         doubts.append(f"{name} {error}")
     return text, doubts
@@ -96,14 +98,6 @@ def names_in(tree: Any) -> Iterator[Name]:
         if id(part) in seen:
             continue
         seen.add(id(part))
-        match part:
-            case Name():
-                yield part
-            case Made():
-                pending += [part.maker, part.args, part.state, part.items, part.pairs]
-            case Mapped():
-                pending.append(part.pairs)
-            case Grouped():
-                pending.append(part.items)
-            case list() | tuple():
-                pending.extend(part)
+        if isinstance(part, Name):
+            yield part
+        pending.extend(parts_of(part))

@@ -146,7 +146,7 @@ def _enclosed(made: Made) -> tuple[str, str, dict[str, Any]]:
     """Module and name of a function, and the values that it encloses, by their names there."""
     try:
         _, slots = made.state
-        attributes = dict(slots.pairs)
+        attributes = dict(slots)
         # The names end the arguments of the code object, but for those of its own cells.
         names = made.args[0].args[-2]
         cells = attributes["__closure__"]

@@ -15,20 +15,20 @@ from typing import Any, TypeVar
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from safe_files.admission import read_pickle
-from safe_files.archives import read_members
-from safe_files.library_classes import policy_classes
-from safe_files.limits import MAX_ARCHIVE_BYTES
-from safe_files.model_members import MEMBERS, SETTINGS, TENSORS, parse_settings
+from safe_files.archives import MEMBERS, SETTINGS, TENSORS, parse_settings, read_members
+from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
+from safe_files.objects import policy_classes, read_pickle
 from safe_files.rebuilding import Maker
 from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import Source, content_of
-from safe_files.sizes import check_sizes
 from safe_files.tensors import check_values, first_line, load_tensors
-from safe_files.weights import check_fit, check_variable
+from safe_files.weights import charged_tensors, check_fit, check_sizes, check_variable
 
 # What is trained and part of no network: the entropy coefficient of SAC and its kin.
 VARIABLES = frozenset({"log_ent_coef", "ent_coef_tensor"})
+
+# The files of those; the second is the name that the first once had.
+_VARIABLES = frozenset({"pytorch_variables.pth", "tensors.pth"})
 
 # What the reader's own side decides.
 NOT_READ = frozenset(
@@ -47,15 +47,10 @@ Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 @dataclass(frozen=True)
 class Settings:
-    """A model's attributes.
+    """A model's attributes."""
 
-    Attributes:
-        plain: those that are plain data.
-        pickled: those that the library pickles, as pickles.
-    """
-
-    plain: Mapping[str, Any]
-    pickled: Mapping[str, bytes]
+    plain: Mapping[str, Any]  # those that are plain data
+    pickled: Mapping[str, bytes]  # those that the library pickles, as pickles
 
     def __contains__(self, name: str) -> bool:
         return name in self.plain or name in self.pickled
@@ -92,20 +87,30 @@ def load_model(
         ValueError: if the model does not fit ``env``, as the library says it.
     """
     files, variables = _tensors_of(algorithm)
-    members = read_members(content_of(path, MAX_ARCHIVE_BYTES), MEMBERS | files)
-    settings = read_settings(members, algorithm)
+    content = content_of(path, MAX_ARCHIVE_BYTES)
+    budget = Budget(len(content))
+    members = read_members(content, MEMBERS | files, budget)
+    settings = read_settings(members, algorithm, budget)
     known = {**policy_classes(algorithm), **(classes or {})}
     given = {name: value for name, value in (custom_objects or {}).items() if name in settings}
-    objects = {**_objects(settings, known, makers, {**replaced, **given}), **given}
+    objects = {**_objects(settings, known, makers, {**replaced, **given}, budget), **given}
     if not isinstance(objects.get("policy_class"), type):
         raise UnsafeFileError("does not say its policy's class", "policy_class")
-    tensors = {name: load_tensors(members[name]) for name in sorted(files & set(members))}
+    names = sorted(files & set(members))
+    tensors = {name: load_tensors(members.pop(name), budget) for name in names}
     check_values(tensors)
     _check_variables(tensors, variables)
-    check_sizes({**settings.plain, **objects, **replaced}, tensors)
-    checked = _zipped({**members, SETTINGS: _data(settings, objects)})
+    check_sizes({**settings.plain, **objects, **replaced}, budget)
     try:
-        model = algorithm.load(checked, env=env, device=device, custom_objects=objects, **replaced)
+        with charged_tensors(budget):
+            model = _with_tensors(algorithm, tensors).load(
+                _zipped(_data(settings, objects), tensors),
+                env=env,
+                device=device,
+                custom_objects=objects,
+                **replaced,
+            )
+        model.__class__ = algorithm
         check_fit(model, tensors)
     except ValueError:
         raise  # it does not fit the environment
@@ -114,13 +119,24 @@ def load_model(
     return model
 
 
-def read_settings(members: Mapping[str, bytes], algorithm: type[BaseAlgorithm]) -> Settings:
-    """The attributes in a zip, those left out that a reader decides.
+def _with_tensors(algorithm: type[Algorithm], tensors: Mapping[str, Any]) -> type[Algorithm]:
+    """The algorithm, which fills in the parameters of which it finds the names in a zip."""
 
-    Raises:
-        UnsafeFileError: if they are no attributes of such a model.
-    """
-    data = parse_settings(members)
+    def set_parameters(
+        self: BaseAlgorithm, found: Any, exact_match: bool = True, device: Any = "auto"
+    ) -> None:
+        for name, held in found.items():
+            held.update(held or tensors[f"{name}.pth"])
+        algorithm.set_parameters(self, found, exact_match, device)
+
+    return type(algorithm.__name__, (algorithm,), {"set_parameters": set_parameters})
+
+
+def read_settings(
+    members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
+) -> Settings:
+    """The attributes in a zip, those left out that a reader decides; the budget pays for them."""
+    data = parse_settings(members, budget)
     plain: dict[str, Any] = {}
     pickled: dict[str, bytes] = {}
     for key, value in data.items():
@@ -154,11 +170,7 @@ def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozens
 
 
 def decoded(key: str, text: Any) -> bytes:
-    """The pickle that stands in JSON as base64.
-
-    Raises:
-        UnsafeFileError: if it is none.
-    """
+    """The pickle that stands in JSON as base64."""
     try:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, TypeError, ValueError) as error:
@@ -170,6 +182,7 @@ def _objects(
     classes: Mapping[str, type],
     makers: Mapping[str, Maker] | None,
     replaced: Mapping[str, Any],
+    budget: Budget,
 ) -> dict[str, Any]:
     """What the pickled attributes stand for."""
     objects: dict[str, Any] = {}
@@ -177,7 +190,7 @@ def _objects(
         if key in replaced:
             continue
         try:
-            objects[key] = read_pickle(pickled, classes, makers)
+            objects[key] = read_pickle(pickled, classes, makers, budget)
         except UnsafeFileError as error:
             raise UnsafeFileError(f"{key} {error}", key) from error
     return objects
@@ -185,7 +198,7 @@ def _objects(
 
 def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
     """The library sets each of these by the way to it: let there be no other than it writes."""
-    for name in ("pytorch_variables.pth", "tensors.pth"):
+    for name in sorted(_VARIABLES):
         variables = tensors.get(name, {})
         if not isinstance(variables, dict):
             raise UnsafeFileError(f"holds {name} that is not as the library writes it")
@@ -201,10 +214,13 @@ def _data(settings: Settings, objects: Mapping[str, Any]) -> bytes:
     return json.dumps({**settings.plain, **dict.fromkeys(objects)}).encode()
 
 
-def _zipped(members: Mapping[str, bytes]) -> io.BytesIO:
+def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
+    """A zip of what was checked, written anew; of the parameters, it has the names alone."""
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w") as archive:
-        for name, member in members.items():
-            archive.writestr(name, member)
+        archive.writestr(SETTINGS, data)
+        for name, held in tensors.items():
+            with archive.open(name, "w") as member:
+                th.save(held if name in _VARIABLES else {}, member)
     content.seek(0)
     return content

@@ -6,98 +6,95 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from safe_files.limits import MAX_DEPTH, MAX_VALUES
-from safe_files.pickle_trees import Grouped, Made, Mapped, Name, Tree
+from safe_files.limits import MAX_DEPTH, Budget
+from safe_files.pickle_trees import PLAIN, Made, Name, Tree, parts_of
 from safe_files.refusals import UnsafeFileError, shown
 
 Build = Callable[[Tree], Any]
 Maker = Callable[[Made, Build], Any]
 
-# What dictionaries may be keyed by: the hash of a nested tuple can take for ever.
-KEYS = (str, int, float, bytes, type(None))
+# What a value takes, with its place in what holds it; texts and bytes take their length besides.
+_BYTES_PER_VALUE = 64
+# Makers of spaces make several arrays of each that they are given; others a copy.
+_SPACES, _COPIES_OF_A_SPACE = "gymnasium.spaces.", 4
 _REFUSED = "which may not stand in such a file"
 
 
 @dataclass(frozen=True)
 class Admitted:
-    """What a file may hold beside plain data.
+    """What a file may hold beside plain data, by the full names of classes and functions."""
 
-    Attributes:
-        makers: by the full name of a class or function, what makes the object from what the file
-            says, and refuses what does not fit.
-        classes: by their full names, classes that a file may name.
-    """
-
-    makers: Mapping[str, Maker]
-    classes: Mapping[str, type]
+    makers: Mapping[str, Maker]  # what makes an object, and refuses what does not fit
+    classes: Mapping[str, type]  # those that a file may name
 
 
-def rebuild(tree: Tree, admitted: Admitted) -> Any:
-    """Make what a tree stands for.
-
-    Args:
-        tree: as `safe_files.pickle_trees.read_tree` returns it.
-        admitted: what it may hold beside plain data.
-
-    Raises:
-        UnsafeFileError: if it holds anything else, refers to itself, or is too deep or too large.
-    """
-    return _Rebuilding(admitted).build(tree)
+def rebuild(tree: Tree, admitted: Admitted, budget: Budget) -> Any:
+    """Make what a tree stands for."""
+    rebuilding = _Rebuilding(admitted, budget)
+    try:
+        size, _ = rebuilding.measure(tree)
+    except RecursionError:
+        raise UnsafeFileError(f"is nested more than {MAX_DEPTH} deep") from None
+    if not isinstance(tree, Made):
+        # Whoever writes it out, or compares it, meets what is shared at each of its places.
+        budget.charge(size)
+    return rebuilding.build(tree)
 
 
 class _Rebuilding:
     """What has been made so far; that which is shared in the tree is made once."""
 
-    def __init__(self, admitted: Admitted) -> None:
+    def __init__(self, admitted: Admitted, budget: Budget) -> None:
         self.admitted = admitted
-        self.n_values = 0
-        self.depth = 0
-        self.made: dict[int, tuple[Any, int]] = {}
+        self.budget = budget
+        self.measures: dict[int, tuple[int, int]] = {}
+        self.made: dict[int, Any] = {}
         self.under_way: set[int] = set()
+
+    def measure(self, tree: Tree) -> tuple[int, int]:
+        """Bytes of a part, what is shared counted at each of its places; and how deep it is."""
+        if isinstance(tree, PLAIN):
+            return _BYTES_PER_VALUE + (len(tree) if isinstance(tree, str | bytes) else 0), 0
+        key = id(tree)
+        if key not in self.measures:
+            # What refers to itself is refused where it is built.
+            self.measures[key] = 0, 0
+            found = [self.measure(part) for part in parts_of(tree)]
+            depth = 1 + max((depth for _, depth in found), default=0)
+            if depth > MAX_DEPTH:
+                raise UnsafeFileError(f"is nested more than {MAX_DEPTH} deep")
+            self.measures[key] = _BYTES_PER_VALUE + sum(size for size, _ in found), depth
+        return self.measures[key]
 
     def build(self, tree: Tree) -> Any:
         """Make one part of the tree."""
-        if tree is None or isinstance(tree, bool | int | float | str | bytes):
-            self._count(1)
+        if isinstance(tree, PLAIN):
             return tree
         key = id(tree)
-        if key in self.made:
-            value, n_values = self.made[key]
-            self._count(n_values)
-            return value
         if key in self.under_way:
             raise UnsafeFileError("refers to itself")
-        before = self.n_values
-        self._count(1)
-        self.under_way.add(key)
-        self.depth += 1
-        if self.depth > MAX_DEPTH:
-            raise UnsafeFileError(f"is nested more than {MAX_DEPTH} deep")
-        value = self._make(tree)
-        self.depth -= 1
-        self.under_way.remove(key)
-        self.made[key] = value, self.n_values - before
-        return value
-
-    def _count(self, n_values: int) -> None:
-        self.n_values += n_values
-        if self.n_values > MAX_VALUES:
-            raise UnsafeFileError(f"holds more than {MAX_VALUES:,} values")
+        if key not in self.made:
+            self.under_way.add(key)
+            self.made[key] = self._make(tree)
+            self.under_way.remove(key)
+        return self.made[key]
 
     def _make(self, tree: Tree) -> Any:
         match tree:
-            case list() | tuple():
+            case list() | tuple() | set():
+                self.budget.charge(_BYTES_PER_VALUE + 8 * len(tree))
                 return type(tree)(self.build(item) for item in tree)
-            case Mapped():
-                return {self._key(key): self.build(value) for key, value in tree.pairs}
-            case Grouped():
-                return {self._key(item) for item in tree.items}
+            case dict():
+                self.budget.charge(_BYTES_PER_VALUE * (1 + len(tree)))
+                return {self.build(key): self.build(value) for key, value in tree.items()}
             case Name():
                 return self._named(tree)
             case Made():
                 maker = self.admitted.makers.get(canonical(tree.maker))
                 if maker is None:
                     raise UnsafeFileError(f"holds {_what(tree.maker)}, {_REFUSED}")
+                n_copies = _COPIES_OF_A_SPACE if str(tree.maker).startswith(_SPACES) else 1
+                self.budget.charge(n_copies * self.measures[id(tree)][0])
                 try:
                     return maker(tree, self.build)
                 except UnsafeFileError:
@@ -105,12 +102,6 @@ class _Rebuilding:
                 except Exception as error:  # the libraries' constructors can fail in any way
                     raise wrong(tree) from error
         raise UnsafeFileError("holds what is no data")
-
-    def _key(self, tree: Tree) -> Any:
-        key = self.build(tree)
-        if type(key) not in KEYS:
-            raise UnsafeFileError(f"uses a {type(key).__name__} as the key of a dictionary")
-        return key
 
     def _named(self, name: Name) -> type:
         found = self.admitted.classes.get(canonical(name))
@@ -135,11 +126,7 @@ def _what(name: Name | Made) -> str:
 
 
 def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tuple[Any, ...]:
-    """The arguments of a call, which must be of these kinds, and nothing besides them.
-
-    Raises:
-        UnsafeFileError: if they are others, or the object is given more than arguments.
-    """
+    """The arguments of a call, which must be of these kinds, and nothing besides them."""
     values = tuple(build(arg) for arg in made.args)
     fits = len(values) == len(kinds) and all(map(isinstance, values, kinds))
     if not fits or made.state is not None or made.items or made.pairs:
@@ -148,11 +135,7 @@ def arguments(made: Made, build: Build, *kinds: type | tuple[type, ...]) -> tupl
 
 
 def fields(made: Made, build: Build) -> dict[str, Any]:
-    """The attributes that an object is given.
-
-    Raises:
-        UnsafeFileError: if it is given anything else, or attributes that are not names.
-    """
+    """The attributes that an object is given."""
     state = {} if made.state is None else build(made.state)
     fits = isinstance(state, dict) and all(isinstance(key, str) for key in state)
     if not fits or made.args or made.items or made.pairs:
@@ -161,13 +144,8 @@ def fields(made: Made, build: Build) -> dict[str, Any]:
 
 
 def chosen_fields(made: Made, build: Build, names: Iterable[str]) -> dict[str, Any]:
-    """Those of an object's attributes that are asked for; the others are not looked at.
-
-    Raises:
-        UnsafeFileError: if the object has no attributes, or one of these is missing.
-    """
-    pairs = made.state.pairs if isinstance(made.state, Mapped) else []
-    trees = {key: value for key, value in pairs if isinstance(key, str)}
+    """Those of an object's attributes that are asked for; the others are not looked at."""
+    trees = made.state if isinstance(made.state, dict) else {}
     if not trees.keys() >= set(names):
         raise wrong(made)
     return {name: build(trees[name]) for name in names}

@@ -14,9 +14,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
-from safe_files.admission import read_pickle
-from safe_files.library_classes import full_name
 from safe_files.limits import MAX_BUFFER_BYTES, MAX_ROWS
+from safe_files.objects import full_name, read_pickle
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, fields, wrong
 from safe_files.refusals import UnsafeFileError

@@ -10,8 +10,8 @@ from gymnasium import spaces
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
-from safe_files.admission import read_pickle
 from safe_files.limits import MAX_STATISTICS_BYTES
+from safe_files.objects import read_pickle
 from safe_files.pickle_trees import Made
 from safe_files.rebuilding import Build, chosen_fields, wrong
 from safe_files.refusals import UnsafeFileError
@@ -25,18 +25,11 @@ _REST = ("observation_space", "obs_rms", "ret_rms")
 
 @dataclass(frozen=True)
 class Normalization:
-    """What a file says of a `VecNormalize`.
+    """What a file says of a `VecNormalize`."""
 
-    Attributes:
-        settings: its constructor's arguments.
-        observation_space: the space that it normalises.
-        obs_rms: statistics of the observations; a dictionary of them where these are dictionaries,
-            None where observations are left as they are.
-        ret_rms: statistics of the returns.
-    """
-
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # its constructor's arguments
     observation_space: spaces.Space[Any]
+    # A dictionary where observations are dictionaries, None where they are left as they are.
     obs_rms: RunningMeanStd | dict[str, RunningMeanStd] | None
     ret_rms: RunningMeanStd
 
@@ -62,11 +55,7 @@ def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
 
 
 def read_normalization(pickled: bytes) -> Normalization:
-    """The statistics in a pickled `VecNormalize`.
-
-    Raises:
-        UnsafeFileError: if it is none.
-    """
+    """The statistics in a pickled `VecNormalize`."""
     found = read_pickle(pickled, makers={_CLASS: _normalization})
     if not isinstance(found, Normalization):
         raise UnsafeFileError("holds no statistics of VecNormalize")

@@ -21,13 +21,13 @@ from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces, get_system_info
 
 from agents.common.serialization import UnknownTypeError, decode, encode
-from safe_files.archives import read_members
-from safe_files.limits import MAX_ARCHIVE_BYTES
-from safe_files.model_members import MEMBERS, parse_settings
+from safe_files.archives import MEMBERS, parse_settings, read_members
+from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
 from safe_files.models import hides
 from safe_files.refusals import UnsafeFileError, shown
 from safe_files.regular_files import content_of
 from safe_files.tensors import check_values, load_tensors
+from safe_files.weights import charged_tensors
 
 FORMAT_VERSION = 1
 TENSORS = frozenset({"policy.pth"})
@@ -107,12 +107,14 @@ class JsonAlgorithm(BaseAlgorithm):
             ValueError: if the zip is of another agent, or damaged, or does not fit ``env``; or if
                 ``custom_objects`` is no dictionary.
         """
-        members = read_members(_content(path), MEMBERS)
+        content = _content(path)
+        budget = Budget(len(content))
+        members = read_members(content, MEMBERS, budget)
         if print_system_info:
             text = members.get("system_info.txt", b"").decode("ascii", "replace")
             # Nothing that a terminal obeys.
             sys.stdout.writelines(f"{shown(line)[1:-1]}\n" for line in text.splitlines())
-        data = {**cls._read_data(members, path, custom_objects), **kwargs}
+        data = {**cls._read_data(members, budget, path, custom_objects), **kwargs}
         if env is not None:
             env = cls._wrap_env(env, data["verbose"])
             check_for_correct_spaces(env, data["observation_space"], data["action_space"])
@@ -126,12 +128,13 @@ class JsonAlgorithm(BaseAlgorithm):
         _check_n_envs(data.get("n_envs"))
         # Without a seed, setting up leaves alone what was saved with its state.
         model.__dict__.update({**data, "seed": None})
-        model._setup_model()
+        with charged_tensors(budget):
+            model._setup_model()
         model.__dict__.update(data)
         if "seed" in kwargs:
             model.set_random_seed(kwargs["seed"])
         parameters = {
-            name.removesuffix(".pth"): load_tensors(members[name])
+            name.removesuffix(".pth"): load_tensors(members[name], budget)
             for name in sorted(TENSORS & set(members))
         }
         _check_tables(parameters, model.get_parameters())
@@ -140,13 +143,17 @@ class JsonAlgorithm(BaseAlgorithm):
 
     @classmethod
     def _read_data(
-        cls, members: Mapping[str, bytes], path: Any, replaced: dict[str, Any] | None
+        cls,
+        members: Mapping[str, bytes],
+        budget: Budget,
+        path: Any,
+        replaced: dict[str, Any] | None,
     ) -> dict[str, Any]:
         """The decoded attributes of a zip of this very class, but for those that are replaced."""
         if not (replaced is None or isinstance(replaced, dict)):
             raise ValueError("custom_objects must be a dictionary or None")
         known = replaced or {}
-        raw = parse_settings(members)
+        raw = parse_settings(members, budget)
         if raw.pop("algorithm", None) != cls.__name__:
             raise ValueError(f"{_named(path)} does not hold a {cls.__name__} agent")
         if raw.pop("format", None) != FORMAT_VERSION:

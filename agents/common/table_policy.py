@@ -11,10 +11,11 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from agents.common.serialization import decode, encode
-from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import read_file
 from safe_files.tensors import check_values, load_tensors
+from safe_files.weights import charged_tensors
 
 
 class TablePolicy(BasePolicy):
@@ -57,13 +58,17 @@ class TablePolicy(BasePolicy):
         Raises:
             ValueError: if the file holds anything else.
         """
-        saved = load_tensors(read_file(Path(path), MAX_ARCHIVE_BYTES))
+        content = read_file(Path(path), MAX_ARCHIVE_BYTES)
+        budget = Budget(len(content))
+        saved = load_tensors(content, budget)
         if not (isinstance(saved, dict) and isinstance(saved.get("data"), str)):
             raise UnsafeFileError(f"{path} holds no policy of this kind")
         check_values({"the policy": saved.get("state_dict")})
+        budget.charge_json(saved["data"].encode())
         try:
             data = {name: decode(value) for name, value in json.loads(saved["data"]).items()}
-            policy = cls._remade(data)
+            with charged_tensors(budget):
+                policy = cls._remade(data)
             policy.load_state_dict(saved["state_dict"])
         except (TypeError, LookupError, AttributeError, RuntimeError, AssertionError) as error:
             raise UnsafeFileError(f"{path} holds no {cls.__name__}: {error}") from error

@@ -154,7 +154,7 @@ def load_to_play(
 ) -> BaseAlgorithm:
     """As `load_model`, for an agent that is not to learn any more.
 
-    What only learning needs is left out: a replay buffer, action noise, and schedules, which zips
+    What only learning needs is left out: buffers, action noise, and schedules, which zips
     of older versions hold as functions. Observations may have other bounds.
 
     Raises:
@@ -178,6 +178,7 @@ def load_to_play(
         "learning_rate": 0.0,
         **dict.fromkeys(("lr_schedule", "clip_range", "clip_range_vf"), unused),
         "action_noise": None,
+        "n_steps": 1,
     }
     if saved is not None:
         replaced["observation_space"] = env.observation_space

@@ -2,9 +2,11 @@
 
 import io
 import os
+import pickle
 import shutil
 import subprocess
 import sys
+import tempfile
 import textwrap
 import time
 from pathlib import Path
@@ -267,3 +269,127 @@ def test_old_machine_code_goes_away(tmp_path, monkeypatch):
     assert left >= {own.name, "old0", "old1"}
     assert len(left) <= 2 + code_cache.KEPT_BESIDE
     assert "old5" not in left
+
+
+# --- machine code that another user may have written ---------------------------------------------
+
+NOBODY = 65534
+
+
+def changed(path, mode=0o700, owner=0):
+    """A new folder of this mode and owner."""
+    path.mkdir()
+    os.chown(path, owner, owner)
+    path.chmod(mode)
+    return path
+
+
+def linked(path, target):
+    path.symlink_to(target)
+    return path
+
+
+# What makes the folder, and why it is refused; None where it serves.
+FOLDERS = {
+    "not there yet": (lambda at: at / "yardstick", None),
+    "the user's own": (lambda at: changed(at / "cache"), None),
+    "a link to one's own": (lambda at: linked(at / "link", changed(at / "cache")), None),
+    "in a sticky folder of all": (lambda at: changed(at / "tmp", 0o1777) / "cache", None),
+    "in a folder that others read": (lambda at: changed(at / "open", 0o755) / "cache", None),
+    "of another": (lambda at: changed(at / "cache", owner=NOBODY), "belongs to another"),
+    "writable by all": (lambda at: changed(at / "cache", 0o777), "mode 777"),
+    "writable by all, sticky": (lambda at: changed(at / "cache", 0o1777), "mode 1777"),
+    "writable by the group": (lambda at: changed(at / "cache", 0o770), "mode 770"),
+    "readable by others": (lambda at: changed(at / "cache", 0o755), "mode 755"),
+    "in a folder of all": (lambda at: changed(at / "tmp", 0o777) / "cache", "mode 777"),
+    "in a folder of the group": (lambda at: changed(at / "tmp", 0o775) / "cache", "mode 775"),
+    "in a folder of another": (
+        lambda at: changed(at / "home", 0o755, NOBODY) / "cache",
+        "belongs to another",
+    ),
+    "far below a folder of all": (
+        lambda at: changed(changed(at / "tmp", 0o777) / "in", 0o700) / "cache",
+        "mode 777",
+    ),
+    "a link to another's": (
+        lambda at: linked(at / "link", changed(at / "cache", owner=NOBODY)),
+        "belongs to another",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FOLDERS)
+def test_machine_code_lies_where_only_the_user_writes(case, tmp_path):
+    make, reason = FOLDERS[case]
+    path = make(tmp_path)
+    if reason is None:
+        folder = code_cache.own_folder(path)
+        assert folder == path.resolve()
+        assert folder.stat().st_mode & 0o077 == 0
+    else:
+        with pytest.raises(code_cache.NotOwnError, match=reason):
+            code_cache.own_folder(path)
+
+
+def test_a_folder_of_root_is_not_a_users():
+    place = Path(tempfile.mkdtemp())
+    place.chmod(0o755)
+    root, users = changed(place / "root", 0o777), changed(place / "user", owner=NOBODY)
+    os.seteuid(NOBODY)
+    try:
+        with pytest.raises(code_cache.NotOwnError, match="root belongs to another user"):
+            code_cache.own_folder(root)
+        assert code_cache.own_folder(users / "cache") == users / "cache"
+    finally:
+        os.seteuid(0)
+        shutil.rmtree(place)
+
+
+class Payload:
+    """Makes a folder where it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = str(mark)
+
+    def __reduce__(self):
+        return os.mkdir, (self.mark,)
+
+
+def plant(folder, payload, change):
+    """Exchange all that Numba would unpickle, and do something to each such file."""
+    for path in folder.rglob("*.nb[ic]"):
+        path.write_bytes(payload)
+        change(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [lambda path: os.chown(path, NOBODY, NOBODY), lambda path: path.chmod(0o666)],
+    ids=["of another", "writable by all"],
+)
+def test_a_file_of_anyones_in_ones_own_folder_is_not_unpickled(checkout, tmp_path, change):
+    assert outcome(checkout)[2] is not None
+    plant(checkout / "mdp", pickle.dumps(Payload(tmp_path / "mark")), change)
+    said = f"{SMALL}print(sum('cannot be used' in name for name in names))"
+    assert run(checkout, said).stdout.split()[:3] == ["13", "compiled", "1"]
+    assert not (tmp_path / "mark").exists()
+    # They were replaced by files that serve.
+    assert outcome(checkout) == (13, "compiled", False)
+
+
+def test_a_folder_of_anyones_is_passed_over_in_one_line(checkout, tmp_path):
+    root, cache = tmp_path / "open", tmp_path / "home"
+    shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
+    assert outcome(root) == (13, "compiled", True)
+    folder = root / "mdp" / "__pycache__" / "machine_code"
+    plant(folder, pickle.dumps(Payload(tmp_path / "mark")), lambda path: None)
+    folder.chmod(0o777)
+    cache.write_text("")
+    closed = {"HOME": str(cache), "XDG_CACHE_HOME": ""}
+    done = run(root, SMALL.replace(NOTE, "names = ['compiling run_small']\n"), **closed)
+    assert done.stdout.split() == ["13", "compiled", "1"]
+    assert done.stderr.strip() == (
+        f"no folder for machine code is safe: {folder} is open to other users, mode 777: it is "
+        "compiled anew in each process"
+    )
+    assert not (tmp_path / "mark").exists()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from safe_files.admission import read_pickle
+from safe_files.objects import read_pickle
 from safe_files.pickle_trees import Made, Name, read_tree
 from safe_files.refusals import UnsafeFileError
 
