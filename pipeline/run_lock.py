@@ -12,6 +12,7 @@ from pipeline.errors import UserError
 from pipeline.folder_lock import folder_lock
 from pipeline.liveness import is_alive
 from pipeline.run_folder import PROCESS, RUNNING, Run
+from safe_files.regular_files import take_up
 
 
 @contextmanager
@@ -24,7 +25,9 @@ def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
 
     Raises:
         UserError: if another process is at work on it.
+        UnsafeFileError: if anything but files and folders lies in it.
     """
+    take_up(run.path)
 
     def stop() -> None:
         say(f"{run.path}: another process has taken this one for dead; this one stops")

@@ -100,8 +100,8 @@ def film_of(planned: PlannedRun) -> Path | None:
         kept = min(len(frames), max(len(frames) * MAX_BYTES // len(film), 1))
         if kept < len(frames):
             film = as_gif(frames[:kept])
-        with replacing(path) as draft:
-            draft.write_bytes(film)
+        with replacing(path) as file:
+            file.write(film)
         write_json(path.with_suffix(".json"), {**episode, "frames": kept})
     return path
 
