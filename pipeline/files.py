@@ -76,7 +76,7 @@ def put_in_place(draft: Path, path: Path, folder: int | None = None) -> None:
     """
     for pause in _PAUSES if sys.platform == "win32" else ():
         try:
-            draft.replace(path)
+            os.replace(draft, path, src_dir_fd=folder, dst_dir_fd=folder)
         except PermissionError:
             time.sleep(pause)
         else:

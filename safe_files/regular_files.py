@@ -78,6 +78,8 @@ def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
     held = _held_above(whole)
     if not _HAS_STEPS:
         _check_steps(Path(whole).parent, held)
+        if not path.parent.is_dir():
+            raise OSError(errno.ENOENT, "its folder is gone", str(path))
         yield path.parent, None
         return
     folder = _opened(Path(held) if held else Path(whole).parent, _STEP, None, path)
@@ -177,6 +179,8 @@ def _opened(name: Path, flags: int, folder: int | None, path: Path) -> int:
         return os.open(name, flags, dir_fd=folder)
     except OSError as error:
         reason = _LINKS.get(error.errno or 0) if flags & _NO_LINK else None
+        if error.errno == errno.ENOENT and flags & _STEP:
+            reason = "its folder is gone"
         raise OSError(error.errno, reason or error.strerror, str(path)) from error
 
 

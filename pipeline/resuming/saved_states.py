@@ -79,7 +79,7 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
         UserError: if there are some, and none is whole or this user's.
     """
     key, found, reasons = state_key(), [], []
-    for path in state_files(folder):
+    for path in filter(Path.is_file, state_files(folder)):
         try:
             with opened(path, NO_LIMIT) as file:
                 found.append(SavedState(*read_snapshot(file, key)))
@@ -87,7 +87,7 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
             continue
         except (OSError, UnsafeFileError, BadSnapshotError, MemoryError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            reasons.append(f"{path}: {reason}")
+            reasons.append(f"{path}: {str(reason).removeprefix(f'{path} ')}")
     if reasons and not found:
         raise UserError(f"{reasons[0]}; remove {folder} to begin the run again")
     for reason in reasons:
