@@ -100,8 +100,8 @@ class RecordedFiles:
         # Not where a link leads that somebody put in the file's place.
         if self.digests is None:
             return None
-        if path.parent == self.folder:
-            return self.digests.get(path.name)
+        if path.is_relative_to(self.folder):
+            return self.digests.get(path.relative_to(self.folder).as_posix())
         place = path.parent.resolve() / path.name
         folder = self.folder.resolve()
         if not place.is_relative_to(folder):
