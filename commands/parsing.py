@@ -20,6 +20,7 @@ from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
 from pipeline.exhaustion import exhaustion
 from pipeline.stopping import default_for_signals, n_stops
+from safe_files.refusals import UnsafeFileError
 
 MISTAKE = 2
 
@@ -139,7 +140,7 @@ def _exit_code(main: Callable[[], int]) -> int:
     program = program_name()
     try:
         return _run_to_the_last_word(main)
-    except UserError as error:
+    except (UserError, UnsafeFileError) as error:
         message = str(error)
     except OSError as error:
         place = f": {error.filename}" if error.filename else ""

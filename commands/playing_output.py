@@ -153,6 +153,8 @@ def play(console: Console, chosen: ChosenModel, request: PlayingRequest) -> None
     env.close()
     if request.film is not None and isinstance(show, _Show):
         _write_film(console, request.film, show.frames)
+        if chosen.run is not None:
+            chosen.run.add_file(request.film)
     _print_returns(console, show.returns, show.lengths)
     if show.returns and not request.norm_reward:
         _print_measured(console, spec, show)

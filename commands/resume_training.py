@@ -142,6 +142,10 @@ def _prepared(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Cons
             activity.now("making the environments and the agent")
             tell_changes(run, spec, say)
             keeping = go_on(run, StateKeeping(args.save_state_every, stays=args.keep_state), say)
+        page = spec.watch_learning
+        if keeping.state is None and page is not None and not args.watch_learning and page.exists():
+            say(f"{page} is there already and stays: nothing shows that this run wrote it")
+            spec = replace(spec, watch_learning=None)
         if keeping.state is None:
             say("no state was saved: the run begins again")
         else:

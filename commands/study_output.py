@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -98,6 +99,7 @@ def conclude(
         The exit code, as of `run_study`.
     """
     planned = results.planned
+    results = replace(results, failures={one.planned.path: one.details for one in failures})
     try:
         if len(results.summary):
             _judge(console, results, command, looks, n_workers, with_page=with_page)

@@ -42,11 +42,13 @@ class RunFailure:
         planned: the run.
         reason: why, in one line.
         log: the file with the details; None where it could not be written.
+        details: what is in it, which is for people alone: nothing reads the file back.
     """
 
     planned: PlannedRun
     reason: str
     log: Path | None
+    details: str = ""
 
 
 class Launcher(Protocol):
@@ -174,5 +176,5 @@ def failed(planned: PlannedRun, root: Path, reason: str, details: str) -> RunFai
         log.parent.mkdir(exist_ok=True)
         write_text(log, details)
     except OSError:
-        return RunFailure(planned, reason, None)
-    return RunFailure(planned, reason, log)
+        return RunFailure(planned, reason, None, details)
+    return RunFailure(planned, reason, log, details)

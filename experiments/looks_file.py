@@ -13,6 +13,8 @@ from experiments.looks import Design, Look, LookLog, Looks, Question
 from experiments.study_spec import METRICS
 from pipeline.errors import UserError, one_line
 from pipeline.files import write_json
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import read_file
 
 FILE = "looks.json"
 _FORMAT = 1
@@ -34,13 +36,13 @@ def read_looks(root: Path) -> LookLog:
     """
     path = root / FILE
     try:
-        if path.stat().st_size > _LARGEST:
-            raise _wrong(path, "it is too large")
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(read_file(path, _LARGEST))
     except FileNotFoundError:
         return LookLog()
     except OSError as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+    except UnsafeFileError as error:
+        raise _wrong(path, str(error).removeprefix(f"{path} ")) from error
     except (ValueError, RecursionError) as error:
         raise _wrong(path, "it is no JSON") from error
     try:

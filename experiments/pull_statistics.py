@@ -71,7 +71,7 @@ class PullStatistics:
     def save(self, path: Path) -> None:
         """Write all arrays to a NumPy archive."""
         arrays: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
-        with replacing(path) as draft, draft.open("wb") as file:
+        with replacing(path) as file:
             np.savez(file, allow_pickle=False, **arrays)
 
     @classmethod

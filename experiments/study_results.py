@@ -69,6 +69,7 @@ class StudyResults:
         left_out: the runs that are damaged.
         n_unchecked: how many runs recorded no digests, so that damage in them may go unseen.
         finished: the runs that the results are of.
+        failures: of runs that have just failed, the details, by their folders.
     """
 
     study: StudySpec
@@ -80,6 +81,7 @@ class StudyResults:
     left_out: tuple[LeftOut, ...] = ()
     n_unchecked: int = 0
     finished: tuple[PlannedRun, ...] = ()
+    failures: Mapping[Path, str] = field(default_factory=dict)
 
 
 # Columns of `StudyResults.summary`; returns are undiscounted sums of rewards.

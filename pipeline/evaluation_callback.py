@@ -182,7 +182,7 @@ class EvaluationCallback(EvalCallback):
             arrays["successes"] = _table(self.evaluations_successes)
         if len(set(self.n_episodes)) > 1:
             arrays["n_episodes"] = self.n_episodes
-        with replacing(self.run.evaluations_path) as draft, draft.open("wb") as file:
+        with replacing(self.run.evaluations_path) as file:
             np.savez(file, **arrays)
         self._is_written, self._written_at = True, time.monotonic()
 

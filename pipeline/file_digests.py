@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from pipeline.errors import UserError, one_line
+from pipeline.files import files_below
 from pipeline.json_text import plain
 from safe_files.limits import Budget
 from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import opened, read_file
+from safe_files.regular_files import NO_LIMIT, hold, opened, read_file
 
 RECORD = "run.json"
 FIELD = "files"
@@ -35,9 +36,6 @@ LARGEST_RECORD = 64 << 20  # bytes
 LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
 _PIECE = 1 << 20  # bytes
 _DEEPEST_RECORD = 100  # lists and objects inside each other
-
-
-Content = TypeVar("Content")
 
 
 class DamagedFileError(UserError):
@@ -80,7 +78,8 @@ class RecordedFiles:
         Raises:
             DamagedFileError: if it is not, or cannot be read.
         """
-        content = _reading(read_file, path, limit)
+        with _as_damage(path):
+            content = read_file(path, limit)
         recorded = self._recorded(path)
         if recorded is not None and hashlib.sha256(content).hexdigest() != recorded:
             raise DamagedFileError(path, "is not as the run left it")
@@ -93,16 +92,17 @@ class RecordedFiles:
             DamagedFileError: if it is missing or changed.
         """
         recorded = self._recorded(path)
-        if recorded is not None and _reading(_digest, path, sys.maxsize) != recorded:
-            raise DamagedFileError(path, "is not as the run left it")
+        with _as_damage(path):
+            if recorded is not None and digest_of(path) != recorded:
+                raise DamagedFileError(path, "is not as the run left it")
 
     def _recorded(self, path: Path) -> str | None:
         """The digest of a file; None where the run recorded none, or the file is not its own."""
         # Not where a link leads that somebody put in the file's place.
         if self.digests is None:
             return None
-        if path.parent == self.folder:
-            return self.digests.get(path.name)
+        if path.is_relative_to(self.folder):
+            return self.digests.get(path.relative_to(self.folder).as_posix())
         place = path.parent.resolve() / path.name
         folder = self.folder.resolve()
         if not place.is_relative_to(folder):
@@ -112,8 +112,7 @@ class RecordedFiles:
 
 def digests_of(folder: Path) -> dict[str, str]:
     """The digests of all files of a run folder but ``run.json``, by relative name."""
-    paths = sorted(path for path in folder.rglob("*") if path.is_file())
-    paths = [path for path in paths if path.parent != folder / STATE_FOLDER]
+    paths = [path for path in sorted(files_below(folder)) if path.parent != folder / STATE_FOLDER]
     names = {path.relative_to(folder).as_posix(): path for path in paths}
     return {
         name: digest_of(path)
@@ -123,8 +122,12 @@ def digests_of(folder: Path) -> dict[str, str]:
 
 
 def digest_of(path: Path) -> str:
-    """The digest of a file."""
-    return _digest(path, sys.maxsize)
+    """The digest of a regular file."""
+    digest = hashlib.sha256()
+    with opened(path, NO_LIMIT) as file:
+        while piece := file.read(_PIECE):
+            digest.update(piece)
+    return digest.hexdigest()
 
 
 def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
@@ -142,16 +145,16 @@ def read_record(path: Path) -> dict[str, Any]:
         FileNotFoundError: if there is none.
         DamagedFileError: if it holds anything else than a run's record, or was changed.
     """
+    hold(path.parent)
     try:
         content = read_file(path, LARGEST_RECORD)
         Budget(len(content)).charge_json(content)
         record = json.loads(content)
     except FileNotFoundError:
         raise
-    except OSError as error:
-        raise DamagedFileError(path, f"cannot be read: {error.strerror}") from error
-    except UnsafeFileError as error:
-        raise DamagedFileError(path, f"is damaged: {error}") from error
+    except (OSError, UnsafeFileError):
+        with _as_damage(path):
+            raise
     except (ValueError, RecursionError) as error:
         raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error
     if not isinstance(record, dict):
@@ -166,23 +169,16 @@ def read_record(path: Path) -> dict[str, Any]:
     return record
 
 
-def _reading(read: Callable[[Path, int], Content], path: Path, limit: int) -> Content:
+@contextmanager
+def _as_damage(path: Path) -> Iterator[None]:
     try:
-        return read(path, limit)
+        yield
     except FileNotFoundError as error:
         raise DamagedFileError(path, "is missing") from error
     except OSError as error:
         raise DamagedFileError(path, f"cannot be read: {error.strerror}") from error
     except UnsafeFileError as error:
         raise DamagedFileError(path, str(error).removeprefix(f"{path} ")) from error
-
-
-def _digest(path: Path, limit: int) -> str:
-    digest = hashlib.sha256()
-    with opened(path, limit) as file:
-        while piece := file.read(_PIECE):
-            digest.update(piece)
-    return digest.hexdigest()
 
 
 def _seal(record: Mapping[str, Any]) -> str:

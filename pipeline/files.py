@@ -13,10 +13,12 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
+from io import BufferedWriter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.json_text import json_text
+from safe_files.regular_files import NEW, folder_of, open_number
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
@@ -64,16 +66,22 @@ def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
     return f"{kept.decode(errors='ignore')}-{digest}"
 
 
-def put_in_place(draft: Path, path: Path) -> None:
-    """Rename a file or folder to ``path``; a file that is there is replaced in one step."""
+def put_in_place(draft: Path, path: Path, folder: int | None = None) -> None:
+    """Rename a file or folder to ``path``; a file that is there is replaced in one step.
+
+    Args:
+        draft: what there is.
+        path: what it is to be called.
+        folder: the open folder that both are names in; None where they are whole paths.
+    """
     for pause in _PAUSES if sys.platform == "win32" else ():
         try:
-            draft.replace(path)
+            os.replace(draft, path, src_dir_fd=folder, dst_dir_fd=folder)
         except PermissionError:
             time.sleep(pause)
         else:
             return
-    draft.replace(path)
+    os.replace(draft, path, src_dir_fd=folder, dst_dir_fd=folder)
 
 
 @contextmanager
@@ -88,45 +96,47 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a name beside ``path`` to write to, and rename it into place once it is whole.
+def replacing(path: Path) -> Iterator[BufferedWriter]:
+    """Give a file to write to, and let it appear as ``path`` once it is whole.
 
     Nobody meets a half-written file then, whatever becomes of the process. A power cut may still
-    take the file: see `lasting`.
+    take the file: see `lasting`. A link or pipe of that name is replaced and not written to; and
+    who exchanges its folder meanwhile changes nothing, since names are those of the open folder.
 
     Raises:
-        FileNotFoundError: if the folder is gone, as one that was renamed meanwhile; some libraries
-            would make it anew.
+        OSError: if the folder is gone, as one that was renamed meanwhile, or lies behind a link in
+            a folder that is held: see `safe_files.regular_files`.
     """
-    if not path.parent.is_dir():
-        raise FileNotFoundError(errno.ENOENT, "its folder is gone", str(path))
     # A name that could be guessed might be there already, as a link to another's file.
-    draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
-    with naming(path):
+    name = f".{path.name}.{secrets.token_hex(8)}.tmp"
+    with naming(path), folder_of(path) as (before, folder):
+        draft = before / name
         try:
-            yield draft
-            put_in_place(draft, path)
+            with os.fdopen(os.open(draft, NEW, 0o666, dir_fd=folder), "wb") as file:
+                yield file
+            put_in_place(draft, before / path.name, folder)
         except OSError as error:
-            if error.filename == str(draft):  # of which nobody knows
+            if str(error.filename) == str(draft):  # of which nobody knows
                 error.filename = str(path)
             raise
         finally:
             with contextlib.suppress(OSError):  # a disk that has become read-only refuses that too
-                draft.unlink()
+                os.unlink(draft, dir_fd=folder)
 
 
 @contextmanager
-def lasting(path: Path) -> Iterator[Path]:
+def lasting(path: Path) -> Iterator[BufferedWriter]:
     """As `replacing`, and after it the file is there for good, also after a power cut.
 
     Not so in a folder that is `kept_later`.
     """
     later = is_kept_later(path)
-    with replacing(path) as draft:
-        yield draft
+    with replacing(path) as file:
+        yield file
         if not later:
+            file.flush()
             with naming(path):
-                sync_file(draft)
+                os.fsync(file.fileno())
     if not later:
         sync_folders(path.parent)
 
@@ -151,40 +161,43 @@ def is_kept_later(path: Path) -> bool:
 
 def settle(folder: Path) -> None:
     """Wait until the disk has a folder and all that is in it."""
-    paths = [folder, *folder.rglob("*")]
-    sync_together(filter(Path.is_file, paths), filter(Path.is_dir, paths))
+    sync_together(files_below(folder), [Path(parent) for parent, *_ in os.walk(folder)])
+
+
+def files_below(folder: Path) -> list[Path]:
+    """The regular files in a folder and in those inside it; no link is followed or counts."""
+    paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
+    return [path for path in paths if path.is_file() and not path.is_symlink()]
+
+
+def sync_file(path: Path) -> None:
+    """Wait until the disk has the contents of a file."""
+    # Windows flushes only what may be written.
+    number = open_number(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+    try:
+        os.fsync(number)
+    finally:
+        os.close(number)
 
 
 if sys.platform == "win32":
-
-    def sync_file(path: Path) -> None:
-        """Wait until the disk has the contents of a file."""
-        with path.open("rb+") as file:  # only what may be written is flushed
-            os.fsync(file.fileno())
 
     def sync_folders(*folders: Path) -> None:
         """Nothing: Windows keeps names in a journal of its own, and flushes no folder."""
 else:
 
-    def sync_file(path: Path) -> None:
-        """Wait until the disk has the contents of a file."""
-        _sync(path)
-
     def sync_folders(*folders: Path) -> None:
         """Wait until the disk has the names in the folders, as far as this user may ask for it."""
         for folder in folders:
             try:
-                _sync(folder)
+                number = os.open(folder, os.O_RDONLY)
+                try:
+                    os.fsync(number)
+                finally:
+                    os.close(number)
             except OSError as error:
                 if error.errno not in _CANNOT_SYNC:
                     raise
-
-    def _sync(path: Path) -> None:
-        number = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(number)
-        finally:
-            os.close(number)
 
 
 def sync_together(files: Iterable[Path], folders: Iterable[Path]) -> None:
@@ -215,16 +228,16 @@ def _waiting_threads(pid: int) -> ThreadPoolExecutor:
 
 def drafts_in(folder: Path) -> list[Path]:
     """The files in a folder, and in those inside it, that `replacing` has begun to write."""
-    return [path for path in folder.rglob(".*.tmp") if _DRAFT.fullmatch(path.name)]
+    return [path for path in files_below(folder) if _DRAFT.fullmatch(path.name)]
 
 
 def write_text(path: Path, text: str) -> None:
     """Replace the file at ``path`` by ``text``, byte for byte the same on every system."""
-    with replacing(path) as draft:
-        draft.write_text(text, encoding="utf-8", newline="\n")
+    with replacing(path) as file:
+        file.write(text.encode())
 
 
 def write_json(path: Path, data: Any) -> None:
     """Replace the file at ``path`` for good by ``data`` as indented JSON; nan is null there."""
-    with lasting(path) as draft:
-        draft.write_text(json_text(data, indent=2) + "\n", encoding="utf-8", newline="\n")
+    with lasting(path) as file:
+        file.write(f"{json_text(data, indent=2)}\n".encode())

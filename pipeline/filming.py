@@ -69,8 +69,8 @@ def film_episode(
 def write_film(path: Path, frames: list[Any]) -> None:
     """Write pictures, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
     film = _as_mp4(frames) if path.suffix == ".mp4" else as_gif(frames)
-    with replacing(path) as draft:
-        draft.write_bytes(film)
+    with replacing(path) as file:
+        file.write(film)
 
 
 def as_gif(frames: list[Any]) -> bytes:

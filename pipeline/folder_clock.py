@@ -8,6 +8,9 @@ import re
 import secrets
 from pathlib import Path
 
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import NO_LIMIT, opened
+
 SECONDS_BETWEEN_SIGNS = 5.0
 
 # What is written beside its place for an instant, here and by `pipeline.files.replacing`.
@@ -17,7 +20,8 @@ _SECONDS_OF_AN_INSTANT = 5.0
 
 def give_sign(path: Path) -> None:
     """Show that the owner of a file or folder is alive."""
-    os.utime(path)  # without a time, so that a network folder takes that of its server
+    # Without a time, so that a network folder takes that of its server.
+    os.utime(path, follow_symlinks=os.utime not in os.supports_follow_symlinks)
 
 
 def seconds_silent(path: Path) -> float:
@@ -34,11 +38,12 @@ def last_sign(path: Path) -> float:
 
     Raises:
         OSError: if there is no such path.
+        UnsafeFileError: if it is neither a regular file nor a folder.
     """
     if path.is_dir():
         return path.stat().st_mtime
     # Network folders remember for a while what a file was, but not beyond its being opened.
-    with path.open("rb") as file:
+    with opened(path, NO_LIMIT) as file:
         return os.fstat(file.fileno()).st_mtime
 
 
@@ -57,7 +62,7 @@ def remove_remains(root: Path) -> None:
     for folder in (root, *(root / name for name in _names_in(root))):
         for name in filter(_FOR_AN_INSTANT.fullmatch, _names_in(folder)):
             path = folder / name
-            with contextlib.suppress(OSError):
+            with contextlib.suppress(OSError, UnsafeFileError):
                 if seconds_silent(path) > _SECONDS_OF_AN_INSTANT:
                     if path.is_dir():
                         path.rmdir()

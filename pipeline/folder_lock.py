@@ -29,6 +29,7 @@ from pipeline.folder_clock import (
     seconds_silent,
 )
 from pipeline.signs_of_life import Heartbeat
+from safe_files.regular_files import NEW, open_number, read_file
 
 SECONDS_OF_SILENCE = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2
@@ -89,6 +90,7 @@ def folder_lock(
         FolderInUseError: if another process is at work, saying who; also at the end, if one has
             taken this one for dead.
         FolderGoneError: if somebody has removed the folder.
+        UnsafeFileError: if a link, a pipe or a device lies in the place of the lock.
     """
     lost: list[UserError] = []
 
@@ -143,7 +145,8 @@ def _appears(path: Path, content: str) -> bool:
     """Let the lock appear, whole; whether it was not there."""
     draft = path.with_name(f"{LOCK}.{secrets.token_hex(8)}.tmp")
     try:
-        draft.write_text(content, encoding="utf-8")
+        with os.fdopen(open_number(draft, NEW), "wb") as file:
+            file.write(content.encode())
         os.link(draft, path)
     except FileExistsError:
         return False
@@ -169,8 +172,7 @@ def _unlink(path: Path) -> None:
 def _read(path: Path) -> dict[str, Any]:
     """What a lock says; nothing where it is gone, or says nothing."""
     with contextlib.suppress(OSError, ValueError, RecursionError):
-        with path.open("rb") as file:
-            owner = json.loads(file.read(_LARGEST))
+        owner = json.loads(read_file(path, _LARGEST))
         return owner if isinstance(owner, dict) else {}
     return {}
 

@@ -10,7 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError, shown
+from pipeline.files import replacing
 from pipeline.user_modules import UserModule
+from safe_files.regular_files import NO_LIMIT, read_file
 
 # The folder of a run that keeps copies of single files.
 COPIES = "modules"
@@ -35,7 +37,8 @@ def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
         if "." in module.name or not path.is_file() or path.stat().st_size > MAX_COPY_BYTES:
             continue
         (folder / COPIES).mkdir(exist_ok=True)
-        (folder / COPIES / path.name).write_bytes(path.read_bytes())
+        with replacing(folder / COPIES / path.name) as file:
+            file.write(path.read_bytes())
 
 
 def changed_since(modules: Iterable[UserModule], folder: Path) -> list[Path]:
@@ -45,7 +48,7 @@ def changed_since(modules: Iterable[UserModule], folder: Path) -> list[Path]:
     return [
         path
         for path, copy in copies.items()
-        if path.is_file() and copy.is_file() and path.read_bytes() != copy.read_bytes()
+        if path.is_file() and copy.is_file() and path.read_bytes() != read_file(copy, NO_LIMIT)
     ]
 
 

@@ -71,7 +71,7 @@ class PullRecorder(PullLog):
 
     def write(self) -> None:
         """Write the pulls so far."""
-        with replacing(self.folder / PULLS_FILE) as draft, draft.open("wb") as file:
+        with replacing(self.folder / PULLS_FILE) as file:
             np.savez(file, allow_pickle=False, **self.arrays())
 
 

@@ -23,6 +23,7 @@ from pipeline.file_digests import (
     VERSION,
     VERSION_FIELD,
     RecordedFiles,
+    digest_of,
     digests_of,
     read_record,
     sealed,
@@ -30,13 +31,14 @@ from pipeline.file_digests import (
 from pipeline.files import (
     drafts_in,
     is_kept_later,
-    naming,
     put_in_place,
+    replacing,
     sync_together,
     write_json,
 )
 from pipeline.liveness import is_alive, mark
 from pipeline.run_files import RunFiles, environment_name
+from safe_files.regular_files import hold
 
 RUNNING = "running"
 FINISHED = "finished"
@@ -61,8 +63,6 @@ OUTCOME = (
     "pulls",
     FIELD,
 )
-# The field of ``run.json`` with the folder of TensorBoard's log, where there is one.
-TENSORBOARD = "tensorboard"
 # The field of ``run.json`` that says, while a run is running, which process is at work on it.
 PROCESS = "process"
 # Kept by a run that is under way: where nothing else fits on the disk, its last word does.
@@ -86,7 +86,13 @@ def _run_number(name: str, env_name: str) -> int:
 
 @dataclass(frozen=True)
 class Run(RunFiles):
-    """A run folder, and what it says of itself."""
+    """A run folder, and what it says of itself.
+
+    It is held: nothing in it is read or written through a link.
+    """
+
+    def __post_init__(self) -> None:
+        hold(self.path)
 
     @classmethod
     def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
@@ -125,9 +131,9 @@ class Run(RunFiles):
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
-        unnumbered = cls(log_folder / algo, name)
-        if number < 0 or (number == 0 and not runs and unnumbered.model_path.exists()):
-            return unnumbered
+        has_unnumbered = (log_folder / algo / f"{name}.zip").exists()
+        if number < 0 or (number == 0 and not runs and has_unnumbered):
+            return cls(log_folder / algo, name)
         if not runs:
             raise NoRunError(algo, env_id, log_folder)
         if number == 0:
@@ -191,9 +197,8 @@ class Run(RunFiles):
 
     def keep_room(self) -> None:
         """Take the room on the disk that the run's last word needs."""
-        room = self.path / ROOM
-        with naming(room):
-            room.write_bytes(bytes(ROOM_BYTES))
+        with replacing(self.path / ROOM) as file:
+            file.write(bytes(ROOM_BYTES))
 
     def _give_room(self) -> None:
         (self.path / ROOM).unlink(missing_ok=True)
@@ -216,6 +221,12 @@ class Run(RunFiles):
         if not is_kept_later(self.path):
             self.wait_for_disk([self.path / name for name in digests])
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests})
+
+    def add_file(self, path: Path) -> None:
+        """Let the record name a file that came into the folder after the end of the run."""
+        digests = self.files.digests
+        if digests is not None and path.parent.resolve() == self.path.resolve():
+            self.update_info(**{FIELD: {**digests, path.name: digest_of(path)}})
 
     def wait_for_disk(self, files: Sequence[Path]) -> None:
         """Wait until the disk has files of the run, and the way to them."""

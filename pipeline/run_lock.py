@@ -13,6 +13,7 @@ from pipeline.errors import UserError
 from pipeline.folder_lock import folder_lock
 from pipeline.liveness import is_alive
 from pipeline.run_folder import PROCESS, RUNNING, Run
+from safe_files.regular_files import take_up
 
 
 @contextmanager
@@ -25,7 +26,9 @@ def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
 
     Raises:
         UserError: if another process is at work on it, or it is gone.
+        UnsafeFileError: if anything but files and folders lies in it.
     """
+    take_up(run.path)
     with folder_lock(run.path, partial(_thread.interrupt_main, signal.SIGTERM), say):
         yield
 

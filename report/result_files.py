@@ -19,11 +19,16 @@ GZIP: Any = {"method": "gzip", "compresslevel": 6}
 def write_tables(results: StudyResults) -> list[Path]:
     """Write ``summary.csv``, a row for each run, and ``curves.csv.gz``, all learning curves."""
     summary, curves = results.root / "summary.csv", results.root / "curves.csv.gz"
-    with replacing(summary) as draft:
-        results.summary.to_csv(draft, index=False, lineterminator="\n")
-    with replacing(curves) as draft:
+    with replacing(summary) as file:
+        results.summary.to_csv(file, mode="wb", index=False, lineterminator="\n")
+    with replacing(curves) as file:
         results.curves.to_csv(
-            draft, index=False, float_format="%.8g", compression=GZIP, lineterminator="\n"
+            file,
+            mode="wb",
+            index=False,
+            float_format="%.8g",
+            compression=GZIP,
+            lineterminator="\n",
         )
     return [summary, curves]
 

@@ -1,23 +1,115 @@
-"""Files read once, whole, and only where they are files of a bearable size."""
+"""The one door to files: regular files alone, and none through a link out of a folder that is held.
+
+A folder of runs may come from a stranger, with a link, a pipe or a device under any of its names.
+Once such a folder is held, what lies below it is opened step by step from the folder itself, where
+no step may be a link. A link on the way to the folder is the user's own, and is followed.
+"""
 
 from __future__ import annotations
 
+import errno
 import io
 import os
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
 
 from safe_files.refusals import UnsafeFileError
 
 # What is read: a path, or a stream of bytes that were read already.
 Source = Path | str | io.BufferedIOBase
 
+NO_LIMIT = 1 << 62  # bytes
+# Each 0 where the system has no such thing. Who opens a pipe so does not wait for its other end.
+_BYTES = getattr(os, "O_BINARY", 0)
+_ALWAYS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | _BYTES
+NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _BYTES  # what is not there yet, not even as a link
+_NO_LINK = getattr(os, "O_NOFOLLOW", 0)
+_STEP = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0)
+_LINKS = {errno.ELOOP: "it is a link", errno.ENOTDIR: "it lies behind a link, or no folder"}
+_HAS_STEPS = bool(_NO_LINK) and os.open in os.supports_dir_fd
+_JUNCTION = getattr(stat, "IO_REPARSE_TAG_MOUNT_POINT", -1)
+
+_held: set[str] = set()
+
+
+def hold(folder: Path) -> None:
+    """Follow no link inside a folder from now on, in this process."""
+    _held.add(_whole(folder))
+
+
+def take_up(folder: Path) -> None:
+    """Hold a folder in which nothing lies but files and folders.
+
+    Libraries that open paths by themselves may then be let in.
+
+    Raises:
+        UnsafeFileError: naming a link, pipe or device inside.
+    """
+    hold(folder)
+    pending = [str(folder)]
+    while pending:
+        try:
+            with os.scandir(pending.pop()) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        pending.append(entry.path)
+                    elif not entry.is_file(follow_symlinks=False) and os.path.lexists(entry.path):
+                        raise UnsafeFileError(
+                            f"{entry.path} is a link, a pipe or a device: only files and folders "
+                            "may lie there"
+                        )
+        except FileNotFoundError:  # of others who are at work there
+            continue
+
 
 @contextmanager
-def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
+def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
+    """The folder of a path, as functions of `os` take it.
+
+    Yields:
+        What to put before a name in it, and ``dir_fd``.
+
+    Raises:
+        OSError: if it is not there, or lies behind a link in a folder that is held.
+    """
+    whole = _whole(path)
+    held = _held_above(whole)
+    if not _HAS_STEPS:
+        _check_steps(Path(whole).parent, held)
+        if not path.parent.is_dir():
+            raise OSError(errno.ENOENT, "its folder is gone", str(path))
+        yield path.parent, None
+        return
+    folder = _opened(Path(held) if held else Path(whole).parent, _STEP, None, path)
+    try:
+        for name in () if held is None else Path(whole).relative_to(held).parts[:-1]:
+            inner = _opened(Path(name), _STEP | _NO_LINK, folder, path)
+            os.close(folder)
+            folder = inner
+        yield Path(), folder
+    finally:
+        os.close(folder)
+
+
+def open_number(path: Path, flags: int) -> int:
+    """The descriptor of a file, whatever kind it is of, opened without waiting for it.
+
+    Raises:
+        OSError: if that fails, or it is or lies behind a link in a folder that is held.
+    """
+    held = _held_above(_whole(path))
+    if held is None:  # the user's own place
+        return os.open(path, flags | _ALWAYS)
+    with folder_of(path) as (before, folder):
+        if folder is None:
+            _check_steps(path, held)
+        return _opened(before / path.name, flags | _ALWAYS | _NO_LINK, folder, path)
+
+
+@contextmanager
+def opened(path: Path, limit: int) -> Iterator[io.BufferedReader]:
     """A regular file, open for reading: what is checked is what is used.
 
     Args:
@@ -26,14 +118,26 @@ def opened(path: Path, limit: int) -> Iterator[BinaryIO]:
 
     Raises:
         UnsafeFileError: if it is no regular file (a pipe or a device could go on for ever), or
-            larger than that.
+            larger than that, or behind a link in a folder that is held.
         OSError: if it cannot be read.
     """
-    # Looked at first, since to open a pipe may already wait for ever; and again once it is open,
-    # since another may lie there by then.
-    _check(path.stat(), path, limit)
-    with path.open("rb") as file:
-        _check(os.fstat(file.fileno()), path, limit)
+    try:
+        number = open_number(path, os.O_RDONLY)
+    except OSError as error:
+        if error.strerror in _LINKS.values():
+            raise UnsafeFileError(f"{path} is no regular file: {error.strerror}") from error
+        raise
+    try:
+        status = os.fstat(number)
+        if not stat.S_ISREG(status.st_mode):
+            raise UnsafeFileError(f"{path} is no regular file")
+        if status.st_size > limit:
+            raise UnsafeFileError(f"{path} is larger than {limit:,} bytes")
+        file = os.fdopen(number, "rb")
+    except BaseException:
+        os.close(number)
+        raise
+    with file:
         yield file
 
 
@@ -59,8 +163,33 @@ def content_of(source: Source, limit: int) -> bytes:
     return content
 
 
-def _check(status: os.stat_result, path: Path, limit: int) -> None:
-    if not stat.S_ISREG(status.st_mode):
-        raise UnsafeFileError(f"{path} is no regular file")
-    if status.st_size > limit:
-        raise UnsafeFileError(f"{path} is larger than {limit:,} bytes")
+def _held_above(path: str) -> str | None:
+    """The outermost of the held folders that a path lies in."""
+    above = map(str, reversed(Path(path).parents))
+    return next((folder for folder in above if folder in _held), None) if _held else None
+
+
+def _whole(path: Path) -> str:
+    """The path from the root, with no link of it followed."""
+    return os.path.normpath(path.absolute())
+
+
+def _opened(name: Path, flags: int, folder: int | None, path: Path) -> int:
+    try:
+        return os.open(name, flags, dir_fd=folder)
+    except OSError as error:
+        reason = _LINKS.get(error.errno or 0) if flags & _NO_LINK else None
+        if error.errno == errno.ENOENT and flags & _STEP:
+            reason = "its folder is gone"
+        raise OSError(error.errno, reason or error.strerror, str(path)) from error
+
+
+def _check_steps(path: Path, held: str | None) -> None:
+    """Refuse links between a held folder and a path, where they cannot be refused by opening."""
+    for step in () if held is None else (path.absolute(), *path.absolute().parents):
+        if str(step) == held:
+            return
+        if os.path.lexists(step):
+            status = os.lstat(step)
+            if stat.S_ISLNK(status.st_mode) or getattr(status, "st_reparse_tag", 0) == _JUNCTION:
+                raise OSError(errno.ELOOP, _LINKS[errno.ELOOP], str(path))

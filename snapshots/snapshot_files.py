@@ -18,8 +18,7 @@ import hashlib
 import hmac
 import json
 import os
-from io import BufferedReader
-from pathlib import Path
+from io import BufferedReader, BufferedWriter
 from typing import Any
 
 import numpy as np
@@ -38,11 +37,13 @@ class BadSnapshotError(Exception):
     """A file holds no snapshot, a damaged one, or one that was made under another key."""
 
 
-def write_snapshot(path: Path, snapshot: Snapshot, note: dict[str, Any], key: bytes) -> None:
+def write_snapshot(
+    file: BufferedWriter, snapshot: Snapshot, note: dict[str, Any], key: bytes
+) -> None:
     """Write a snapshot and flush it to the disk.
 
     Args:
-        path: where to; what is there is overwritten.
+        file: where to, open and empty.
         snapshot: the record.
         note: what else the file is to say, as JSON.
         key: what makes the code.
@@ -59,24 +60,23 @@ def write_snapshot(path: Path, snapshot: Snapshot, note: dict[str, Any], key: by
     tree = {"note": note, "roots": snapshot.roots, "nodes": snapshot.nodes, "arrays": table}
     text = json.dumps(tree, allow_nan=False, separators=(",", ":")).encode()
     code = hmac.new(key, digestmod="sha256")
-    with path.open("wb") as file:
-        file.write(MAGIC)
-        file.write(bytes(_CODE_BYTES))
-        contents: list[bytes | memoryview[Any]] = [part.data for part in parts if part.nbytes]
-        for content in (len(text).to_bytes(8, "little"), text, *contents):
-            code.update(content)
-            file.write(content)
-        file.seek(_CODE_AT)
-        file.write(code.digest())
-        file.flush()
-        os.fsync(file.fileno())
+    file.write(MAGIC)
+    file.write(bytes(_CODE_BYTES))
+    contents: list[bytes | memoryview[Any]] = [part.data for part in parts if part.nbytes]
+    for content in (len(text).to_bytes(8, "little"), text, *contents):
+        code.update(content)
+        file.write(content)
+    file.seek(_CODE_AT)
+    file.write(code.digest())
+    file.flush()
+    os.fsync(file.fileno())
 
 
-def read_snapshot(path: Path, key: bytes) -> tuple[Snapshot, dict[str, Any]]:
+def read_snapshot(file: BufferedReader, key: bytes) -> tuple[Snapshot, dict[str, Any]]:
     """Read a snapshot back.
 
     Args:
-        path: the file.
+        file: open at its beginning.
         key: as it was written with.
 
     Returns:
@@ -86,18 +86,17 @@ def read_snapshot(path: Path, key: bytes) -> tuple[Snapshot, dict[str, Any]]:
         BadSnapshotError: if the file is none, damaged, or made under another key.
         OSError: if it cannot be read.
     """
-    with path.open("rb") as file:
-        if file.read(len(MAGIC)) != MAGIC:
-            raise BadSnapshotError("it is no snapshot")
-        code = file.read(_CODE_BYTES)
-        begin = file.tell()
-        if not hmac.compare_digest(code, _code_of(file, key)):
-            raise BadSnapshotError(
-                "it is damaged, or another user or machine made it, or the key was replaced"
-            )
-        file.seek(begin)
-        tree = json.loads(file.read(int.from_bytes(file.read(8), "little")))
-        arrays = [_array(file, entry) for entry in tree["arrays"]]
+    if file.read(len(MAGIC)) != MAGIC:
+        raise BadSnapshotError("it is no snapshot")
+    code = file.read(_CODE_BYTES)
+    begin = file.tell()
+    if not hmac.compare_digest(code, _code_of(file, key)):
+        raise BadSnapshotError(
+            "it is damaged, or another user or machine made it, or the key was replaced"
+        )
+    file.seek(begin)
+    tree = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+    arrays = [_array(file, entry) for entry in tree["arrays"]]
     return Snapshot(tree["roots"], tree["nodes"], arrays), tree["note"]
 
 

@@ -169,11 +169,9 @@ def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
     from experiments.analysis import analyse
     from experiments.drafts import draft_path
-    from experiments.launching import failure_log
     from experiments.run_in_child import do_run
     from experiments.study_plan import plan
     from experiments.study_results import read_results
-    from pipeline.files import write_text
     from report.page import film_section, write_report
     from report.series.study_series import study_series
 
@@ -182,10 +180,8 @@ def report_study(tmp_path_factory):
     failed = planned[-1]
     for run in planned[:-1]:
         do_run(run, draft_path(root, run), "compare.py small.yml")
-    log = failure_log(root, failed)
-    log.parent.mkdir()
-    write_text(log, "Traceback:\nValueError: <the> disk & all is full\n")
-    analysis = analyse(read_results(study, planned, root))
+    details = {failed.path: "Traceback:\nValueError: <the> disk & all is full\n"}
+    analysis = analyse(dataclasses.replace(read_results(study, planned, root), failures=details))
     page = root / "report.html"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(film_section, "MAX_STEPS", 20)  # longer films take ten seconds to draw

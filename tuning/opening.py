@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agents import ALGORITHMS
 from experiments.study_plan import check_settings
 from pipeline.errors import UserError
+from safe_files.regular_files import take_up
 from tuning.judging import judged
 from tuning.pruning import is_hopeless
 from tuning.samplers import make_sampler
@@ -80,7 +81,9 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
 
     Raises:
         UserError: if it cannot be done so, or is not what was begun under this name.
+        UnsafeFileError: if anything but files and folders lies in the folder.
     """
+    take_up(root)
     run = shipped_run(tuning, root)
     check_settings(tuning.study, [run])
     if tuning.figure == AUTO:

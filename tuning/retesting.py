@@ -12,6 +12,7 @@ from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalys
 from experiments.planned_runs import PlannedRun
 from experiments.study_spec import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.file_digests import DamagedFileError
+from pipeline.files import write_text
 from tuning.entry_files import entry_text
 from tuning.judging import UnjudgedError, judged, outcome_of
 from tuning.trial_queue import SETTINGS
@@ -74,7 +75,7 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
     for each in candidates:
         path = root / FOLDER / f"{each.label.replace(' ', '-')}.yml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(entry_text(tuning, each.entry, ()), encoding="utf-8")
+        write_text(path, entry_text(tuning, each.entry, ()))
         agents.append(AgentSpec(each.label, tuning.agent.algo, conf_file=path))
     metric = tuning.figure if tuning.figure in METRICS else "final"  # of scores and costs too
     return replace(

@@ -167,6 +167,6 @@ class ValueMapRecorder:
             "optimal_values": optimal_values,
             "optimal_actions": optimal_actions,
         }
-        with replacing(self.path) as draft, draft.open("wb") as file:
+        with replacing(self.path) as file:
             np.savez(file, **arrays)
         self._last_write = time.monotonic()

@@ -75,7 +75,7 @@ def run_around(model: Path) -> Run | None:
     own = run_of(model)
     if own is not None:
         return own
-    folder = model.resolve().parent
+    folder = model.parent.resolve()
     names = _settings_folders(folder)
     if model.stem in names:
         return Run(folder, model.stem)

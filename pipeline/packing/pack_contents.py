@@ -17,7 +17,6 @@ from pipeline.packing.model_card import card, results
 from pipeline.packing.scrubbing import check_secrets, check_untold, record_to_tell, zip_to_tell
 from pipeline.run_folder import FINISHED, Run
 from safe_files.limits import MAX_ARCHIVE_BYTES
-from safe_files.regular_files import read_file
 
 CARD = "README.md"
 FILMS = (".mp4", ".gif")
@@ -50,7 +49,10 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 def _files(run: Run, record: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
-    """All files but the card and the record."""
+    """All files but the card and the record; of the run's, only those that its record names."""
+    recorded = run.files.digests
+    if recorded is None:
+        raise UserError(f"{run.path} recorded no digests of its files: train again to pack it")
     spec, settings = record["spec"], run.params_path.name
     yield run.model_path.name, zip_to_tell(read_recorded(run, run.model_path, MAX_ARCHIVE_BYTES))
     yield f"{settings}/config.yml", _yaml(spec["hyperparams"])
@@ -66,13 +68,15 @@ def _files(run: Run, record: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
         ("value_map.png", run.value_map_path),
         ("learning_curve.png", run.curve_path),
     ):
-        if path.is_file():
+        if path.relative_to(run.path).as_posix() in recorded:
             yield name, read_recorded(run, path, MAX_ARCHIVE_BYTES)
     if (told := results(record)) is not None:
         yield "results.json", told.encode()
-    films = sorted(path for path in run.path.iterdir() if path.suffix in FILMS and path.is_file())
-    if films:
-        yield f"replay{films[0].suffix}", read_file(films[0], MOST_FILM_BYTES)
+    for name in sorted(recorded):
+        if Path(name).suffix in FILMS and "/" not in name:
+            film = read_recorded(run, run.path / name, MOST_FILM_BYTES)
+            yield f"replay{Path(name).suffix}", film
+            break
 
 
 def _yaml(data: dict[str, Any]) -> bytes:

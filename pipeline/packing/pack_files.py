@@ -48,8 +48,8 @@ def pack(run_folder: Path, target: Path) -> Path:
         raise UserError(f"{target} is there already: name another place for the pack")
     files = contents(run_folder)
     if is_zip:
-        with replacing(target) as draft:
-            draft.write_bytes(zipped(dict(sorted(files.items()))))
+        with replacing(target) as file:
+            file.write(zipped(dict(sorted(files.items()))))
         return target
     draft = target.with_name(f".{target.name}.{secrets.token_hex(8)}.tmp")
     draft.mkdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from mdp.array_types import Floats
 from pipeline.evaluation.sampled import Yardstick
 from pipeline.pictures.picture_files import fix_layout, write_png
 from pipeline.run_folder import Run
+from safe_files.regular_files import NO_LIMIT, read_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,17 +40,17 @@ def read_monitors(folder: Path) -> tuple[Floats, Floats]:
         Environment steps done by the end of each episode, counted over all environments, and its
         return, both of shape (n_episodes,).
     """
-    paths = sorted(folder.glob("*.monitor.csv"))
+    contents = [read_file(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
     rows = [
-        np.loadtxt(path, delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
-        for path in paths
-        if path.read_bytes().count(b"\n") > 2
+        np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
+        for content in contents
+        if content.count(b"\n") > 2
     ]
     if not rows:
         return np.empty(0), np.empty(0)
     # The environments of a run are stepped together: by the time that one of them has done so many
     # steps, all of them have.
-    steps = np.concatenate([len(paths) * np.cumsum(table[:, 1]) for table in rows])
+    steps = np.concatenate([len(contents) * np.cumsum(table[:, 1]) for table in rows])
     returns = np.concatenate([table[:, 0] for table in rows])
     order = np.argsort(steps, kind="stable")
     return steps[order], returns[order]
@@ -112,7 +114,7 @@ def _evaluations(run: Run) -> tuple[Floats, Floats]:
     """Steps and mean returns of the evaluations, each of shape (n_evaluations,)."""
     if not run.evaluations_path.exists():
         return np.empty(0), np.empty(0)
-    with np.load(run.evaluations_path) as evaluations:
+    with np.load(BytesIO(read_file(run.evaluations_path, NO_LIMIT))) as evaluations:
         return evaluations["timesteps"], evaluations["results"].mean(axis=1)
 
 

@@ -27,5 +27,5 @@ def write_png(figure: Figure, path: Path) -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas: Any = FigureCanvasAgg(figure)
-    with replacing(path) as draft:
-        canvas.print_png(draft)
+    with replacing(path) as file:
+        canvas.print_png(file)

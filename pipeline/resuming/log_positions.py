@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-import os
 import zlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from io import BufferedReader
 from pathlib import Path
 
 from pipeline.errors import UserError
 from pipeline.file_digests import STATE_FOLDER
+from pipeline.files import replacing
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import NO_LIMIT, opened
 
 EVENT_FILES = "events.out.tfevents.*"
 # By the numbers of the environments: a wrapper that the settings name begins its file anew.
@@ -30,7 +32,7 @@ def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Positio
     Returns:
         By path: of Monitor's files relative to the run folder, of the others from the root.
     """
-    paths = {path.name: path for path in _monitor_files(run_folder)}
+    paths = {path.name: path for path in monitor_files(run_folder)}
     paths |= {str(path): path for path in _event_files(log_folder)}
     return {name: _position(path, path.stat().st_size) for name, path in paths.items()}
 
@@ -38,43 +40,54 @@ def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Positio
 def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, Position]) -> None:
     """Remove what was appended since, and the files that were begun since.
 
+    What is left is a new file, so that no other name of the old one is written to.
+
     Raises:
         UserError: if a file is missing, or does not begin with what it held.
     """
     for name, position in positions.items():
         path = run_folder / name  # or the name itself, where that begins at the root
-        if not path.is_file() or _position(path, position[0])[:2] != tuple(position)[:2]:
+        try:
+            found = _position(path, position[0])
+        except (FileNotFoundError, UnsafeFileError):
+            found = None
+        if found is None or found[:2] != tuple(position)[:2]:
             raise UserError(
                 f"{path} is not as the run left it: it cannot go on from its state; remove "
                 f"{run_folder / STATE_FOLDER} to begin the run again"
             )
-    for path in [*_monitor_files(run_folder), *_event_files(log_folder)]:
+    for path in [*monitor_files(run_folder), *_event_files(log_folder)]:
         name = path.name if path.parent == run_folder else str(path)
         if name in positions:
-            os.truncate(path, positions[name][0])
+            with replacing(path) as draft, opened(path, NO_LIMIT) as file:
+                _copy(file, positions[name][0], draft.write)
         else:
             path.unlink()
 
 
-def remove_events(log_folder: str) -> None:
-    """Remove TensorBoard's files of a run that begins anew, and their folder if it is empty."""
-    for path in _event_files(log_folder):
-        path.unlink()
-    with contextlib.suppress(OSError):
-        Path(log_folder).rmdir()
-
-
 def _position(path: Path, length: int) -> Position:
     """Where a file is after so many bytes, or at its end if that comes before."""
-    n_read = checksum = n_lines = 0
-    with path.open("rb") as file:
-        while piece := file.read(min(_PIECE, length - n_read)):
-            n_read, checksum = n_read + len(piece), zlib.crc32(piece, checksum)
-            n_lines += piece.count(b"\n")
-    return n_read, checksum, n_lines
+    checksum = n_lines = 0
+
+    def add(piece: bytes) -> None:
+        nonlocal checksum, n_lines
+        checksum, n_lines = zlib.crc32(piece, checksum), n_lines + piece.count(b"\n")
+
+    with opened(path, NO_LIMIT) as file:
+        return _copy(file, length, add), checksum, n_lines
 
 
-def _monitor_files(run_folder: Path) -> list[Path]:
+def _copy(file: BufferedReader, length: int, write: Callable[[bytes], object]) -> int:
+    """Hand on so many bytes of a file, or all if it has fewer; how many there were."""
+    n_read = 0
+    while piece := file.read(min(_PIECE, length - n_read)):
+        write(piece)
+        n_read += len(piece)
+    return n_read
+
+
+def monitor_files(run_folder: Path) -> list[Path]:
+    """The files that Monitor appends to."""
     return sorted(run_folder.glob(MONITOR_FILES))
 
 

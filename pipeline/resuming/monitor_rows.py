@@ -7,6 +7,7 @@ take longer than all else together.
 from __future__ import annotations
 
 import csv
+import io
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.compiled.episodes import n_whole_returns
 from pipeline.resuming.log_positions import MONITOR_FILES, Position
+from safe_files.regular_files import NO_LIMIT, opened
 from snapshots.filling import NotRestorableError
 
 RETURNS, LENGTHS, TIMES = "episode_returns", "episode_lengths", "episode_times"
@@ -92,7 +94,8 @@ def _layers(env: VecEnv) -> Iterator[gym.Env[Any, Any]]:
 
 
 def _columns(path: Path) -> dict[str, list[Any]]:
-    with path.open(encoding="utf-8", newline="") as file:
+    with opened(path, NO_LIMIT) as content:
+        file = io.TextIOWrapper(content, encoding="utf-8", newline="")
         for _ in range(_HEAD_LINES):
             next(file)
         rows = [row[:3] for row in csv.reader(file)]

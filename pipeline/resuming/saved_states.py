@@ -11,6 +11,8 @@ from pipeline.errors import UserError
 from pipeline.files import replacing, sync_folders
 from pipeline.resuming.state_folder import state_file, state_files
 from pipeline.source_digest import source_digest
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import NO_LIMIT, opened
 from snapshots.recording import Snapshot
 from snapshots.snapshot_files import BadSnapshotError, read_snapshot, write_snapshot
 from snapshots.user_key import user_key
@@ -60,9 +62,9 @@ def save_state(folder: Path, number: int, snapshot: Snapshot, note: dict[str, An
     """
     key = state_key()
     folder.mkdir(exist_ok=True)
-    with replacing(state_file(folder, number)) as draft:
+    with replacing(state_file(folder, number)) as file:
         whole_note = {**note, "number": number, SOURCES: source_digest()}
-        write_snapshot(draft, snapshot, whole_note, key)
+        write_snapshot(file, snapshot, whole_note, key)
     sync_folders(folder)
 
 
@@ -77,14 +79,15 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
         UserError: if there are some, and none is whole or this user's.
     """
     key, found, reasons = state_key(), [], []
-    for path in filter(Path.is_file, state_files(folder)):  # a pipe would be waited for
+    for path in filter(Path.is_file, state_files(folder)):
         try:
-            found.append(SavedState(*read_snapshot(path, key)))
+            with opened(path, NO_LIMIT) as file:
+                found.append(SavedState(*read_snapshot(file, key)))
         except FileNotFoundError:
             continue
-        except (OSError, BadSnapshotError, MemoryError) as error:
+        except (OSError, UnsafeFileError, BadSnapshotError, MemoryError) as error:
             reason = error.strerror if isinstance(error, OSError) else error
-            reasons.append(f"{path}: {reason}")
+            reasons.append(f"{path}: {str(reason).removeprefix(f'{path} ')}")
     if reasons and not found:
         raise UserError(f"{reasons[0]}; remove {folder} to begin the run again")
     for reason in reasons:

@@ -18,7 +18,7 @@ from agents.common.callback_horizons import Horizon
 from mdp.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
-from pipeline.files import sync_file
+from pipeline.files import files_below, sync_file
 from pipeline.progress import ProgressDisplay
 from pipeline.resuming.global_generators import generator_states, set_generators
 from pipeline.resuming.log_positions import Position, log_positions
@@ -27,7 +27,7 @@ from pipeline.resuming.saved_states import SavedState, save_state
 from pipeline.resuming.state_folder import settings_digest
 from pipeline.resuming.state_keeping import SaveInterval
 from pipeline.resuming.user_state import put_back, user_state
-from pipeline.run_folder import TENSORBOARD, Run
+from pipeline.run_folder import Run
 from pipeline.safe_moments import StopAtSafeMoment
 from pipeline.stopping import current
 from pipeline.user_modules import UserModule
@@ -119,8 +119,6 @@ class StateSaver(StopAtSafeMoment):
             self.save()
 
     def _on_training_start(self) -> None:
-        if (folder := _log_folder(self.model)) is not None:
-            self.run.update_info(**{TENSORBOARD: folder})
         self.steps_at_save = self.model.num_timesteps
         self.saved_at, self.started = time.monotonic(), WorkTime.now()
 
@@ -225,8 +223,8 @@ class StateSaver(StopAtSafeMoment):
     def _files_changed(self, logs: Mapping[str, Position]) -> list[Path]:
         """The files of the run beside its logs and states that the disk may not have yet."""
         changed = []
-        for path in self.run.path.rglob("*"):
-            if path.parent == self.run.state_path or path.name in logs or not path.is_file():
+        for path in files_below(self.run.path):
+            if path.parent == self.run.state_path or path.name in logs:
                 continue
             status = path.stat()
             stamp = status.st_ino, status.st_mtime_ns, status.st_size

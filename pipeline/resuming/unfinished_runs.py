@@ -11,11 +11,11 @@ from typing import Any
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError, digest_of
 from pipeline.module_records import changed_since
-from pipeline.resuming.log_positions import cut_back, remove_events
+from pipeline.resuming.log_positions import cut_back, monitor_files
 from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.run_files import environment_name
-from pipeline.run_folder import FINISHED, TENSORBOARD, Run, numbered_runs
+from pipeline.run_folder import FINISHED, Run, numbered_runs
 from pipeline.run_record import TRAINED_AGENT, recorded_versions
 from pipeline.train_spec import TrainSpec, completed
 from pipeline.user_modules import UserModule
@@ -167,6 +167,5 @@ def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
 def _forget(run: Run) -> None:
     """Remove what a run without a state would not write over, beginning anew."""
     remove_states(run.state_path)
-    logged = run.read_info().get(TENSORBOARD)
-    if isinstance(logged, str):
-        remove_events(logged)
+    for path in monitor_files(run.path):  # another name of one keeps what it holds
+        path.unlink()

@@ -48,8 +48,8 @@ def figure(
             place.spines[["top", "right"]].set_visible(False)
         for suffix, options in ((".png", {"dpi": 150}), (".svg", {"metadata": {"Date": None}})):
             target = path.with_name(path.name + suffix)
-            with replacing(target) as draft:
-                canvas.savefig(draft, format=suffix[1:], **options)
+            with replacing(target) as file:
+                canvas.savefig(file, format=suffix[1:], **options)
             written.append(target)
             # The second file looks as the first: finding places for all takes longest.
             canvas.set_layout_engine("none")

@@ -26,6 +26,7 @@ from pipeline.user_modules import import_again
 from report.learning_page.kept_pages import kept_page, note_page, page_path, without_page
 from report.learning_page.learning_assembly import write_learning_page
 from report.page.sections import LearningPage, first_runs
+from safe_files.regular_files import hold
 
 BATCH = "its runs were done as one batch, which leaves no agent"
 WITHOUT_STATES = StateKeeping(SaveInterval(is_off=True))
@@ -107,6 +108,7 @@ def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:
     Raises:
         UserError: if the agent cannot be watched, or has become another one than that of the run.
     """
+    hold(path.parents[2])  # the study
     import_again(planned.spec.user_modules)
     spec = replace(planned.spec, log_folder=folder, tensorboard_log=None, watch_learning=path)
     training = prepare(spec, Console(quiet=True), {}, "", keeping=WITHOUT_STATES)

@@ -11,7 +11,7 @@ from pipeline.files import write_json
 from report.learning_page.learning_assembly import MOST_BYTES, page_version
 from report.page.sections import LearningPage
 from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.regular_files import NO_LIMIT, read_file
 
 FOLDER = "learning"
 LONGEST_WORDS = 300
@@ -30,7 +30,7 @@ def without_page(run: PlannedRun, reason: str) -> LearningPage:
 
 def note_page(root: Path, run: PlannedRun, words: str) -> LearningPage:
     """Note what the page that has just been written was made from."""
-    content = page_path(root, run).read_bytes()
+    content = read_file(page_path(root, run), NO_LIMIT)
     write_json(_note_path(root, run), {"words": words, **_made_from(run, content)})
     return _page(run, words, content)
 

@@ -24,7 +24,7 @@ from pipeline.playing import playing_env
 from report.page.markup import data_uri
 from report.page.sections import Report, Section, first_runs
 from report.wording import number
-from safe_files.regular_files import read_file
+from safe_files.regular_files import NO_LIMIT, read_file
 
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
 COLOURS = 128
@@ -68,12 +68,12 @@ def section(report: Report) -> Section | None:
             path = film_of(run)
             if path is None:
                 continue
-            content = path.read_bytes()
+            content = read_file(path, NO_LIMIT)
             # What an environment does not take is left to the next ones.
             room = ALL_BYTES * n_done // len(runs_to_film) - sum(map(len, contents))
             if content in contents or len(content) <= room:
                 place = contents.setdefault(content, len(contents))
-                groups[-1].append(_film(run.agent, path, place))
+                groups[-1].append(_film(run.agent, path, content, place))
             else:
                 without_room[-1].append(run.agent)
     if not any(groups):
@@ -100,8 +100,8 @@ def film_of(planned: PlannedRun) -> Path | None:
         kept = min(len(frames), max(len(frames) * MAX_BYTES // len(film), 1))
         if kept < len(frames):
             film = as_gif(frames[:kept])
-        with replacing(path) as draft:
-            draft.write_bytes(film)
+        with replacing(path) as file:
+            file.write(film)
         write_json(path.with_suffix(".json"), {**episode, "frames": kept})
     return path
 
@@ -155,9 +155,9 @@ def _shrunk(frames: list[Any]) -> list[Any]:
     return [np.asarray(picture.convert("RGB")) for picture in few]
 
 
-def _film(agent: str, path: Path, place: int) -> Film:
+def _film(agent: str, path: Path, content: bytes, place: int) -> Film:
     still = io.BytesIO()
-    with Image.open(path) as picture:
+    with Image.open(io.BytesIO(content)) as picture:
         width, height = picture.size
         picture.convert("RGB").quantize(64).save(still, "PNG", optimize=True)
     return Film(
@@ -166,7 +166,7 @@ def _film(agent: str, path: Path, place: int) -> Film:
         place,
         width,
         height,
-        _caption(json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))),
+        _caption(json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))),
     )
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.launching import failure_log
 from experiments.looks_file import read_looks
 from experiments.planned_runs import PlannedRun
 from experiments.run_versions import mixed_versions
@@ -116,8 +115,7 @@ def _missing_runs(results: StudyResults, missing: Iterable[PlannedRun]) -> list[
     groups: dict[tuple[str, str, str], MissingRuns] = {}
     damaged = {one.planned.path: one.reason for one in results.left_out}
     for run in missing:
-        log = failure_log(results.root, run)
-        details = log.read_text(encoding="utf-8").strip() if log.exists() else ""
+        details = results.failures.get(run.path, "").strip()
         reason = damaged.get(run.path) or (details.splitlines()[-1] if details else "not done yet")
         key = (run.agent, run.environment, reason)
         seeds = groups[key].seeds if key in groups else []

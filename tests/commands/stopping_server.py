@@ -54,7 +54,7 @@ def moments():
         "compiling": (engine, "run_block", always),
         "training": (StateSaver, "_on_step", lambda *_: next(calls) == 3),
         "evaluating": (evaluation_callback.EvaluationCallback, "_append", always),
-        "saving": (files, "put_in_place", lambda draft, path: path.name == "FrozenLake-v1.zip"),
+        "saving": (files, "put_in_place", lambda draft, path, *_: path.name == "FrozenLake-v1.zip"),
         "judging": (finishing, "_final_evaluation", always),
         "drawing": (finishing, "draw_learning_curve", always),
         "recording": (Run, "end", always),

@@ -17,13 +17,13 @@ def train_on_full_disk(type_in_own_folder, own_folder, monkeypatch):
         folder = own_folder / "logs" / "qlearning" / "FrozenLake-v1_1"
         put_in_place, full = files.put_in_place, []
 
-        def put(draft, path):
+        def put(draft, path, *opened):
             if path.name == name:
                 assert (folder / ROOM).stat().st_size == ROOM_BYTES
                 full.append(path)
             if full and not (room_helps and not (folder / ROOM).exists()):
                 raise OSError(errno.ENOSPC, "No space left on device")
-            put_in_place(draft, path)
+            put_in_place(draft, path, *opened)
 
         monkeypatch.setattr(files, "put_in_place", put)
         code, _, said = type_in_own_folder(

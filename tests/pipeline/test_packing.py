@@ -45,6 +45,7 @@ def runs(tmp_path_factory):
     lake = {"is_slippery": False}
     table = trained(folder, "FrozenLake-v1", "qlearning", {"env_kwargs": lake}, 3000)
     (table.path / "route.gif").write_bytes(b"GIF89a")
+    table.add_file(table.path / "route.gif")
     small = {**SMALL, "n_timesteps": 64}
     ppo = trained(folder, "FrozenLake-v1", "ppo", small, tensorboard_log=folder / "tb")
     dqn = trained(folder, "CartPole-v1", "dqn", {**LEARNER, "normalize": True})

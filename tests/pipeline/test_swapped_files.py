@@ -2,6 +2,7 @@
 
 import hashlib
 import io
+import os
 import pathlib
 import shutil
 from dataclasses import replace
@@ -61,15 +62,16 @@ def swapped(runs, tmp_path, monkeypatch):
         opens = []
 
         def open_and_swap(path, *args, **kwargs):
-            file = opened(path, *args, **kwargs)
-            if path.is_relative_to(run.path) and path.suffix in (".zip", ".pkl"):
-                opens.append(path.name)
-                shutil.copy(other.path / path.relative_to(run.path), tmp_path / "other")
-                (tmp_path / "other").replace(path)
-            return file
+            number = opened(path, *args, **kwargs)
+            there = pathlib.Path(f"/proc/self/fd/{number}").readlink()
+            if there.is_relative_to(run.path) and there.suffix in (".zip", ".pkl"):
+                opens.append(there.name)
+                shutil.copyfile(other.path / there.relative_to(run.path), tmp_path / "other")
+                (tmp_path / "other").replace(there)
+            return number
 
-        opened = pathlib.Path.open
-        monkeypatch.setattr(pathlib.Path, "open", open_and_swap)
+        opened = os.open
+        monkeypatch.setattr(os, "open", open_and_swap)
         return run, opens
 
     return copy

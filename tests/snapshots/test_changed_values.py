@@ -29,9 +29,11 @@ KEY = b"k" * 32
 
 def gone_through(was_built, became, folder):
     """What becomes of a value that another process had built, and this one has changed."""
-    write_snapshot(folder / "file", record({"it": Holder(held=became)}), {}, KEY)
+    with (folder / "file").open("wb") as file:
+        write_snapshot(file, record({"it": Holder(held=became)}), {}, KEY)
     other = Holder(held=was_built)
-    restore(read_snapshot(folder / "file", KEY)[0], {"it": other})
+    with (folder / "file").open("rb") as file:
+        restore(read_snapshot(file, KEY)[0], {"it": other})
     return other.held
 
 

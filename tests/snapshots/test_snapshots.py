@@ -113,9 +113,19 @@ def as_text(value):
     return json.dumps(snapshot.nodes), [a.tobytes() for a in snapshot.arrays]
 
 
+def written(path, *args):
+    with path.open("wb") as file:
+        write_snapshot(file, *args)
+
+
+def read_back(path, key):
+    with path.open("rb") as file:
+        return read_snapshot(file, key)
+
+
 def through_file(snapshot, folder):
-    write_snapshot(folder / "file", snapshot, {"note": 1}, KEY)
-    found, note = read_snapshot(folder / "file", KEY)
+    written(folder / "file", snapshot, {"note": 1}, KEY)
+    found, note = read_back(folder / "file", KEY)
     assert note == {"note": 1}
     return found
 
@@ -269,27 +279,27 @@ def test_zeros_at_the_end_take_no_room(tmp_path):
 
 
 def test_every_flipped_bit_is_noticed(tmp_path):
-    write_snapshot(tmp_path / "file", record({"it": Holder(np.arange(3))}), {}, KEY)
+    written(tmp_path / "file", record({"it": Holder(np.arange(3))}), {}, KEY)
     content = bytearray((tmp_path / "file").read_bytes())
     for place in range(len(content)):
         content[place] ^= 1
         (tmp_path / "file").write_bytes(content)
         content[place] ^= 1
         with pytest.raises(BadSnapshotError):
-            read_snapshot(tmp_path / "file", KEY)
+            read_back(tmp_path / "file", KEY)
 
 
 @pytest.mark.parametrize("share", range(0, 100, 7))
 def test_every_truncation_is_noticed(tmp_path, share):
-    write_snapshot(tmp_path / "file", record({"it": Holder(np.arange(3))}), {}, KEY)
+    written(tmp_path / "file", record({"it": Holder(np.arange(3))}), {}, KEY)
     content = (tmp_path / "file").read_bytes()
     (tmp_path / "file").write_bytes(content[: len(content) * share // 100])
     with pytest.raises(BadSnapshotError):
-        read_snapshot(tmp_path / "file", KEY)
+        read_back(tmp_path / "file", KEY)
 
 
 def test_another_key_is_refused_before_anything_is_parsed(tmp_path, monkeypatch):
-    write_snapshot(tmp_path / "file", record({"it": Holder(1)}), {}, KEY)
+    written(tmp_path / "file", record({"it": Holder(1)}), {}, KEY)
     monkeypatch.setattr(json, "loads", lambda *_: pytest.fail("it was parsed"))
     with pytest.raises(BadSnapshotError, match="another user"):
-        read_snapshot(tmp_path / "file", b"x" * 32)
+        read_back(tmp_path / "file", b"x" * 32)

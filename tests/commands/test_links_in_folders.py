@@ -1,0 +1,360 @@
+"""Links, pipes and devices under all names in a stranger's folder: no way out, and no waiting."""
+
+import json
+import os
+import shutil
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+import compare
+import enjoy
+import train
+import tune
+from commands import inspect_model, pack_run
+from commands.parsing import run_command
+from pipeline.file_digests import FIELD, RECORD, digests_of, sealed
+from pipeline.files import replacing
+from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
+from pipeline.settings.hyperparams import split
+from pipeline.train_spec import TrainSpec
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import hold, read_file
+
+COMMANDS = {
+    "train": train.main,
+    "enjoy": enjoy.main,
+    "compare": compare.main,
+    "tune": tune.main,
+    "inspect": inspect_model.main,
+    "pack": pack_run.main,
+}
+SECRET = b"GIF89a the key to everything"
+LAKE, CART, ARMS = "FrozenLake-v1", "CartPole-v1", "BernoulliBandit-v0"
+SMALL = {"n_steps": 16, "batch_size": 16, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
+AGENTS = {
+    "table": ("qlearning", LAKE, {}),
+    "network": ("ppo", CART, {**SMALL, "normalize": True}),
+    "bandit": ("ucb", ARMS, {}),
+}
+OPTIONAL = (".lock", ".room", "state", "state/even.state", "modules", "aaa.gif", "pulls.npz")
+OPTIONAL += ("replay_buffer.pkl", "vec_normalize.pkl", "best_model_vecnormalize.pkl", "args.yml")
+STUDY = ("--env", LAKE, "--algos", "random", "--seeds", "2", "-n", "20", "--no-report", "-j", "1")
+STUDY_NAMES = ("looks.json", "summary.csv", "curves.csv.gz", "report.html", "verdicts.md", ".lock")
+STUDY_NAMES += (".drafts", "failures", "figures", "films", "learning", "replaced", "runs")
+TUNING = ("--env", LAKE, "--algo", "qlearning", "--n-episodes", "20", "--seeds-per-trial", "1")
+TUNING += ("--n-trials", "2", "--retest", "0", "-j", "1", "--no-report")
+TUNING_NAMES = ("trials.db", "trials.db-journal", "tuning.json", "winner.yml", "retest", ".lock")
+TUNING_NAMES += ("runs", ".drafts", "report.html")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """A finished run of each kind of agent, with a state that the next training may go on from."""
+    from pipeline.training import train as do_training
+
+    folder, found = tmp_path_factory.mktemp("runs"), {}
+    for kind, (algo, env_id, settings) in AGENTS.items():
+        raw = {"n_timesteps": 64, **settings}
+        fields = {"eval_episodes": 1, "n_eval_envs": 1, "device": "cpu", "verbose": 0}
+        spec = TrainSpec(algo, env_id, split(raw), raw, 0, log_folder=folder, **fields)
+        keeping = StateKeeping(SaveInterval(steps=16), stays=True)
+        found[kind] = do_training(spec, Console(quiet=True), {}, "train.py", keeping=keeping).run
+        assert list(found[kind].state_path.iterdir())
+    return found
+
+
+@pytest.fixture
+def outside(tmp_path):
+    """What no command may read or write: files and a folder beside the user's own."""
+    folder = tmp_path / "outside"
+    (folder / "inner").mkdir(parents=True)
+    (folder / "key").write_bytes(SECRET)
+    (folder / "inner" / "key").write_bytes(SECRET)
+    return folder
+
+
+@pytest.fixture
+def type_command(tmp_path, monkeypatch, capfd):
+    """Run a command in this process, where it may not take long: exit code and all output."""
+    (tmp_path / "own").mkdir()
+    monkeypatch.chdir(tmp_path / "own")
+    monkeypatch.setattr("pipeline.finishing._draw", lambda *_: None)
+
+    def run(command, *words):
+        monkeypatch.setattr(sys, "argv", [command, *map(str, words)])
+        signal.signal(signal.SIGALRM, lambda *_: pytest.fail(f"{command} hangs"))
+        signal.alarm(300 if "whole" in words else 50)  # to lay the ground takes long
+        try:
+            with pytest.raises(SystemExit) as stop:
+                run_command(COMMANDS[command])
+        finally:
+            signal.alarm(0)
+        out, err = capfd.readouterr()
+        assert stop.value.code in ((0, 1, 2) if command == "inspect" else (0, 2)), err
+        assert stop.value.code != 2 or err.count("\n") == 1, err
+        return stop.value.code, out + err
+
+    return run
+
+
+def put_device(path):
+    try:
+        os.mknod(path, 0o600 | 0o020000, os.makedev(1, 5))  # /dev/zero
+    except PermissionError:  # where tests are not root's
+        path.symlink_to("/dev/zero")
+
+
+def substitutes(outside, name, original):
+    """What takes the place of a name: links to files, one like the original, folders, nothing."""
+    like = outside / f"like {name.replace('/', ' ')}"
+    if original.is_dir():
+        shutil.copytree(original, like, dirs_exist_ok=True)
+    elif original.exists():
+        like.write_bytes(original.read_bytes())
+    return {
+        "key": lambda path: path.symlink_to(outside / "key"),
+        "like": lambda path: path.symlink_to(like),
+        "folder": lambda path: path.symlink_to(outside / "inner"),
+        "dangling": lambda path: path.symlink_to(outside / "not there"),
+        "pipe": os.mkfifo,
+        "device": put_device,
+    }
+
+
+def held_in(folder):
+    return {path: path.is_file() and path.read_bytes() for path in folder.rglob("*")}
+
+
+def names_in(folder, more=()):
+    there = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}
+    return sorted(there | set(more))
+
+
+def attack(genuine, names, outside, copies, act, n_each=2):
+    """Put substitutes in the place of each name of a copy, act on it, and look outside.
+
+    The first is a link to what is like the original, the others are each name's next ones in turn.
+    """
+    turn = 0
+    for name in names:
+        puts = substitutes(outside, name, genuine / name)
+        others = [what for what in puts if what != "like"]
+        chosen = ["like", *(others[(turn + i) % len(others)] for i in range(n_each - 1))]
+        turn += n_each - 1
+        for what in chosen:
+            put = puts[what]
+            shutil.rmtree(copies, ignore_errors=True)
+            shutil.copytree(genuine, copies)
+            path = copies / name
+            shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
+            path.parent.mkdir(exist_ok=True)
+            put(path)
+            before = held_in(outside)
+            act(f"{name} is {what}")
+            assert held_in(outside) == before, f"{name} is {what}: written outside"
+
+
+def check_untold(said, own):
+    assert SECRET.decode() not in said
+    for path in own.rglob("*"):
+        if path.is_file() and not path.is_symlink():
+            assert SECRET not in path.read_bytes(), path
+
+
+def rewrite(folder, **fields):
+    info = json.loads((folder / RECORD).read_text())
+    (folder / RECORD).write_text(json.dumps(sealed({**info, **fields})))
+    return info
+
+
+def interrupted(genuine, folder, has_state):
+    """A copy of a run as if it had been interrupted, with a seal as anybody can make it."""
+    shutil.copytree(genuine, folder)
+    rewrite(folder, state="interrupted")
+    if not has_state:
+        shutil.rmtree(folder / "state")
+
+
+# --- runs ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", AGENTS)
+def test_a_finished_run(runs, outside, type_command, kind):
+    genuine, (algo, env_id, _) = runs[kind].path, AGENTS[kind]
+    own = Path.cwd()
+    copy = own / genuine.name
+    small = ("-params", "n_steps:16", "batch_size:16") if kind == "network" else ()
+
+    def act(told):
+        play = ("--render", "none", "--n-episodes", "1")
+        said = [type_command("enjoy", copy, *play), type_command("pack", copy, own / "pack.zip")]
+        if ".zip is" in told:
+            said.append(type_command("inspect", copy / f"{env_id}.zip"))
+        if any(read in told for read in (".zip is", ".pkl is", f"{RECORD} is", f"{env_id} is")):
+            words = ("--algo", algo, "--env", env_id, "-n", "16", "-f", own / "logs", *small)
+            said.append(type_command("train", *words, "-i", copy, "--eval-freq", "-1"))
+        check_untold("".join(text for _, text in said), own)
+        if told.startswith(f"{env_id}.zip is"):
+            assert {said[0][0], said[1][0], said[-1][0]} == {2}, told
+        (own / "pack.zip").unlink(missing_ok=True)
+
+    names = [name for name in names_in(genuine, OPTIONAL) if "state" not in name]
+    attack(genuine, names, outside, copy, act)
+
+
+@pytest.mark.parametrize("kind", AGENTS)
+@pytest.mark.parametrize("has_state", [True, False])
+def test_an_interrupted_run(runs, outside, type_command, kind, has_state):
+    genuine = runs[kind].path
+    folder = Path.cwd() / "begun" / genuine.parent.name / genuine.name
+    interrupted(genuine, folder, has_state)
+    copy = Path.cwd() / "logs" / genuine.parent.name / genuine.name
+
+    def act(told):
+        code, said = type_command("train", "--resume", copy)
+        assert code == 2, told
+        check_untold(said, Path.cwd())
+
+    attack(folder, names_in(folder, OPTIONAL), outside, copy, act, n_each=6)
+
+
+def test_another_name_of_what_is_appended_to_keeps_what_it_holds(runs, outside, type_command):
+    for has_state in (True, False):
+        copy = Path.cwd() / f"logs-{has_state}" / "qlearning" / "FrozenLake-v1_1"
+        interrupted(runs["table"].path, copy, has_state)
+        names = [name for name in names_in(copy) if (copy / name).is_file()]
+        held = {}
+        for number, name in enumerate(names):
+            other = outside / f"{has_state} {number}"
+            os.link(copy / name, other)
+            held[other] = other.read_bytes()
+        code, said = type_command("train", "--resume", copy)
+        assert code == 0, said
+        assert {path: path.read_bytes() for path in held} == held
+
+
+def test_a_run_of_a_stranger_is_begun_again_and_writes_over_no_page(runs, type_command, outside):
+    copy = Path.cwd() / "logs" / "qlearning" / "FrozenLake-v1_1"
+    interrupted(runs["table"].path, copy, has_state=False)
+    spec = {**rewrite(copy)["spec"], "watch_learning": str(outside / "key")}
+    events = outside / "events.out.tfevents.1"
+    events.write_bytes(b"mine")
+    rewrite(copy, spec=spec, tensorboard=str(outside))
+    code, said = type_command("train", "--resume", copy)
+    assert code == 0, said
+    assert "is there already and stays" in said
+    assert (outside / "key").read_bytes() == SECRET
+    assert events.read_bytes() == b"mine"
+
+
+def test_a_run_of_rl_zoo3(runs, outside, type_command):
+    genuine = Path.cwd() / "zoo"
+    shutil.copytree(
+        runs["network"].path, genuine, ignore=shutil.ignore_patterns("run.json", "state")
+    )
+    copy = Path.cwd() / "ppo" / "CartPole-v1_1"
+
+    def act(told):
+        play = ("--render", "none", "--n-episodes", "1")
+        said = type_command("enjoy", copy, *play)
+        more = type_command("enjoy", "--algo", "ppo", "--env", CART, "-f", Path.cwd(), *play)
+        check_untold(said[1] + more[1], Path.cwd())
+
+    names = [f"{CART}.zip", CART, f"{CART}/config.yml", f"{CART}/args.yml"]
+    names += [f"{CART}/vecnormalize.pkl", "vec_normalize.pkl", "config.yml", "args.yml"]
+    attack(genuine, names, outside, copy, act)
+
+
+def test_what_is_packed_is_what_the_record_names(runs, outside, type_command):
+    """Even a link whose digest the record has, and a file that lies there by chance."""
+    copy = Path.cwd() / "gift"
+    shutil.copytree(runs["table"].path, copy)
+    (copy / "aaa.gif").write_bytes(b"GIF89a by chance")
+    code, said = type_command("pack", copy, "first")
+    assert code == 0, said
+    assert not list(Path("first").glob("replay.*"))
+    (copy / "aaa.gif").unlink()
+    (copy / "aaa.gif").symlink_to(outside / "key")
+    rewrite(copy, **{FIELD: {**rewrite(copy)[FIELD], "aaa.gif": digests_of(outside)["key"]}})
+    code, said = type_command("pack", copy, "second")
+    assert (code, Path("second").exists()) == (2, False)
+    assert "aaa.gif is no regular file: it is a link" in said
+
+
+# --- studies, searches, packs --------------------------------------------------------------------
+
+
+def test_a_study(outside, type_command):
+    root = Path.cwd() / "logs" / "studies"
+    assert type_command("compare", *STUDY, "--name", "whole")[0] == 0
+    whole = root / "whole"
+
+    def act(told):
+        repair = ("--repair",) if "like" in told else ()
+        code, said = type_command("compare", *STUDY, "--name", "copy", *repair)
+        assert code == 2, told
+        check_untold(said, Path.cwd())
+
+    run = Path(next(name for name in names_in(whole) if name.endswith(f"/{RECORD}")))
+    names = [*STUDY_NAMES, "failures/x.txt", "replaced/1", *map(str, (run, *run.parents[:2]))]
+    attack(whole, names, outside, root / "copy", act)
+
+
+def test_a_search(outside, type_command):
+    root = Path.cwd() / "logs" / "tuning"
+    assert type_command("tune", *TUNING, "--name", "whole")[0] == 0
+
+    def act(told):
+        code, said = type_command("tune", *TUNING, "--name", "copy")
+        assert code == 2, told
+        check_untold(said, Path.cwd())
+
+    attack(root / "whole", TUNING_NAMES, outside, root / "copy", act)
+
+
+def test_a_pack(runs, outside, type_command):
+    genuine = Path.cwd() / "genuine"
+    assert type_command("pack", runs["network"].path, genuine)[0] == 0
+    copy = Path.cwd() / "copy"
+
+    def act(told):
+        code, said = type_command("pack", "--check", copy)
+        assert code == 2, told
+        said += type_command("enjoy", copy, "--render", "none", "--n-episodes", "1")[1]
+        check_untold(said, Path.cwd())
+
+    attack(genuine, names_in(genuine), outside, copy, act)
+
+
+# --- the door itself -----------------------------------------------------------------------------
+
+
+def test_a_folder_that_is_exchanged_while_a_file_is_written_changes_nothing(tmp_path, outside):
+    run = tmp_path / "run"
+    (run / "state").mkdir(parents=True)
+    hold(run)
+    with replacing(run / "state" / "even.state") as file:
+        file.write(b"whole")
+        (run / "state").rename(run / "moved")
+        (run / "state").symlink_to(outside)
+    assert (run / "moved" / "even.state").read_bytes() == b"whole"
+    assert sorted(path.name for path in outside.iterdir()) == ["inner", "key"]
+    with pytest.raises(OSError, match="behind a link"), replacing(run / "state" / "even.state"):
+        pytest.fail("it was opened")
+    with pytest.raises(UnsafeFileError, match="behind a link"):
+        read_file(run / "state" / "key", 100)
+
+
+def test_a_link_above_the_folder_is_the_users_own(tmp_path, outside):
+    (tmp_path / "disk" / "run").mkdir(parents=True)
+    (tmp_path / "logs").symlink_to(tmp_path / "disk")
+    hold(tmp_path / "logs" / "run")
+    with replacing(tmp_path / "logs" / "run" / "a.zip") as file:
+        file.write(b"whole")
+    assert read_file(tmp_path / "logs" / "run" / "a.zip", 100) == b"whole"
+    (tmp_path / "link").symlink_to(outside / "key")
+    assert read_file(tmp_path / "link", 100) == SECRET
