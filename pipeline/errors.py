@@ -45,7 +45,7 @@ _brief.maxstring = _brief.maxother = 60
 
 # What a terminal obeys instead of showing it, but for ends of lines and tabs; and what turns the
 # direction of writing round.
-_OBEYED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+_OBEYED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 
 
 class UserError(Exception):
