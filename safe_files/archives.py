@@ -22,6 +22,7 @@ _DAMAGE = (
     OSError,
     ValueError,
     EOFError,
+    OverflowError,
     NotImplementedError,
     RuntimeError,
 )
