@@ -14,7 +14,7 @@ begin anew.
 With ``--at-calls`` short commands, also a search and a pack, get one of the first three signals
 when one of their processes is about to make the k-th system call that changes the folder: write,
 fsync, rename, mkdir, unlink and the like; k is drawn uniformly. Before SIGKILL half of a write is
-done. After two such stops the command is left alone. That needs Linux and a C compiler.
+done. After three such stops the command is left alone. That needs Linux and a C compiler.
 
 Counted are results that differ, files that
 are damaged, processes that are left, and files that are left. All must be none.
@@ -202,7 +202,7 @@ def main() -> int:
         os.environ["XDG_CONFIG_HOME"] = str(Path(folder) / "config")
         found = (short_cases if args.at_calls else cases)(Path(folder))
         chosen = [case for case in found if case.name in args.only or not args.only]
-        most = 2 if args.at_calls else args.kills
+        most = 3 if args.at_calls else args.kills
         signals, seed = 0, 0
         with ThreadPoolExecutor(args.jobs) as pool:
             list(pool.map(Case.prepare, chosen))
