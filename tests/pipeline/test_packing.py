@@ -286,7 +286,8 @@ def test_links_twins_and_what_nobody_listed(packed):
     for change, mode, complaint in [
         ({"link": b"/etc/passwd"}, stat.S_IFLNK | 0o777, "'link', which is no regular file"),
         ({"pipe": b""}, stat.S_IFIFO | 0o600, "'pipe', which is no regular file"),
-        ({"folder/": b""}, 0, "'folder/', which is no regular file"),
+        ({"folder/": b""}, 0, "'folder/', which would lie elsewhere"),
+        ({"": b""}, 0, "'', which would lie elsewhere"),
         ({"readme.md": b""}, 0, "two names that some systems take for one"),
         ({"README.md/a": b""}, 0, "a file that is a folder too"),
         ({"more.py": b"print()"}, 0, "'more.py' is not among the files that run.json lists"),
