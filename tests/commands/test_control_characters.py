@@ -42,7 +42,7 @@ def complaint(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
-        ("\u061cb", r"\u061cb"),
+        ("\u061cb\udce9", r"\u061cb\udce9"),
         (HOSTILE, r"\x1b]0;x\x07\x1b[2J"),
         ("\x9b2J", r"\x9b2J"),
         ("a\u202eb\u2066", r"a\u202eb\u2066"),
@@ -99,6 +99,10 @@ def test_titles_and_labels_of_a_study(complaint, tmp_path):
     text = json.dumps(HOSTILE)  # which YAML reads as JSON does
     for lines in (
         f"agents: {{{text}: }}\nenvironments: [FrozenLake-v1]\n",
+        f"agents: {{{text}: {{algo: sarsa}}}}\nenvironments: [FrozenLake-v1]\n",
+        f"agents: [sarsa]\nenvironments: {{{text}: {{id: FrozenLake-v1}}}}\n",
+        f"title: {text}\nagents: [sarsa]\nenvironments: [FrozenLake-v1]\n",
+        f"description: {text}\nagents: [sarsa]\nenvironments: [FrozenLake-v1]\n",
         f"agents: [qlearning]\nenvironments: [{text}]\n",
         f"{text}: 1\n",
         f"metric: {text}\n",
@@ -106,6 +110,8 @@ def test_titles_and_labels_of_a_study(complaint, tmp_path):
     ):
         study.write_text(lines)
         assert r"\x1b" in complaint(compare_agents, study)
+        study.write_text(lines.replace("\\u001b", "\\ud83d"))
+        assert r"\ud83d" in complaint(compare_agents, study)
 
 
 def test_no_command_prints_by_another_console():
