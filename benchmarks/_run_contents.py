@@ -15,6 +15,8 @@ import numpy as np
 import torch as th
 
 TIMES = ("seconds", "cpu_seconds")
+# Digests of files with times in them, the settings with the folder's name, and who did it.
+NOT_COMPARED = (*TIMES, "began", "ended", "files", "spec", "process", "command", "packed")
 
 
 def contents(logs: Path) -> dict[str, Any]:
@@ -40,9 +42,8 @@ def _content(path: Path) -> Any:
     if path.name.endswith("monitor.csv"):
         lines = path.read_text(encoding="utf-8").splitlines()
         return [line.split(",")[:2] for line in lines[1:]]
-    if path.name == "run.json":
-        info = json.loads(path.read_text(encoding="utf-8"))
-        return {k: v for k, v in info.items() if k not in (*TIMES, "files", "spec", "process")}
+    if path.suffix == ".json":
+        return _without_times(json.loads(path.read_text(encoding="utf-8")))
     if path.suffix in (".csv", ".gz"):
         opened = gzip.open if path.suffix == ".gz" else open
         with opened(path, "rt", encoding="utf-8", newline="") as file:
@@ -52,6 +53,12 @@ def _content(path: Path) -> Any:
         return path.read_bytes()
     # In what is left stand commands, durations and folders.
     return path.suffix
+
+
+def _without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {k: _without_times(v) for k, v in value.items() if k not in NOT_COMPARED}
+    return [_without_times(held) for held in value] if isinstance(value, list) else value
 
 
 def _bits(value: Any) -> Any:

@@ -185,12 +185,12 @@ def _compare(args: argparse.Namespace) -> int:
     root = Path(args.log_folder) / study.name
     take_up(root)
     console = table_console()
-    say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    say = partial(console.print, highlight=False, soft_wrap=True)
     place = place_of(
         args, root, command_line(), RunLimits(study.run_timeout, study.run_memory), say
     )
     planned = plan(study, root)
-    console.print(study.title, style="bold", markup=False, highlight=False)
+    console.print(study.title, style="bold", highlight=False)
     with folder_lock(root, give_way, say), told_if_gone(root):
         try:
             if args.until_decided:

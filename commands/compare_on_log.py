@@ -30,7 +30,7 @@ def compare_on_log(args: argparse.Namespace) -> int:
     console = table_console(highlight=False)
     n = len(args.policy)
     about = f"{n} {'policy' if n == 1 else 'policies'} on {args.logged}"
-    console.print(about, markup=False, soft_wrap=True)
+    console.print(about, soft_wrap=True)
     with doing(console, "reading the log") as activity:
         compared = _compare(args, modules, activity)
     from report.off_policy_table import print_comparison

@@ -183,7 +183,7 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest, film: Path | Non
     is_moved = wanted.path is not None and wanted.path != Path(args.model)
     place = args.model if is_moved else found.path  # of a pack's zip, the zip
     about = f"{found.spec.algo} on {found.spec.env_id}: {place}"
-    console.print(about, markup=False, soft_wrap=True)
+    console.print(about, soft_wrap=True)
     with doing(console, "loading the libraries"), loading_libraries():
         from commands.playing_output import PlayingRequest, play
         from pipeline.models.model_choice import with_statistics

@@ -51,7 +51,7 @@ def main() -> int:
 def _print(title: str, lines: Mapping[str, str]) -> None:
     width = max(map(len, lines), default=0)
     rows = [f"  {name:<{width}}  {text}".rstrip() for name, text in lines.items()]
-    table_console().print("\n".join([title, *rows]), markup=False, highlight=False, soft_wrap=True)
+    table_console().print("\n".join([title, *rows]), highlight=False, soft_wrap=True)
 
 
 if __name__ == "__main__":

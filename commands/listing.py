@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gymnasium as gym
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
@@ -29,7 +28,7 @@ def _print_agents(console: Console) -> None:
     table.add_column("what it is")
     for name, entry in ALGORITHMS.items():
         missing = "" if entry.is_installed else f"  needs: {entry.install_command}"
-        table.add_row(escape(name), escape(entry.summary + missing))
+        table.add_row(name, entry.summary + missing)
     print_rows(console, table)
 
 

@@ -100,7 +100,7 @@ class LiveProgress(ABC):
     def say(self, line: str) -> None:
         """Print a line that stays."""
         self.silence.end()
-        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self.console.print(line, highlight=False, soft_wrap=True)
 
 
 def duration(seconds: float) -> str:

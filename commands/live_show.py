@@ -84,7 +84,7 @@ class LiveShow:
         self.returns.append(total_return)
         self.lengths.append(length)
         line = f"episode {len(self.returns)}: return {total_return:.2f}, {length} steps"
-        self._live.console.print(line, markup=False, highlight=False, soft_wrap=True)
+        self._live.console.print(line, highlight=False, soft_wrap=True)
 
     def _draw(self, frames: list[Any], figures: ActionFigures | None, chosen: int | None) -> None:
         if frames:

@@ -43,6 +43,7 @@ def main() -> int:
     from commands.terminal import TextConsole
     from pipeline.errors import UserError
     from pipeline.packing.pack_files import check_pack, default_target, pack
+    from pipeline.stopping import stops_noticed
 
     console, path = TextConsole(highlight=False), Path(args.run)
     if not path.exists():
@@ -51,13 +52,14 @@ def main() -> int:
         if args.target is not None:
             raise UserError(f"--check writes nothing: leave out {args.target}")
         told = f"{path}: {check_pack(path)} files, each as it was packed"
-        console.print(told, markup=False, soft_wrap=True)
+        console.print(told, soft_wrap=True)
         return 0
     if not path.is_dir():
         raise UserError(f"{path} is a file: name the folder of a run")
-    target = pack(path, default_target(path) if args.target is None else Path(args.target))
-    console.print(f"pack  {target}", markup=False, soft_wrap=True)
-    console.print(f"play  {called_as('enjoy')} {target}", markup=False, soft_wrap=True)
+    with stops_noticed():
+        target = pack(path, default_target(path) if args.target is None else Path(args.target))
+    console.print(f"pack  {target}", soft_wrap=True)
+    console.print(f"play  {called_as('enjoy')} {target}", soft_wrap=True)
     return 0
 
 

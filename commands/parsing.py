@@ -9,8 +9,11 @@ import contextlib
 import importlib.util
 import io
 import os
+import re
 import shlex
 import sys
+import traceback
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from signal import SIGINT, Signals
@@ -34,6 +37,8 @@ COMMANDS = {
     "pack": "make a finished run a folder or zip for others, with a model card",
     "inspect": "say what a model file holds, and run nothing of it",
 }
+
+_COLOURS = re.compile(r"\x1b\[[0-9;]*m")  # Gymnasium's warnings bring their own
 
 # What stands for signs that a terminal's encoding lacks; a question mark for all others.
 PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
@@ -104,6 +109,8 @@ def run_command(main: Callable[[], int]) -> NoReturn:
     code 2. A reader of the output who goes away is no mistake: see `commands.streams`.
     """
     print_on_any_terminal()
+    warnings.formatwarning = _warning
+    sys.excepthook = _tell_unforeseen
     codes: list[int] = []
     before = n_stops()
     atexit.register(_leave, codes)  # before the libraries', so that it is called after them
@@ -210,6 +217,23 @@ def command_line() -> str:
     program, *arguments = sys.argv
     words = program.split() if program.startswith(f"{NAME} ") else ["python", program]
     return shlex.join([*words, *arguments])
+
+
+def _warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    line: str | None = None,
+) -> str:
+    """A library's warning in one line, as mistakes are told: what it quotes may be a stranger's."""
+    text = _COLOURS.sub("", one_line(message) if isinstance(message, Warning) else message)
+    return f"{program_name()}: warning: {visible(text)}\n"
+
+
+def _tell_unforeseen(kind: type[BaseException], error: BaseException, trace: Any) -> None:
+    """A traceback, which may quote a stranger's texts too."""
+    sys.stderr.write(visible("".join(traceback.format_exception(kind, error, trace))))
 
 
 def print_on_any_terminal() -> None:

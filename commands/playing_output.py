@@ -204,7 +204,7 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
             return
         obstacle = evaluator.obstacle(model, deterministic)
         if obstacle:
-            console.print(f"[dim]sampled, not exact: {spec.algo}: {obstacle}[/]")
+            console.print(f"sampled, not exact: {spec.algo}: {obstacle}", style="dim")
             return
         if why_not_exact(model, evaluator.observations):
             return

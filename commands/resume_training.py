@@ -123,7 +123,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
 def _nothing_to_do(args: argparse.Namespace, run: Run, console: Console) -> int:
     if not args.keep_state:  # of a process that was killed just before it did that
         remove_states(run.state_path)
-    console.print(f"{run.path} is finished already", markup=False, highlight=False)
+    console.print(f"{run.path} is finished already", highlight=False)
     return 0
 
 

@@ -8,8 +8,8 @@ from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from commands.parsing import called_as
 from commands.terminal import print_rows
@@ -86,24 +86,23 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     """Say what is about to be trained, and with which hyperparameters."""
     budget = spec.hyperparams.n_timesteps or spec.hyperparams.n_episodes or 0
     unit = "steps" if spec.hyperparams.n_timesteps else "episodes"
+    agent, environment = Text(spec.algo, "bold"), Text(spec.env_id, "bold")
     console.print(
-        f"[bold]{spec.algo}[/] on [bold]{spec.env_id}[/], seed {spec.seed}, {budget:,} {unit}"
+        Text.assemble(agent, " on ", environment, f", seed {spec.seed}, {budget:,} {unit}")
     )
     settings = "  ".join(f"{key}={_brief(value)}" for key, value in spec.saved_hyperparams.items())
-    console.print(f"[dim]{settings}[/]", highlight=False)
+    console.print(settings, style="dim", highlight=False)
 
 
 def print_line(console: Console, line: str) -> None:
     """Say something beside the figures, in one line however long it is."""
-    console.print(line, style="dim", markup=False, highlight=False, soft_wrap=True)
+    console.print(line, style="dim", highlight=False, soft_wrap=True)
 
 
 def print_refusal(console: Console, refusal: str | None) -> None:
     """Say why the environment's own model is not used, where that is so."""
     if refusal is not None:
-        console.print(
-            f"{refusal}; figures are sampled", markup=False, highlight=False, soft_wrap=True
-        )
+        console.print(f"{refusal}; figures are sampled", highlight=False, soft_wrap=True)
 
 
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
@@ -128,12 +127,12 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     rows.append(("files", str(outcome.run.path)))
     table = Table.grid(padding=(0, 2))
     for row in rows:
-        table.add_row(*map(escape, row))
+        table.add_row(*row)
     print_rows(console, table)
     # On one line, however long: it is there to be copied.
     width = max(len(label) for label, _ in rows) + 2
     command = f"{'watch':<{width}}{watch_command(spec, outcome.run)}"
-    console.print(command, highlight=False, markup=False, soft_wrap=True)
+    console.print(command, highlight=False, soft_wrap=True)
 
 
 def _describe_evaluations(outcome: Outcome) -> str:
@@ -209,4 +208,4 @@ def _write_watched(console: Console, training: Training) -> None:
 
     with doing(console, "writing the page that plays the training"):
         write_learning_page(training.spec, training.watch, path)
-    console.print(f"learning {path}", markup=False, highlight=False, soft_wrap=True)
+    console.print(f"learning {path}", highlight=False, soft_wrap=True)

@@ -170,7 +170,7 @@ def _whose(damaged: LeftOut) -> str:
 
 def say(console: Console, line: str) -> None:
     """Print a line as it is."""
-    console.print(line, markup=False, highlight=False, soft_wrap=True)
+    console.print(line, highlight=False, soft_wrap=True)
 
 
 def do_missing(
@@ -190,7 +190,6 @@ def do_missing(
     done = [run for run in planned if run.is_finished]
     console.print(
         f"{len(planned)} runs, {len(done)} of them there already; {place.words}, in {root}",
-        markup=False,
         highlight=False,
     )
     with StudyProgress(console, planned, done) as progress:
@@ -279,6 +278,6 @@ def _films(results: StudyResults, activity: Activity) -> list[Path]:
 
 def _print_files(console: Console, root: Path, files: Sequence[Path]) -> None:
     console.print()
-    console.print(f"files: {root}", markup=False, highlight=False)
+    console.print(f"files: {root}", highlight=False)
     for path in files:
-        console.print(f"  {path.relative_to(root)}", markup=False, highlight=False)
+        console.print(f"  {path.relative_to(root)}", highlight=False)

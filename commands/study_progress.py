@@ -7,9 +7,9 @@ from collections import Counter
 from collections.abc import Sequence
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress_bar import ProgressBar
 from rich.table import Table
+from rich.text import Text
 
 from commands.live_progress import LiveProgress, duration
 from experiments.launching import RunFailure
@@ -82,9 +82,9 @@ class StudyProgress(LiveProgress):
         for key, total in self.total.items():
             done, failed = self.done[key], self.failed[key]
             table.add_row(
-                *map(escape, key),
+                *key,
                 f"{done}/{total}",
                 ProgressBar(total=total, completed=done, width=24),
-                f"[red]{failed}[/]" if failed else "",
+                Text(str(failed), "red") if failed else "",
             )
         return table

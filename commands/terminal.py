@@ -20,8 +20,12 @@ UNBOUNDED = 10_000  # columns
 class TextConsole(Console):
     """A console that shows what control characters there are in a text, and obeys none of them.
 
-    Labels, titles and names come from files; what moves the cursor or sets a colour is Rich's own.
+    Labels, titles and names come from files, so Rich's markup, which can crash or make links of
+    them, is text too. What moves the cursor or sets a colour is Rich's own: see ``style``.
     """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, **options)
 
     def print(self, *objects: Any, **options: Any) -> None:
         """As Rich does; into a file or a pipe no line is broken, so that `grep` finds it whole."""
@@ -65,4 +69,4 @@ def print_rows(console: Console, table: Table) -> None:
     wide = TextConsole(file=StringIO(), width=UNBOUNDED)
     wide.print(table, highlight=False)
     for line in wide.file.getvalue().splitlines():  # type: ignore[attr-defined]  # it is ours
-        console.print(line.rstrip(), markup=False, highlight=False, soft_wrap=True)
+        console.print(line.rstrip(), highlight=False, soft_wrap=True)

@@ -40,7 +40,7 @@ def _tune(args: argparse.Namespace) -> int:
 
     go_on_unread()
     console = table_console()
-    console.print(tuning.study.title, style="bold", markup=False, highlight=False)
+    console.print(tuning.study.title, style="bold", highlight=False)
     root = Path(args.log_folder) / tuning.study.name
     try:
         how = _how(args, tuning, root, console)
@@ -69,7 +69,7 @@ def _how(args: argparse.Namespace, tuning: TuningSpec, root: Path, console: Cons
     # Every run folder notes the command, which is no place for a password.
     command = without_secret(command_line())
     limits = RunLimits(tuning.study.run_timeout, tuning.study.run_memory)
-    say = partial(console.print, markup=False, highlight=False, soft_wrap=True)
+    say = partial(console.print, highlight=False, soft_wrap=True)
 
     @cache
     def place(folder: Path) -> Place:

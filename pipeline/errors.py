@@ -43,9 +43,11 @@ _brief = reprlib.Repr()
 _brief.maxstring = _brief.maxother = 60
 
 
-# What a terminal obeys instead of showing it, but for ends of lines and tabs; and what turns the
-# direction of writing round.
-_OBEYED = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+# What a terminal obeys instead of showing it, but for ends of lines and tabs; what turns the
+# direction of writing round; and halves of characters, which no file can hold.
+_OBEYED = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 
 
 class UserError(Exception):

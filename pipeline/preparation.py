@@ -10,7 +10,6 @@ from typing import Any, cast
 import torch as th
 from gymnasium import spaces
 from rich.console import Console
-from rich.markup import escape
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
@@ -214,7 +213,7 @@ def _n_eval_envs(spec: TrainSpec, model: BaseAlgorithm, *, is_exact: bool) -> in
 
 
 def _say(console: Console, line: str) -> None:
-    console.print(f"[dim]{escape(line)}[/]")
+    console.print(line, style="dim", markup=False)
 
 
 def _exact_evaluator(
@@ -226,7 +225,7 @@ def _exact_evaluator(
         "" if exact is None else exact.obstacle(model) or why_not_exact(model, exact.observations)
     )
     if reason:
-        console.print(f"[dim]evaluations are sampled, not exact: {escape(reason)}[/]")
+        _say(console, f"evaluations are sampled, not exact: {reason}")
     elif exact is not None and (note := map_refusal(exact)) is not None:
         _say(console, note)
     return None if reason else exact

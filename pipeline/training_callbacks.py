@@ -72,7 +72,7 @@ def named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[Bas
 def pull_recorder(model: BaseAlgorithm, run: Run, console: Console) -> PullRecorder | None:
     """What keeps every pull, unless a compiled loop was asked for, which does not stop at each."""
     if getattr(model, "engine", None) == "compiled":
-        console.print("[dim]engine: compiled keeps no pulls, so that regret is not known[/]")
+        console.print("engine: compiled keeps no pulls, so that regret is not known", style="dim")
         return None
     return PullRecorder(run.path)
 

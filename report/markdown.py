@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from pipeline.errors import visible
 from report.markup_language import MarkupLanguage
 
 _PLAIN_NAME = re.compile(r"[\w.=+-]+")
@@ -28,14 +29,14 @@ def name_of(label: str) -> str:
 
 def escaped(text: str) -> str:
     """Text in which nothing is markup."""
-    return _MARKUP.sub(lambda found: "\\" + found[0], " ".join(text.split()))
+    return _MARKUP.sub(lambda found: "\\" + found[0], " ".join(visible(text).split()))
 
 
 MARKDOWN = MarkupLanguage(
     preamble=lambda _: "",
     title=lambda text: f"# {escaped(text)}",
     heading=lambda text: f"## {escaped(text)}",
-    command=lambda text: f"`{text.replace('`', ' ')}`",
+    command=lambda text: f"`{visible(text).replace('`', ' ')}`",
     text=escaped,
     items=lambda texts: "\n".join(f"- {escaped(text)}" for text in texts),
     name=name_of,

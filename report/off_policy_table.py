@@ -23,7 +23,7 @@ def print_comparison(console: Console, comparison: Comparison) -> None:
     """Print the table, what it says in sentences, and the notes."""
     console.print(_table(comparison))
     for sentence in [*sentences(comparison), *comparison.notes]:
-        console.print(f"  {sentence}", markup=False)
+        console.print(f"  {sentence}")
 
 
 def _table(comparison: Comparison) -> Table:

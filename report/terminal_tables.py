@@ -7,7 +7,6 @@ from typing import TypeVar
 
 import pandas as pd
 from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
 
@@ -43,7 +42,7 @@ def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
         _print_conclusion(console, analysis.study, environment)
     console.print()
     origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
-    console.print(origin, highlight=False, markup=False)
+    console.print(origin, highlight=False)
 
 
 def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
@@ -51,7 +50,7 @@ def _print_conclusion(console: Console, study: StudySpec, environment: Environme
     said = conclusion(study, environment)
 
     def say(text: str) -> None:
-        console.print(text, highlight=False, markup=False)
+        console.print(text, highlight=False)
 
     say(said.lead)
     if says_more(environment):
@@ -76,7 +75,7 @@ def _matrix(environment: EnvironmentAnalysis) -> Table:
         table.add_column(place, justify="right", no_wrap=True)
     for place, name, row in zip(numbers, names, verdict_matrix(environment), strict=True):
         signs = ["·" if verdict is None else SIGNS[verdict] for verdict in row]
-        table.add_row(place, escape(name), *signs)
+        table.add_row(place, name, *signs)
     return table
 
 
@@ -90,7 +89,7 @@ def _print_ranking(
         if (agent.agent, label) in pulls
     ]
     if on_bandit:
-        left_out = _print_fitting(console, escape(label), BANDIT_COLUMNS, on_bandit)
+        left_out = _print_fitting(console, label, BANDIT_COLUMNS, on_bandit)
         explained = _bandit_caption(analysis.study, left_out)
     else:
         rows = [Row(agent, environment) for agent in environment.agents]
@@ -100,7 +99,7 @@ def _print_ranking(
     if left_out:
         explained.append(f"a wider terminal shows {enumeration(left_out)} too")
     # As wide as the terminal, and not as the table, which may be narrow.
-    console.print("; ".join(explained), style="italic dim", highlight=False, markup=False)
+    console.print("; ".join(explained), style="italic dim", highlight=False)
 
 
 def _print_fitting(
@@ -135,12 +134,12 @@ def _table(
         table.add_column(column.terminal, justify="right")
     for place, name in enumerate(names):
         cells = [cells[place] for _, cells in shown]
-        table.add_row(escape(name), *(cell.in_line or cell.text for cell in cells))
+        table.add_row(name, *(cell.in_line or cell.text for cell in cells))
     return table
 
 
 def _title(environment: EnvironmentAnalysis) -> str:
-    title = escape(environment.environment)
+    title = environment.environment
     if environment.optimum is not None:
         title += f": optimum {optimum_words(environment.optimum, environment.optimum_at_least)}"
         title += f", best random or constant policy {number(environment.baseline)}"
@@ -187,11 +186,11 @@ def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> N
     """Print the table of `episodes_table`, agents side by side."""
     for environment, rows in table.groupby("environment", sort=False):
         title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
-        printed = Table(title=escape(title), title_justify="left")
+        printed = Table(title=title, title_justify="left")
         printed.add_column("episode", justify="right")
         agents = list(dict.fromkeys(rows["agent"]))
         for agent in agents:
-            printed.add_column(escape(str(agent)), justify="right")
+            printed.add_column(str(agent), justify="right")
         by_episode = rows.set_index(["episode", "agent"])
         for episode in sorted(set(rows["episode"])):
             cells = []

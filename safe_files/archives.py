@@ -37,6 +37,7 @@ _DAMAGE = (
     OSError,
     ValueError,
     EOFError,
+    OverflowError,
     NotImplementedError,
     RuntimeError,
 )

@@ -2,12 +2,14 @@
 
 A sampler that several drivers seed alike would draw the same settings in all of them, and one that
 goes on after a kill would draw its first again. So each trial has a generator of its own, seeded by
-the search's seed and the trial's number: which driver asks, and when it was started, is no matter.
+the search's seed and the trial's number, and each parameter that is drawn alone one that is seeded
+by its name too: which driver asks, and when it was started, is no matter.
 """
 
 from __future__ import annotations
 
 import warnings
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -37,8 +39,8 @@ class SeededSampler(BaseSampler):
 
     def _of(self, trial: FrozenTrial) -> BaseSampler:
         if trial.number != self._number:
-            seed = np.random.SeedSequence([self._seed, trial.number]).generate_state(1)[0]
-            self._number, self._sampler = trial.number, self._make(int(seed))
+            self._number = trial.number
+            self._sampler = self._make(_drawn_from([self._seed, trial.number]))
         return self._sampler
 
     def before_trial(self, study: Study, trial: FrozenTrial) -> None:
@@ -62,7 +64,10 @@ class SeededSampler(BaseSampler):
         param_name: str,
         param_distribution: BaseDistribution,
     ) -> Any:
-        return self._of(trial).sample_independent(study, trial, param_name, param_distribution)
+        # By its name: after a kill some of a trial's parameters are in the storage, and not drawn.
+        numbers = [self._seed, trial.number, zlib.crc32(param_name.encode())]
+        sampler = self._make(_drawn_from(numbers))
+        return sampler.sample_independent(study, trial, param_name, param_distribution)
 
     def after_trial(
         self,
@@ -72,6 +77,10 @@ class SeededSampler(BaseSampler):
         values: Sequence[float] | None,
     ) -> None:
         self._of(trial).after_trial(study, trial, state, values)
+
+
+def _drawn_from(numbers: list[int]) -> int:
+    return int(np.random.SeedSequence(numbers).generate_state(1)[0])
 
 
 def make_sampler(tuning: TuningSpec) -> BaseSampler:

@@ -157,9 +157,10 @@ class Search:
             seconds = seconds_of(trial.user_attrs)
             new = TrialUnderWay(trial, entry, seeds, known, seconds)
             self._trials.append(new)
-            if seeds:
+            if known:  # its driver may have ended between the last of them and the judgement
+                self._judge(new)
+            if not new.is_over:
                 return new
-            self._judge(new)
         return None
 
     def _begin(self, each: TrialUnderWay, seed: int) -> None:
@@ -211,10 +212,16 @@ class Search:
         each.seconds += outcome.seconds
         with _lost_to_others():
             figures = {str(seed): figure for seed, figure in each.figures.items()}
-            each.trial.set_user_attr(FIGURES, figures)
+            self._report(each)
             each.trial.set_user_attr(SECONDS, each.seconds)
-            each.trial.report(self._value(each), len(each.figures))
+            each.trial.set_user_attr(FIGURES, figures)  # the last: from now on the seed is done
         self._judge(each)
+
+    def _report(self, each: TrialUnderWay) -> None:
+        step, trial_id = len(each.figures), each.trial._trial_id
+        # A driver that was killed may have told it already.
+        if step not in self.queue.storage.get_trial(trial_id).intermediate_values:
+            each.trial.report(self._value(each), step)
 
     def _check_alike(self, outcome: RunOutcome) -> None:
         """Scores and returns are not to be compared: an optimum may be known since an update."""

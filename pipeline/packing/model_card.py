@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ import gymnasium as gym
 import yaml
 
 from agents import ALGORITHMS
+from pipeline.errors import visible
 
 # What stands around an environment, and a plain script would have to put there too.
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
@@ -33,7 +35,7 @@ def card(record: Mapping[str, Any], files: Collection[str]) -> str:
     films = [name for name in files if name.startswith("replay.")]
     sections = [
         f"---\n{_front_matter(record)}---\n",
-        f"# {algo} on {env_id}\n",
+        f"# {_text(algo)} on {_text(env_id)}\n",
         _trained(record),
         _figures(record),
         *(
@@ -45,15 +47,22 @@ def card(record: Mapping[str, Any], files: Collection[str]) -> str:
         "## Settings\n",
         fenced("yaml", str(yaml.safe_dump(spec["hyperparams"]))),
         "## Versions\n",
-        "".join(f"- {name} {version}\n" for name, version in record["versions"].items()),
+        "".join(
+            f"- {_text(name)} {_text(version)}\n" for name, version in record["versions"].items()
+        ),
     ]
-    return "\n".join(sections)
+    return visible("\n".join(sections))
+
+
+def _text(value: object) -> str:
+    """A value as Markdown in which nothing is markup: the run may be anybody's."""
+    return re.sub(r"[\\`*<>|&\[\]]", lambda found: f"\\{found[0]}", " ".join(str(value).split()))
 
 
 def _trained(record: Mapping[str, Any]) -> str:
     steps, seed = record["n_timesteps"], record["spec"]["seed"]
     maker = "Trained with Yardstick (the Python package `rl-yardstick`)"
-    return f"{maker} for {steps:,} environment steps, seed {seed}.\n"
+    return f"{maker} for {steps:,} environment steps, seed {_text(seed)}.\n"
 
 
 def _front_matter(record: Mapping[str, Any]) -> str:
@@ -139,7 +148,7 @@ def _bandit_figures(record: Mapping[str, Any]) -> str:
 
 
 def _table(rows: list[tuple[str, Any]]) -> str:
-    told = [f"| {name} | {value} |\n" for name, value in rows if value is not None]
+    told = [f"| {_text(name)} | {_text(value)} |\n" for name, value in rows if value is not None]
     return "".join(["| figure | value |\n", "|---|---|\n", *told])
 
 
@@ -154,10 +163,12 @@ def _playing(record: Mapping[str, Any], files: Collection[str]) -> str:
     if text is not None:
         parts += ["In Python:\n", fenced("python", text)]
     if plain_class(spec) is not None:
-        place = f"{spec['algo']}/{record['env_name']}_1"
+        place = shlex.quote(f"{spec['algo']}/{record['env_name']}_1")
         packages = [*(spec.get("gym_packages") or []), *([] if _is_known(spec) else ["envs"])]
-        words = f"--algo {spec['algo']} --env {spec['env_id']}{_flag(packages)} -f ."
-        copying = f"mkdir -p {spec['algo']} && cp -r PACK {place}\n"
+        words = (
+            f"{shlex.join(['--algo', spec['algo'], '--env', spec['env_id']])}{_flag(packages)} -f ."
+        )
+        copying = f"mkdir -p {shlex.quote(spec['algo'])} && cp -r PACK {place}\n"
         parts += [
             "With rl_zoo3, which finds agents by the names of folders (this one is `PACK`):\n",
             fenced("sh", f"{copying}python -m rl_zoo3.enjoy {words}\n"),
@@ -166,7 +177,7 @@ def _playing(record: Mapping[str, Any], files: Collection[str]) -> str:
 
 
 def _flag(packages: Sequence[str]) -> str:
-    return f" --gym-packages {' '.join(packages)}" if packages else ""
+    return f" --gym-packages {shlex.join(packages)}" if packages else ""
 
 
 def _is_known(spec: Mapping[str, Any]) -> bool:

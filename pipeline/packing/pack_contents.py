@@ -9,7 +9,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.errors import UserError
+from pipeline.errors import UserError, one_line
 from pipeline.file_digests import FIELD, RECORD, VERSION, VERSION_FIELD, sealed
 from pipeline.json_text import json_text
 from pipeline.models.recorded_runs import read_recorded, run_in
@@ -39,9 +39,12 @@ def contents(folder: Path) -> dict[str, bytes]:
     if info.get("state") != FINISHED:
         raise UserError(f"{folder} is {info.get('state')}, and a pack is of a finished run")
     check_secrets(info["spec"]["hyperparams"])
-    record = record_to_tell(info)
-    files = dict(_files(run, record))
-    files[CARD] = card(record, files.keys()).encode()
+    try:
+        record = record_to_tell(info)
+        files = dict(_files(run, record))
+        files[CARD] = card(record, files.keys()).encode()
+    except (TypeError, ValueError, LookupError, AttributeError) as error:  # of whatever it says
+        raise UserError(f"{folder} cannot be packed: {one_line(error)}") from error
     record |= {VERSION_FIELD: VERSION, FIELD: {name: _digest(files[name]) for name in files}}
     files[RECORD] = (json_text(sealed(record), indent=2) + "\n").encode()
     check_untold(files, run)

@@ -152,7 +152,7 @@ def _members(content: bytes) -> Mapping[str, bytes]:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         for info in archive.infolist():
             kind = stat.S_IFMT(info.external_attr >> 16)
-            if kind not in (0, stat.S_IFREG) or info.is_dir():
+            if kind not in (0, stat.S_IFREG):
                 raise UnsafeFileError(f"holds {shown(info.filename)}, which is no regular file")
             _check_name(info.filename)
     files = read_members(content)

@@ -15,7 +15,7 @@ from yaml.constructor import ConstructorError
 from yaml.events import AliasEvent
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from pipeline.errors import shown
+from pipeline.errors import shown, visible
 
 _TAG = "tag:yaml.org,2002:"
 _PLAIN_TAGS = frozenset(
@@ -45,6 +45,7 @@ class StrictLoader(yaml.SafeLoader):
     """Refuses repeated keys and every tag but those of plain data."""
 
     admitted_tags = _PLAIN_TAGS
+    admits_control_characters = False
 
     yaml_implicit_resolvers = {  # noqa: RUF012 # PyYAML copies it itself before it adds to it
         first: [(tag, regexp) for tag, regexp in resolvers if tag != _TAG + "timestamp"]
@@ -92,6 +93,11 @@ class StrictLoader(yaml.SafeLoader):
         if node.tag not in self.admitted_tags:
             problem = f"{node.tag.replace(_TAG, '!!')} is not allowed here"
             raise ConstructorError(None, None, problem, node.start_mark)
+        text = node.value if isinstance(node, ScalarNode) else ""
+        if not self.admits_control_characters and visible(text) != text:
+            # As itself none is YAML. Spelt out, it would go on into tables, pictures and names.
+            problem = f"{shown(text)} holds control characters"
+            raise ConstructorError(None, None, problem, node.start_mark)
         is_number = node.tag in (_TAG + "int", _TAG + "float")
         if is_number and len(node.value) > _LONGEST_NUMBER:
             problem = f"{shown(node.value)} is too long for a number"
@@ -109,9 +115,13 @@ StrictLoader.add_implicit_resolver(
 
 
 class SavedSettingsLoader(StrictLoader):
-    """Reads rl_zoo3's tag for an OrderedDict too: as the data that it is, looking nothing up."""
+    """Reads rl_zoo3's tag for an OrderedDict too: as the data that it is, looking nothing up.
+
+    A folder's name among the settings may be whatever it was.
+    """
 
     admitted_tags = _PLAIN_TAGS | {_ORDERED_DICT}
+    admits_control_characters = True
 
 
 def _ordered_dict(loader: SavedSettingsLoader, node: Node) -> dict[str, Any]:

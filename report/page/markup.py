@@ -15,6 +15,7 @@ import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from pipeline.errors import visible
 from report.ranking_cells import bar
 from report.wording import interval_alone, number, optimum_words
 
@@ -28,13 +29,14 @@ SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
 
 
 def templates() -> Environment:
-    """The templates; whatever they are filled with is escaped."""
+    """The templates; whatever they are filled with is escaped, and control characters are."""
     environment = Environment(
         loader=PackageLoader("report.page"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
+        finalize=lambda value: visible(value) if type(value) is str else value,
     )
     environment.filters.update(
         number=number,

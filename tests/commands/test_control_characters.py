@@ -13,7 +13,7 @@ from rich.text import Text
 
 from commands import compare_agents, enjoy_agent, terminal, train_agent
 from commands.parsing import run_command
-from commands.terminal import TextConsole
+from commands.terminal import TextConsole, print_rows, table_console
 from pipeline.errors import UserError, visible
 
 TITLE, CLEAR = "\x1b]0;x\x07", "\x1b[2J"
@@ -42,6 +42,7 @@ def complaint(monkeypatch, capsys, tmp_path):
 @pytest.mark.parametrize(
     ("text", "shown"),
     [
+        ("\u061cb\udce9", r"\u061cb\udce9"),
         (HOSTILE, r"\x1b]0;x\x07\x1b[2J"),
         ("\x9b2J", r"\x9b2J"),
         ("a\u202eb\u2066", r"a\u202eb\u2066"),
@@ -59,8 +60,8 @@ def test_the_console_obeys_its_own_colours_alone(is_terminal):
     console = TextConsole(file=file, width=200, force_terminal=is_terminal, _environ={})
     table = Table(HOSTILE, title=HOSTILE)
     table.add_row(HOSTILE)
-    console.print(HOSTILE, style="bold", markup=False)
-    console.print(f"[red]{CLEAR.replace('[', chr(92) + '[')}[/]")
+    console.print(HOSTILE, style="red")
+    console.print(CLEAR)
     console.print(table)
     console.print(Text(HOSTILE))
     printed = file.getvalue()
@@ -69,6 +70,19 @@ def test_the_console_obeys_its_own_colours_alone(is_terminal):
     assert "\x07" not in printed
     assert re.sub("\x1b.*?m", "", printed).count(r"\x1b[2J") == 6
     assert ("\x1b[31m" in printed) is is_terminal
+
+
+@pytest.mark.parametrize("text", ["[/]", "[link=https://a.b]c[/link]", "[red]d[/red]", ":bomb:"])
+def test_no_text_is_markup(text, capsys):
+    for console in (TextConsole(force_terminal=True, width=80, _environ={}), table_console()):
+        table = Table(text, title=text, caption=text)
+        table.add_row(text)
+        console.print(text)
+        console.print(table)
+        print_rows(console, table)
+        out = capsys.readouterr().out
+        assert re.sub("\x1b[^a-z]*m", "", out).count(text) == 9
+        assert "\x1b]8" not in out
 
 
 def test_what_moves_the_cursor_still_does():
@@ -85,6 +99,10 @@ def test_titles_and_labels_of_a_study(complaint, tmp_path):
     text = json.dumps(HOSTILE)  # which YAML reads as JSON does
     for lines in (
         f"agents: {{{text}: }}\nenvironments: [FrozenLake-v1]\n",
+        f"agents: {{{text}: {{algo: sarsa}}}}\nenvironments: [FrozenLake-v1]\n",
+        f"agents: [sarsa]\nenvironments: {{{text}: {{id: FrozenLake-v1}}}}\n",
+        f"title: {text}\nagents: [sarsa]\nenvironments: [FrozenLake-v1]\n",
+        f"description: {text}\nagents: [sarsa]\nenvironments: [FrozenLake-v1]\n",
         f"agents: [qlearning]\nenvironments: [{text}]\n",
         f"{text}: 1\n",
         f"metric: {text}\n",
@@ -92,6 +110,8 @@ def test_titles_and_labels_of_a_study(complaint, tmp_path):
     ):
         study.write_text(lines)
         assert r"\x1b" in complaint(compare_agents, study)
+        study.write_text(lines.replace("\\u001b", "\\ud83d"))
+        assert r"\ud83d" in complaint(compare_agents, study)
 
 
 def test_no_command_prints_by_another_console():

@@ -7,10 +7,10 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from rich.console import Console
 
 from commands import live_progress, study_progress, tune_progress
 from commands.study_progress import StudyProgress
+from commands.terminal import TextConsole
 from commands.tune_progress import TuningProgress
 from experiments.launching import RunFailure
 from experiments.study_plan import plan
@@ -42,7 +42,7 @@ def planned_runs(n_seeds=4):
 
 def console_of(**options):
     file = io.StringIO()
-    return file, Console(file=file, width=100, **options)
+    return file, TextConsole(file=file, width=100, **options)
 
 
 def failure_of(run):

@@ -6,6 +6,7 @@ import io
 import json
 import os
 import re
+import shlex
 import shutil
 import stat
 import subprocess
@@ -196,6 +197,8 @@ def changed(run, tmp_path, change):
             lambda info: info["spec"]["hyperparams"].update(note=f"see {Path.home()}/notes"),
             "names .*, a place on this machine: nothing was packed",
         ),
+        (lambda info: info.update(n_timesteps="many"), "cannot be packed: Cannot specify ','"),
+        (lambda info: info["final"].pop("std_return"), "cannot be packed: 'std_return'"),
     ],
 )
 def test_what_is_not_packed(runs, tmp_path, change, complaint):
@@ -236,6 +239,24 @@ def test_where_something_lies_already(packed, runs, tmp_path):
     with unpacked(again) as inside:
         assert choose_model(ModelRequest(path=inside)).spec.algo == "qlearning"
     assert default_target(runs["table"].path) == Path("qlearning-FrozenLake-v1-7")
+
+
+def test_a_card_quotes_what_a_strangers_run_says(runs, tmp_path):
+    said = "\x1b]0;x\x07\u202e<script>[a](b:c)`$(id)`\n# d; id"
+
+    def change(info):
+        info["spec"].update(env_id=said, seed=said, gym_packages=[said])
+        info["versions"] |= {"numpy": said, said: "1"}
+        info["final"]["baseline"] = said
+
+    pack(changed(runs["ppo"], tmp_path, change), tmp_path / "pack")
+    parts = (tmp_path / "pack" / "README.md").read_text(encoding="utf-8").split("---\n", 2)
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202e]", "".join(parts))
+    outside = re.sub(r"^(`{3,})\w+\n.*?\n\1\n", "", parts[2], flags=re.DOTALL | re.MULTILINE)
+    assert not re.search(r"(?<!\\)(<script|\[a\]|`\$)|^# d", outside, re.MULTILINE)
+    for block in re.findall(r"^```sh\n(.*?)\n```\n", parts[2], re.DOTALL | re.MULTILINE):
+        assert r"\x1b]0;x" in block
+        assert "id" not in shlex.split(block)
 
 
 # --- packs of strangers ---------------------------------------------------------------------------
@@ -287,7 +308,8 @@ def test_links_twins_and_what_nobody_listed(packed):
     for change, mode, complaint in [
         ({"link": b"/etc/passwd"}, stat.S_IFLNK | 0o777, "'link', which is no regular file"),
         ({"pipe": b""}, stat.S_IFIFO | 0o600, "'pipe', which is no regular file"),
-        ({"folder/": b""}, 0, "'folder/', which is no regular file"),
+        ({"folder/": b""}, 0, "'folder/', which would lie elsewhere"),
+        ({"": b""}, 0, "'', which would lie elsewhere"),
         ({"readme.md": b""}, 0, "two names that some systems take for one"),
         ({"README.md/a": b""}, 0, "a file that is a folder too"),
         ({"more.py": b"print()"}, 0, "'more.py' is not among the files that run.json lists"),

@@ -19,7 +19,7 @@ ESCAPES = re.compile(r"\x1b\[[0-9;]*m")
 def lines_of(write, width=120, **options):
     """What is printed, and the same without colours, as lines without trailing blanks."""
     file = io.StringIO()
-    write(Console(file=file, width=width, **options))
+    write(Console(markup=False, file=file, width=width, **options))
     raw = file.getvalue()
     return raw, [line.rstrip() for line in ESCAPES.sub("", raw).splitlines()]
 

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import pickle
+import struct
 import tracemalloc
 import zipfile
 from functools import partial
@@ -359,6 +360,25 @@ def test_members_that_no_model_has_are_refused(genuine, tmp_path, member):
     path = write(tmp_path / "model.zip", {**genuine, member: b""})
     with pytest.raises(UnsafeFileError, match="which no model file has"):
         load_model(PPO, path)
+
+
+def test_what_zip64_says_leads_nowhere(genuine, tmp_path):
+    """The end of a zip may count, measure and place its list of members with 64 bits each."""
+    raw = write(tmp_path / "model.zip", genuine).read_bytes()
+    end, most = raw.rfind(b"PK\5\6"), 2**64 - 1
+    size, start = struct.unpack("<2L", raw[end + 12 : end + 20])
+    n = len(genuine)
+    whole = (n, size, start)
+    for says in (whole, (n, size, most), (n, most, start), (most, most, most)):
+        end64 = struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, says[0], *says)
+        end64 += struct.pack("<4sLQL", b"PK\6\7", 0, end, 1)
+        small = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, 2**32 - 1, 2**32 - 1, 0)
+        (tmp_path / "model.zip").write_bytes(raw[:end] + end64 + small)
+        if says == whole:
+            load_model(PPO, tmp_path / "model.zip")
+            continue
+        with pytest.raises(UnsafeFileError, match="no whole zip"):
+            load_model(PPO, tmp_path / "model.zip")
 
 
 def test_variables_of_other_names_than_the_algorithms_are_refused(genuine, tmp_path):

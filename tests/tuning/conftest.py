@@ -43,9 +43,13 @@ def toy_tuning(**changes):
 
 
 def opened(storages, tuning, root, storage=None):
-    """A driver's view of the toy; those of one folder share a storage in memory, or a real one."""
+    """A driver's view of the toy; those of one folder share a storage in memory, or a real one.
+
+    A storage is named, or given.
+    """
     root.mkdir(parents=True, exist_ok=True)
-    keeping = storages[root] if storage is None else open_storage(root, storage)
+    keeping = storages[root] if storage is None else storage
+    keeping = open_storage(root, keeping) if isinstance(keeping, str) else keeping
     path = root / "space.yml"
     path.write_text(SPACE)
     space = read_search_space("qlearning", "FrozenLake-v1", path)

@@ -3,9 +3,12 @@
 import errno
 import math
 import os
+from contextlib import suppress
 
 import numpy as np
 import pytest
+from optuna.storages import InMemoryStorage
+from optuna.trial import TrialState
 
 from pipeline.errors import UserError
 from tuning import searching
@@ -39,6 +42,58 @@ def test_what_was_broken_off_goes_on_to_the_same_trials(toy, tmp_path, sampler, 
     assert toy.states(again) == ["COMPLETE"] * 10
     assert toy.params(again) == toy.params(whole)
     assert len(rest.done) == 30 - stops_after
+
+
+WRITES = [
+    *("create_new_trial", "set_trial_param", "set_trial_state_values", "set_study_user_attr"),
+    *("set_trial_intermediate_value", "set_trial_user_attr", "set_trial_system_attr"),
+]
+
+
+class DyingStorage(InMemoryStorage):
+    """From its k-th write on its driver is dead, until it is revived."""
+
+    n_writes, dies_at = 0, math.inf
+
+    def revive(self):
+        self.dies_at = math.inf
+        for trial in self.get_all_trials(0, states=[TrialState.RUNNING]):
+            self.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+
+
+def dying(name):
+    def write(self, *args, **options):
+        self.n_writes += 1
+        if self.n_writes >= self.dies_at:
+            raise KeyboardInterrupt
+        return getattr(InMemoryStorage, name)(self, *args, **options)
+
+    return write
+
+
+for name in WRITES:
+    setattr(DyingStorage, name, dying(name))
+
+
+@pytest.mark.parametrize("sampler", ["tpe", "random", "cmaes"])
+def test_a_kill_at_any_write_to_the_storage_changes_no_trial(toy, tmp_path, sampler):
+    tuning = toy.tuning(sampler=sampler, pruner="racing", n_trials=8, n_seeds=4)
+
+    def searched(storage):
+        place = toy.opened(tuning, tmp_path, storage)
+        toy.search(place, toy.Launcher())
+        return [(t.state, t.value, t.params, t.user_attrs.get(FIGURES)) for t in place.study.trials]
+
+    whole = DyingStorage()
+    undisturbed = searched(whole)
+    assert TrialState.PRUNED in [state for state, *_ in undisturbed]
+    for k in range(10, whole.n_writes, 8):
+        storage = DyingStorage()
+        storage.dies_at = k
+        with suppress(KeyboardInterrupt):
+            searched(storage)
+        storage.revive()
+        assert searched(storage) == undisturbed, k
 
 
 def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path):
