@@ -82,10 +82,10 @@ def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
             raise OSError(errno.ENOENT, "its folder is gone", str(path))
         yield path.parent, None
         return
-    folder = _opened(Path(held) if held else Path(whole).parent, _STEP, None, path)
+    folder = _opened(held or str(Path(whole).parent), _STEP, None, path)
     try:
-        for name in () if held is None else Path(whole).relative_to(held).parts[:-1]:
-            inner = _opened(Path(name), _STEP | _NO_LINK, folder, path)
+        for name in () if held is None else Path(whole[len(held) + 1 :]).parts[:-1]:
+            inner = _opened(name, _STEP | _NO_LINK, folder, path)
             os.close(folder)
             folder = inner
         yield Path(), folder
@@ -105,7 +105,7 @@ def open_number(path: Path, flags: int) -> int:
     with folder_of(path) as (before, folder):
         if folder is None:
             _check_steps(path, held)
-        return _opened(before / path.name, flags | _ALWAYS | _NO_LINK, folder, path)
+        return _opened(str(before / path.name), flags | _ALWAYS | _NO_LINK, folder, path)
 
 
 @contextmanager
@@ -165,8 +165,10 @@ def content_of(source: Source, limit: int) -> bytes:
 
 def _held_above(path: str) -> str | None:
     """The outermost of the held folders that a path lies in."""
-    above = map(str, reversed(Path(path).parents))
-    return next((folder for folder in above if folder in _held), None) if _held else None
+    end = path.find(os.sep, 1) if _held else -1
+    while end > 0 and path[:end] not in _held:
+        end = path.find(os.sep, end + 1)
+    return path[:end] if end > 0 else None
 
 
 def _whole(path: Path) -> str:
@@ -174,7 +176,7 @@ def _whole(path: Path) -> str:
     return os.path.normpath(path.absolute())
 
 
-def _opened(name: Path, flags: int, folder: int | None, path: Path) -> int:
+def _opened(name: str, flags: int, folder: int | None, path: Path) -> int:
     try:
         return os.open(name, flags, dir_fd=folder)
     except OSError as error:
