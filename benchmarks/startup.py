@@ -1,6 +1,6 @@
 """How long the commands take before they do anything, and where a short training spends its time.
 
-    python benchmarks/startup.py                # five rounds, half a minute
+    python benchmarks/startup.py                # five rounds, two minutes
     python benchmarks/startup.py --repeats 1
 
 Whole processes one after the other, in rounds, each command once in a round; reported are medians
@@ -27,6 +27,9 @@ from rich.table import Table
 
 ROOT = Path(__file__).resolve().parent.parent
 TRAINING = ("--algo", "qlearning", "--env", "Warehouse-v0", "--n-episodes", "1000")
+TABLE = ("--algo", "qlearning", "--env", "FrozenLake-v1")
+NETWORKS = ("--algo", "ppo", "--env", "CartPole-v1", "-params", "engine:compiled", "-n", "4096")
+STUDY = ("--algos", "qlearning", "sarsa", "--env", "FrozenLake-v1", "--seeds", "2", "-n", "1000")
 IMPORT = "import stable_baselines3"
 INSTALLED = "from commands.yardstick import main; main()"
 COMMANDS: dict[str, tuple[str, ...]] = {
@@ -34,19 +37,28 @@ COMMANDS: dict[str, tuple[str, ...]] = {
     "yardstick train --help": ("-c", INSTALLED, "train", "--help"),
     "train.py --list": ("train.py", "--list"),
     "train.py --env Warehose-v0": ("train.py", "--env", "Warehose-v0"),
+    f"train.py {' '.join(TABLE)}": ("train.py", *TABLE),
+    f"train.py {' '.join(NETWORKS)}": ("train.py", *NETWORKS),
+    f"compare.py {' '.join(STUDY)}": ("compare.py", *STUDY),
     IMPORT: ("-c", IMPORT),
     f"train.py {' '.join(TRAINING)}": ("train.py", *TRAINING),
 }
-# Of the last one, the limit stands for what it takes beyond the import.
-LIMITS = dict(zip(COMMANDS, ("0.3", "0.3", "0.3", "0.3", None, "1.0 beyond"), strict=True))
+# Of processor time for a table and a study; of the last, for what it takes beyond the import.
+LIMITS = dict(
+    zip(COMMANDS, ("0.3", "0.3", "0.3", "0.3", "1.9", None, "4.0", None, "1.0 beyond"), strict=True)
+)
 
 # A line of `-X importtime`: microseconds of the module alone, of all that it imports, its name.
 IMPORTED = re.compile(r"import time: +(\d+) \| +\d+ \| +([\w.]+)")
 
 
 def process(arguments: tuple[str, ...], folder: str) -> subprocess.CompletedProcess[str]:
-    """Run Python in the project's root; runs of the training go into ``folder``."""
-    where = ("--log-folder", folder) if arguments[0] == "train.py" else ()
+    """Run Python in the project's root; runs go into ``folder``, a study into a new one there."""
+    where: tuple[str, ...] = ()
+    if arguments[0] == "train.py":
+        where = ("--log-folder", folder)
+    elif arguments[0] == "compare.py":
+        where = ("--log-folder", tempfile.mkdtemp(dir=folder))
     return subprocess.run(
         [sys.executable, *arguments, *where],
         cwd=ROOT,

@@ -115,8 +115,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
         from pipeline.training import carry_out
 
         with writing_watched(console, training):
-            outcome = carry_out(training)
-            print_outcome(console, spec, outcome)
+            outcome = carry_out(training, partial(print_outcome, console, spec))
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 

@@ -86,8 +86,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
             telling_what_is_kept(training.run),
             writing_watched(console, training),
         ):
-            outcome = carry_out(training)
-            print_outcome(console, spec, outcome)
+            outcome = carry_out(training, partial(print_outcome, console, spec))
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 

@@ -19,6 +19,11 @@ from mdp.transition_model import TransitionModel
 
 # Beyond this many rounds only plain sweeps are made, which are known to converge.
 ROUNDS_WITH_EVALUATION = 1000
+# With a discount, rounds in which sweeps leave a policy's values rough, times states: then linear
+# systems are solved. It is about the work that SciPy's import takes.
+ROUGH_STATES = 100_000
+# An action has to be better by this to be taken then, relative to the value: by more than rounding.
+FINE_TIE = 1e-15
 # What counts as a tie, relative to the largest value, where no bound of the error is known.
 UNPROVEN_TIE = 1e-9
 
@@ -60,7 +65,10 @@ def value_iteration(
 
     The sweeps are Gauss-Seidel, the states nearest to the end first, and between them the greedy
     policy is evaluated roughly (modified policy iteration: Puterman, Markov Decision Processes,
-    1994, section 6.5). Whether values have converged is judged by the plain sweeps alone.
+    1994, section 6.5). Where sweeps evaluate it too slowly, as where agents do best to stand still
+    until the discount has made all else worth nothing, its linear system is solved by an iterative
+    method, whose memory grows with the states alone. Whether values have converged is judged by
+    the plain sweeps alone.
 
     Args:
         model: the decision process; rows of unreachable states are ignored.
@@ -79,14 +87,22 @@ def value_iteration(
     values, policy = problem.start()
     floor = np.where(problem.part.resting, 0.0, -np.inf)
     order = problem.order
+    solving = False
     change = np.inf
-    iterations = 0
+    iterations = rough = 0
     while True:
-        if _worth_evaluating(problem, values, change, iterations):
+        if _worth_evaluating(problem, values, change, iterations, solving):
             order = order[np.argsort(-values[order], kind="stable")]
-            problem.evaluate(model.expected_reward, policy, order, values, 0.1 * change)
+            if solving:
+                problem.solve(policy, order, values)
+            else:
+                enough = 0.1 * change
+                left = problem.evaluate(model.expected_reward, policy, order, values, enough)
+                rough += len(order) if left > enough else 0
+                solving = discount < 1 and rough > ROUGH_STATES
+        tie = FINE_TIE if solving else TIE_TOLERANCE
         rise, fall = improve(
-            *problem.rows, problem.part.allowed, floor, problem.discount, order, values, policy
+            *problem.rows, problem.part.allowed, floor, problem.discount, order, values, policy, tie
         )
         change = max(rise, fall)
         iterations += 1
@@ -98,8 +114,9 @@ def value_iteration(
 def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None = None) -> Plan:
     """Plan by evaluating a policy exactly and making it greedy, until no action is better.
 
-    The linear systems are solved directly, which suits some ten thousand states; beyond, use
-    ``value_iteration``. Howard, Dynamic Programming and Markov Processes, 1960.
+    The linear systems are solved directly, which suits some ten thousand states; beyond, the
+    memory that this takes depends on the model, and ``value_iteration`` is faster. Howard, Dynamic
+    Programming and Markov Processes, 1960.
 
     Args:
         model: the decision process; rows of unreachable states are ignored.
@@ -128,12 +145,12 @@ def policy_iteration(model: TransitionModel, discount: float, mask: Bools | None
 
 
 def _worth_evaluating(
-    problem: PlanningProblem, values: Floats, change: float, iterations: int
+    problem: PlanningProblem, values: Floats, change: float, iterations: int, solving: bool
 ) -> bool:
-    """Whether to evaluate the policy between sweeps: not where only rounding is left to mend."""
+    """Whether to evaluate the policy: by sweeps, not where only rounding is left to mend."""
     if problem.part.resting.any() or iterations >= ROUNDS_WITH_EVALUATION:
         return False
-    return change > 1e-13 * float(np.abs(values).max())
+    return solving or change > 1e-13 * float(np.abs(values).max())
 
 
 def _exact_values(problem: PlanningProblem, policy: Ints) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 
 from mdp.array_types import AnyInts, Bools, Floats, Ints
 from mdp.graph import steps_to_end
-from mdp.sweeps import action_values, evaluate, first_guess, policy_rows
+from mdp.sweeps import action_values, evaluate, first_guess, policy_rows, residuals
 from mdp.transition_model import TransitionModel
 from mdp.undiscounted import FinitePart, finite_part
 
@@ -19,6 +19,9 @@ LEAST_SETTLED = 0.8
 SWEEPS_PER_EVALUATION = 30
 # Plenty for any chain that mixes at all; a bound that needs more is not worth waiting for.
 MOST_EVALUATIONS = 10_000
+# Of a linear system that is solved between two sweeps: the next policy asks for another one.
+ACCURACY_OF_SOLUTIONS = 1e-2
+MOST_KRYLOV_STEPS = 100
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +113,45 @@ class PlanningProblem:
         if latest <= first:
             values[order] = found
         return latest
+
+    def solve(self, policy: Ints, order: Ints, values: Floats) -> None:
+        """Improve the values of a policy, in place, where ``evaluate`` would need many sweeps.
+
+        The linear system is solved by BiCGSTAB (van der Vorst, 1992), with a sweep as
+        preconditioner, to a hundredth of what was missing. Needs a discount below one.
+
+        Args:
+            policy: actions, shape (S,).
+            order: the states, all of those to plan for.
+            values: shape (S,); as they were where the solution is not nearer.
+        """
+        from scipy.sparse.linalg import LinearOperator, bicgstab
+
+        weight, following, reward, _ = policy_rows(*self.rows, self.discount, order, policy)
+        n = len(order)
+        stays = following == np.arange(n)[:, None]
+        diagonal = 1.0 - np.where(stays, weight, 0.0).sum(axis=1)
+        nothing = np.zeros(n)
+
+        def product(vector: Floats) -> Floats:
+            return -residuals(weight, following, nothing, vector)
+
+        def sweep(right: Floats) -> Floats:
+            found = np.zeros(n)
+            evaluate(weight, following, right, diagonal, found)
+            return found
+
+        missing = residuals(weight, following, reward, values[order])
+        change, _ = bicgstab(
+            LinearOperator((n, n), product, dtype=np.float64),
+            missing,
+            rtol=ACCURACY_OF_SOLUTIONS,
+            maxiter=MOST_KRYLOV_STEPS,
+            M=LinearOperator((n, n), sweep, dtype=np.float64),
+        )
+        found = values[order] + change
+        if np.abs(residuals(weight, following, reward, found)).max() <= np.abs(missing).max():
+            values[order] = found
 
     def action_values(self, values: Floats) -> Floats:
         """Values of shape (S, A), minus infinity for actions that are not allowed."""

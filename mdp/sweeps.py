@@ -28,10 +28,12 @@ def improve(
     order: Ints,
     values: Floats,
     policy: Ints,
+    tie: float,
 ) -> tuple[float, float]:
     """One Gauss-Seidel sweep of the Bellman optimality operator, in place.
 
-    ``policy`` follows the best action, and moves only where another one is really better.
+    ``policy`` follows the best action, and moves only where another one is better by more than
+    ``tie``, relative to the value where that is above 1.
 
     Returns:
         The largest rise and the largest fall of a value.
@@ -55,7 +57,7 @@ def improve(
                 best_action = action
             if action == policy[state]:
                 current = value
-        if best > current + TIE_TOLERANCE * max(1.0, abs(best)):
+        if best > current + tie * max(1.0, abs(best)):
             policy[state] = best_action
         best = max(best, floor[state])
         change = best - values[state]
@@ -176,6 +178,20 @@ def evaluate(
         values[place] += change
         largest = max(largest, abs(change))
     return largest
+
+
+@compiled
+def residuals(
+    weight: Floats, following: NDArray[np.int32], reward: Floats, values: Floats
+) -> Floats:
+    """What one more step of a policy would change in each value of its rows, shape (n,)."""
+    result = np.empty(len(reward))
+    for place in range(len(reward)):
+        value = reward[place] - values[place]
+        for k in range(weight.shape[1]):
+            value += weight[place, k] * values[following[place, k]]
+        result[place] = value
+    return result
 
 
 @compiled

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from signal import Signals
 from typing import Any
 from uuid import uuid4
@@ -171,11 +171,15 @@ def _library_errors_in_one_line() -> Iterator[None]:
         raise UserError(one_line(error)) from error
 
 
-def carry_out(training: Training) -> Outcome:
+def carry_out(training: Training, tell: Callable[[Outcome], object] = lambda _: None) -> Outcome:
     """Train, and save, judge and draw what was learnt.
 
     Ctrl-C ends the training early, and so do the other signals that `pipeline.stopping` notices;
     what was learnt until then is saved all the same.
+
+    Args:
+        training: what `prepare` has made.
+        tell: called with what came out as soon as it is known, before it is drawn and recorded.
 
     Raises:
         UserError: if the agent finds at its first step that it cannot work so; no folder is left
@@ -186,7 +190,7 @@ def carry_out(training: Training) -> Outcome:
     with current().held():
         try:
             with naming(training.run.path):
-                outcome = _train_and_finish(training)
+                outcome = _train_and_finish(training, tell)
         except BaseException as error:
             with contextlib.suppress(BaseException):  # it would hide what the run broke by
                 close(training)
@@ -200,7 +204,7 @@ def carry_out(training: Training) -> Outcome:
     return outcome
 
 
-def _train_and_finish(training: Training) -> Outcome:
+def _train_and_finish(training: Training, tell: Callable[[Outcome], object]) -> Outcome:
     started = WorkTime.now()
     state = FINISHED
     with compile_timer() as time_compiling:
@@ -216,7 +220,9 @@ def _train_and_finish(training: Training) -> Outcome:
         taken = WorkTime.now() - started - time_compiling()
     taken += training.saver.time_before
     with doing(training.display.console, "saving what was learnt") as activity:
-        return _finish(training, state, taken, activity)
+        outcome = _judged(training, state, taken, activity)
+        tell(outcome)
+        return _finish(training, state, outcome, activity)
 
 
 @exits_as_mistakes()
@@ -248,22 +254,19 @@ def _learn(training: Training) -> None:
         raise
 
 
-def _finish(training: Training, state: str, taken: WorkTime, activity: Activity) -> Outcome:
-    """Save what was learnt, judge it, draw it; ``run.json`` says so when all else is there."""
-    run, model, evaluation = training.run, training.model, training.evaluation
+def _judged(training: Training, state: str, taken: WorkTime, activity: Activity) -> Outcome:
+    """Save what was learnt, and judge it."""
+    model, evaluation = training.model, training.evaluation
     pulls = save(training, state)
     final: Evaluation | None = None
     try:
-        seconds_left = SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0
-        with current().waiting(seconds_left), exits_as_mistakes():
+        with _stoppable(state):
             activity.now("evaluating the final policy")
             final = judge(training, state)
-            activity.now("drawing the pictures")
-            draw(training, final)
     except KeyboardInterrupt:
         state = INTERRUPTED
-    outcome = Outcome(
-        run,
+    return Outcome(
+        training.run,
         state,
         n_steps=model.num_timesteps,
         taken=taken,
@@ -276,10 +279,30 @@ def _finish(training: Training, state: str, taken: WorkTime, activity: Activity)
         evaluating=evaluation.taken,
         evaluation_steps=getattr(evaluation.evaluator, "n_steps", 0),
     )
+
+
+def _finish(training: Training, state: str, outcome: Outcome, activity: Activity) -> Outcome:
+    """Draw what was learnt; ``run.json`` says so when all else is there."""
+    try:
+        with _stoppable(state):
+            activity.now("drawing the pictures")
+            draw(training, outcome.final)
+    except KeyboardInterrupt:
+        if outcome.state == FINISHED:
+            activity.say("stopped while drawing: the run counts as interrupted")
+        outcome = replace(outcome, state=INTERRUPTED)
     _record(outcome)
-    if state == FINISHED and not training.keeping.stays:
-        remove_states(run.state_path)
+    if outcome.state == FINISHED and not training.keeping.stays:
+        remove_states(training.run.state_path)
     return outcome
+
+
+@contextmanager
+def _stoppable(state: str) -> Iterator[None]:
+    """Let a signal end this: at once, or where training was ended by one, some time after that."""
+    seconds_left = SECONDS_TO_THE_PICTURES if state == INTERRUPTED else 0.0
+    with current().waiting(seconds_left), exits_as_mistakes():
+        yield
 
 
 def _record(outcome: Outcome) -> None:

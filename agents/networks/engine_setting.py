@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import inspect
+import sys
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
@@ -14,6 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import Schedule
+from torch.optim import Optimizer
 
 from agents.common.callback_horizons import unknown_callbacks
 from agents.common.setting_checks import check_option
@@ -30,6 +33,30 @@ from agents.networks.rollout_events import RolloutEvents
 from agents.networks.shared_tensors import in_rows
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
+# Where PyTorch's ``_disable_dynamo`` keeps a method that the compiler leaves alone.
+_KEPT_OUT = "__dynamo_disable"
+
+
+def do_without_torch_compiler() -> None:
+    """Let optimizers be made, saved and loaded without importing PyTorch's compiler.
+
+    Their methods import it at their first call, to keep it out of them; that takes a second. As
+    long as nobody else has imported it there is nothing to keep out. ``step`` imports it anyway.
+    """
+    for name in ("add_param_group", "load_state_dict", "state_dict", "zero_grad"):
+        method = getattr(getattr(Optimizer, name), "__wrapped__", None)
+        if method is not None and not hasattr(method, _KEPT_OUT):
+            setattr(method, _KEPT_OUT, partial(_call_without_compiler, name, method))
+
+
+def _call_without_compiler(
+    name: str, method: Any, optimizer: Optimizer, *args: Any, **kwargs: Any
+) -> Any:
+    if "torch._dynamo" not in sys.modules:
+        return method(optimizer, *args, **kwargs)
+    if hasattr(method, _KEPT_OUT):
+        delattr(method, _KEPT_OUT)
+    return getattr(Optimizer, name)(optimizer, *args, **kwargs)
 
 
 class CompiledNetworks(BaseAlgorithm):
@@ -58,6 +85,7 @@ class CompiledNetworks(BaseAlgorithm):
         self.engine_in_use = ""
         self._training: Any = None
         self._sharing: ExitStack | None = None
+        do_without_torch_compiler()
         super().__init__(*args, **kwargs)
 
     def set_random_seed(self, seed: int | None = None) -> None:

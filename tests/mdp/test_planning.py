@@ -272,3 +272,15 @@ def test_a_large_warehouse(slip: float) -> None:
     np.testing.assert_allclose(found.values, best, rtol=0, atol=1e-9)
     earned = policy_return(model, found.policy, 10_000).expected_return
     assert earned == pytest.approx(found.start_value, abs=1e-6)
+
+
+def test_sweeps_that_contract_slowly_are_helped_out() -> None:
+    """Far from the goal standing still is best, and forgets by the discount alone."""
+    model = model_of("RandomWarehouse-v0", size=100, slip=0.1)
+    one, two = value_iteration(model, 0.99), policy_iteration(model, 0.99)
+    assert one.iterations < 100  # sweeps alone take 362
+    bound = one.error_bound + two.error_bound
+    np.testing.assert_allclose(one.values, two.values, rtol=0, atol=bound)
+    # Both planners take the first of the actions that they cannot tell apart.
+    gap = two.action_values.max(axis=1) - two.action_values[np.arange(len(one.policy)), one.policy]
+    assert gap[model.reachable].max() <= 4 * bound

@@ -2,6 +2,8 @@
 
 import builtins
 import gc
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import pytest
@@ -59,6 +61,31 @@ def test_only_what_steps_an_optimizer_loads_what_that_needs(imported, fields, ex
         model.engine = fields["engine"]
     load_for_optimizer(model)
     assert imported[:1] == expected  # which imports parts of itself by that name
+
+
+COMPILED_TRAINING = """
+import sys
+from agents import load_algorithm
+model = load_algorithm("ppo")("MlpPolicy", "CartPole-v1", n_steps=32, engine="{engine}")
+model.learn(64)
+model.save(sys.argv[1])
+load_algorithm("ppo").load(sys.argv[1])
+print("torch._dynamo" in sys.modules)
+import torch
+torch._dynamo.reset()
+model.policy.optimizer.zero_grad()
+kept_out = getattr(torch.optim.Optimizer.zero_grad.__wrapped__, "__dynamo_disable")
+print(getattr(kept_out, "func", None) is None)
+"""
+
+
+@pytest.mark.parametrize(("engine", "imported"), [("compiled", False), ("library", True)])
+def test_compiled_networks_do_without_pytorchs_compiler(tmp_path, engine, imported):
+    program = COMPILED_TRAINING.format(engine=engine)
+    command = [sys.executable, "-c", program, str(tmp_path / "model")]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    # Once somebody has imported it, methods are kept out of it as ever.
+    assert done.stdout.splitlines()[-2:] == [str(imported), "True"]
 
 
 def test_optimizers_import_it_still(imported):

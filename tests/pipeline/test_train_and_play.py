@@ -3,6 +3,7 @@
 import io
 import pickle
 import re
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,9 @@ from pipeline.models.model_choice import ChosenModel, with_statistics
 from pipeline.models.model_zips import ModelFile
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
+from pipeline.stopping import stops_noticed
 from pipeline.train_spec import TrainSpec
-from pipeline.training import train
+from pipeline.training import carry_out, prepare, train
 
 
 def spec_of(folder, env_id="FrozenLake-v1", n_timesteps=600, entry=None, **fields):
@@ -78,6 +80,29 @@ def test_a_bar_lets_go_of_the_terminal_whatever_happens(tmp_path, monkeypatch, e
     # The cursor that was hidden, by the bar and by what came after it, is shown again.
     codes = re.findall(r"\x1b\[\?25[hl]", file.getvalue())
     assert codes == ["\x1b[?25l", "\x1b[?25h"] * (2 if state == "interrupted" else 1)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_results_are_told_before_anything_is_drawn(tmp_path, stopped):
+    """A stop while pictures are drawn costs the pictures, and nothing that was found out."""
+    told, file = [], io.StringIO()
+    spec = spec_of(tmp_path, pictures=True, eval_freq=300)
+
+    def tell(outcome):
+        run = outcome.run
+        told.append((outcome.state, run.read_info()["state"], run.curve_path.exists()))
+        if stopped:
+            signal.raise_signal(signal.SIGINT)
+
+    with stops_noticed():
+        training = prepare(spec, Console(file=file, width=200), {}, "train.py")
+        outcome = carry_out(training, tell)
+    assert told == [("finished", "running", False)]
+    info = outcome.run.read_info()
+    assert outcome.state == info["state"] == ("interrupted" if stopped else "finished")
+    assert outcome.run.curve_path.exists() is not stopped
+    assert info["final"]["mean_return"] == outcome.final.mean_return
+    assert ("stopped while drawing: the run counts as interrupted" in file.getvalue()) is stopped
 
 
 # --- playing --------------------------------------------------------------------------------------
