@@ -53,7 +53,8 @@ def card(record: Mapping[str, Any], files: Collection[str]) -> str:
 def _trained(record: Mapping[str, Any]) -> str:
     steps, seed = record["n_timesteps"], record["spec"]["seed"]
     maker = "Trained with Yardstick (the Python package `rl-yardstick`)"
-    return f"{maker} for {steps:,} environment steps, seed {seed}.\n"
+    engine = f"; engine: {record['engine']}" if record.get("engine") else ""
+    return f"{maker} for {steps:,} environment steps, seed {seed}{engine}.\n"
 
 
 def _front_matter(record: Mapping[str, Any]) -> str:
