@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from agents.common.callback_horizons import unknown_callbacks
+from agents.common.callback_horizons import members, unknown_callbacks
 from agents.networks.engine_costs import compiling_seconds, machine_pace
 
 if TYPE_CHECKING:
@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from pipeline.engine_outlook import EngineOutlook
 
 LIBRARY = "library (Stable-Baselines3's own loop)"
-HOW_NOT_TO_BE_ASKED = "a BlockCallback says when it acts: docs/training.md#callbacks"
+HOW_NOT_TO_BE_ASKED = (
+    "made a BlockCallback, it would be asked only when it acts (docs/training.md#from-python)"
+)
 MINUTE, HOUR = 60.0, 3600.0
 
 
@@ -35,22 +37,36 @@ def training_line(
     outlook: EngineOutlook | None, model: BaseAlgorithm, callback: BaseCallback
 ) -> str:
     """The line of one training; empty where there is nothing to say of its engine."""
-    asked = unknown_callbacks(callback)
+    asked = _of_the_users(callback)
     if outlook is None:
         if not asked or getattr(model, "engine", "compiled") != "auto":
             return ""
         return (
-            f"interpreted, a hundred times slower or more than compiled: {', '.join(asked)} must "
-            f"be asked after each step; {HOW_NOT_TO_BE_ASKED}"
+            f"interpreted, a hundred times slower or more: {', '.join(asked)} must be asked after "
+            f"each step; {HOW_NOT_TO_BE_ASKED}"
         )
-    advice = f"; {HOW_NOT_TO_BE_ASKED}" if asked and outlook.auto.is_compiled else ""
     pace = machine_pace()
+    advice = ""
+    if asked and outlook.auto.is_compiled:
+        advice = f"; {HOW_NOT_TO_BE_ASKED}"
+        if outlook.work is not None:
+            advice += f", and training take {about(outlook.work.compiled_seconds * pace)}"
     line = _words(outlook.plan, outlook, pace, "of processor time")
     if outlook.plan.is_compiled:
         return f"{line}{_in_brackets(outlook, pace)}{advice}"
     if outlook.auto.is_compiled:
         line += f"; --engine auto: {_auto_words(outlook, pace)}"
     return f"{line}{advice}"
+
+
+def _of_the_users(callback: BaseCallback) -> list[str]:
+    """Names of the callbacks that must be asked after each step and are not this project's."""
+    return [
+        name
+        for each in members(callback)
+        for name in unknown_callbacks(each)
+        if not type(each).__module__.startswith("pipeline.")
+    ]
 
 
 def _words(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> str:
