@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from stable_baselines3.common.callbacks import CallbackList
+
 from agents.common.callback_horizons import members, unknown_callbacks
 from agents.networks.engine_costs import compiling_seconds, machine_pace
 
@@ -61,12 +63,9 @@ def training_line(
 
 def _of_the_users(callback: BaseCallback) -> list[str]:
     """Names of the callbacks that must be asked after each step and are not this project's."""
-    return [
-        name
-        for each in members(callback)
-        for name in unknown_callbacks(each)
-        if not type(each).__module__.startswith("pipeline.")
-    ]
+    told = [each for each in members(callback) if not isinstance(each, CallbackList)]
+    theirs = [each for each in told if not type(each).__module__.startswith("pipeline.")]
+    return [name for each in theirs for name in unknown_callbacks(each)]
 
 
 def _words(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> str:
