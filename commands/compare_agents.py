@@ -23,7 +23,6 @@ from commands.places import Place, add_limit_flags, add_place_flags, give_way, h
 from commands.streams import go_on_unread
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
-from pipeline.plain_runs import NETWORKS
 from pipeline.signs_of_life import doing
 from pipeline.stopping import stops_noticed
 
@@ -277,6 +276,7 @@ def _engines(planned: Sequence[PlannedRun]) -> str:
     """On which engines the missing runs of networks will train, and what that takes."""
     from commands.engine_lines import study_line
     from pipeline.engine_outlook import planned_outlook
+    from pipeline.plain_runs import NETWORKS
 
     missing: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in planned:
