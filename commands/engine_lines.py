@@ -44,8 +44,8 @@ def training_line(
         if not asked or getattr(model, "engine", "compiled") != "auto":
             return ""
         return (
-            f"interpreted, a hundred times slower or more: {', '.join(asked)} must be asked after "
-            f"each step; {HOW_NOT_TO_BE_ASKED}"
+            f"interpreted, about a hundred times slower or more: {', '.join(asked)} must be asked "
+            f"after each step; {HOW_NOT_TO_BE_ASKED}"
         )
     pace = machine_pace()
     advice = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -66,7 +67,11 @@ def planned_outlook(spec: TrainSpec) -> EngineOutlook | None:
     """
     if spec.algo not in NETWORKS:
         return None
-    with contextlib.suppress(Exception), contextlib.closing(make_training_env(spec, None)) as env:
+    with (
+        contextlib.suppress(Exception),
+        warnings.catch_warnings(action="ignore"),
+        contextlib.closing(make_training_env(spec, None)) as env,
+    ):
         model = make_model(spec, None, env, algorithm_kwargs(spec))
         special, modules = spec.hyperparams, spec.gym_packages
         callbacks = components.callbacks(special.callback, modules, spec.log_folder)

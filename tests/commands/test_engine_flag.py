@@ -282,6 +282,7 @@ def test_a_table_says_what_a_callback_costs(type_command, tmp_path, monkeypatch)
     _, out, err = type_command("train.py", *words, "-params", "callback:mine.Mine")
     assert err == ""
     assert (
-        "engine  interpreted, a hundred times slower or more: Mine must be asked after each step; "
-        "made a BlockCallback, it would be asked only when it acts (docs/training.md#from-python)"
+        "engine  interpreted, about a hundred times slower or more: Mine must be asked after each "
+        "step; made a BlockCallback, it would be asked only when it acts "
+        "(docs/training.md#from-python)"
     ) in out.splitlines()
