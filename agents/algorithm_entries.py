@@ -25,6 +25,8 @@ class AlgorithmEntry:
         needs_masks: whether the environment must say which actions are valid.
         package: the import name of an optional package that it needs, or None.
         extra: the extra of this distribution that installs that package.
+        engines: words for its argument ``engine``, the default first; one or none where there is
+            no such argument, since it has one engine alone.
     """
 
     entry_point: str
@@ -36,6 +38,7 @@ class AlgorithmEntry:
     needs_masks: bool = False
     package: str | None = None
     extra: str | None = None
+    engines: tuple[str, ...] = ()
 
     @property
     def family(self) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch as th
@@ -16,6 +16,7 @@ from torch.nn.utils import clip_grad_norm_
 from agents.common.signatures import full_signature
 from agents.dqn import DQN, NextValues
 from agents.networks.compiled_q_learning import CompiledQLearning
+from agents.networks.engine_setting import NetworkEngineChoice
 
 
 def double_q_values(online: NextValues, target: QNetwork, next_obs: th.Tensor) -> th.Tensor:
@@ -37,10 +38,15 @@ def double_q_values(online: NextValues, target: QNetwork, next_obs: th.Tensor) -
 class DoubleDQN(DQN):
     """Double DQN (van Hasselt, Guez and Silver, 2016): DQN but for its target.
 
-    Arguments are those of `agents.dqn.DQN`.
+    Arguments are those of `agents.dqn.DQN`; ``engine`` is ``"auto"`` by default.
     """
 
+    __signature__: ClassVar[inspect.Signature]
+
     target_kind = "double_q"
+
+    def __init__(self, *args: Any, engine: NetworkEngineChoice = "auto", **kwargs: Any) -> None:
+        super().__init__(*args, engine=engine, **kwargs)
 
     def _next_values(self, target: QNetwork) -> NextValues:
         # One column, so that there is nothing left to choose from.
@@ -54,13 +60,17 @@ class DeepQLearning(CompiledQLearning):
     DQN without what was added to it later: the target comes from the network that learns, as it is
     at that very update, and the loss is the squared error, where Stable-Baselines3's DQN has a
     lagging copy and Huber's loss. Arguments are those of `stable_baselines3.DQN` and ``engine`` of
-    `agents.networks.engine_setting.CompiledNetworks`; ``target_update_interval`` is without effect.
+    `agents.networks.engine_setting.CompiledNetworks`, which is ``"auto"`` by default;
+    ``target_update_interval`` is without effect.
     """
 
     __signature__: ClassVar[inspect.Signature]
 
     target_kind = "online"
     largest_error = math.inf
+
+    def __init__(self, *args: Any, engine: NetworkEngineChoice = "auto", **kwargs: Any) -> None:
+        super().__init__(*args, engine=engine, **kwargs)
 
     def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
         assert self.replay_buffer is not None
@@ -89,4 +99,5 @@ class DeepQLearning(CompiledQLearning):
         return mse_loss(values, targets) / 2
 
 
-DeepQLearning.__signature__ = full_signature(DeepQLearning)
+for _algorithm in (DoubleDQN, DeepQLearning):
+    _algorithm.__signature__ = full_signature(_algorithm)

@@ -9,19 +9,29 @@ LINEAR_INPUTS = ("Box", "Discrete")
 NETWORK_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary", "Dict")
 POLICY_GRADIENT_OUTPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 CONTINUOUS = ("Box",)
+TABLE_ENGINES = ("auto", "compiled", "interpreted")
+LIBRARY_ENGINES = ("library", "compiled", "auto")
+NETWORK_ENGINES = ("auto", "compiled", "library")
 VECTOR_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
 
 def _tabular(entry_point: str, summary: str) -> AlgorithmEntry:
-    return AlgorithmEntry(f"agents.tabular.{entry_point}", summary, DISCRETE, DISCRETE)
+    entry_point = f"agents.tabular.{entry_point}"
+    return AlgorithmEntry(entry_point, summary, DISCRETE, DISCRETE, engines=TABLE_ENGINES)
 
 
 def _tiled(entry_point: str, summary: str) -> AlgorithmEntry:
-    return AlgorithmEntry(f"agents.linear.{entry_point}", summary, LINEAR_INPUTS, DISCRETE)
+    entry_point = f"agents.linear.{entry_point}"
+    return AlgorithmEntry(entry_point, summary, LINEAR_INPUTS, DISCRETE, engines=TABLE_ENGINES)
 
 
-def _deep(entry_point: str, summary: str, actions: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
-    return AlgorithmEntry(entry_point, summary, NETWORK_INPUTS, actions)
+def _deep(
+    entry_point: str,
+    summary: str,
+    actions: tuple[str, ...] = DISCRETE,
+    engines: tuple[str, ...] = LIBRARY_ENGINES[:1],
+) -> AlgorithmEntry:
+    return AlgorithmEntry(entry_point, summary, NETWORK_INPUTS, actions, engines=engines)
 
 
 def _contrib(
@@ -40,6 +50,7 @@ def _contrib(
         needs_masks=needs_masks,
         package="sb3_contrib",
         extra="contrib",
+        engines=LIBRARY_ENGINES[:1],
     )
 
 
@@ -106,20 +117,26 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "reinforce": _tiled(
         "reinforce:Reinforce", "REINFORCE on tiles or a table, with or without a baseline"
     ),
-    "dqn": _deep("agents.dqn:DQN", "deep Q-network (Stable-Baselines3)"),
-    "double_dqn": _deep("agents.deep:DoubleDQN", "DQN with van Hasselt's target"),
+    "dqn": _deep("agents.dqn:DQN", "deep Q-network (Stable-Baselines3)", engines=LIBRARY_ENGINES),
+    "double_dqn": _deep(
+        "agents.deep:DoubleDQN", "DQN with van Hasselt's target", engines=NETWORK_ENGINES
+    ),
     "deep_qlearning": _deep(
-        "agents.deep:DeepQLearning", "DQN of 2013: squared loss, no target network"
+        "agents.deep:DeepQLearning",
+        "DQN of 2013: squared loss, no target network",
+        engines=NETWORK_ENGINES,
     ),
     "ppo": _deep(
         "agents.policy_gradients:PPO",
         "proximal policy optimisation (Stable-Baselines3)",
         POLICY_GRADIENT_OUTPUTS,
+        LIBRARY_ENGINES,
     ),
     "a2c": _deep(
         "agents.policy_gradients:A2C",
         "advantage actor-critic (Stable-Baselines3)",
         POLICY_GRADIENT_OUTPUTS,
+        LIBRARY_ENGINES,
     ),
     "sac": _deep("stable_baselines3:SAC", "soft actor-critic (Stable-Baselines3)", CONTINUOUS),
     "td3": _deep(

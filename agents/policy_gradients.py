@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, ClassVar
@@ -13,9 +14,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from agents.common.signatures import full_signature
 from agents.networks.coverage import check_policy_agent
+from agents.networks.engine_costs import Work, work_of
 from agents.networks.engine_setting import CompiledNetworks
 from agents.networks.library_networks import Network, check_optimizer
 from agents.networks.policy_training import PolicyTraining, policy_networks, policy_training
@@ -50,6 +53,25 @@ class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
         check_policy_agent(self)
         check_optimizer(self.policy.optimizer)
         policy_networks(self.policy, self._seen_in_python())
+
+    def _work_of(self, n_steps: float) -> Work:
+        rollout = self.n_steps * self.n_envs
+        batch_size = self.minibatch_size or rollout
+        n_rollouts = math.ceil(n_steps / rollout)
+        n_updates = n_rollouts * getattr(self, "n_epochs", 1) * math.ceil(rollout / batch_size)
+        policy: Any = self.policy
+        extractor = policy.mlp_extractor
+        actor = nn.ModuleList([extractor.policy_net, policy.action_net])
+        critic = nn.ModuleList([extractor.value_net, policy.value_net])
+        return work_of(
+            "policy",
+            [actor, critic],
+            self.observation_space,
+            n_rollouts * rollout,
+            self.n_envs,
+            n_updates,
+            batch_size,
+        )
 
     def _schedules(self) -> list[Schedule]:
         bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from commands.flag_values import (
     COUNT,
     COUNT_OR_NONE,
+    add_engine_flag,
     filled,
     folder_name,
     number_at_least_zero,
@@ -82,6 +83,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="KEY:VALUE",
         help="hyperparameters to change in every agent",
     )
+    add_engine_flag(parser)
     add(
         "-conf",
         "--conf-file",
@@ -267,3 +269,22 @@ def _prepare(
             place.get_ready(planned)
         activity.now("loading the libraries")
         check_settings(study, planned)
+        line = _engines(planned)
+    if line:
+        console.print(f"engines: {line}", markup=False, highlight=False, soft_wrap=True)
+
+
+def _engines(planned: Sequence[PlannedRun]) -> str:
+    """On which engines the missing runs of networks will train, and what that takes."""
+    from commands.engine_lines import study_line
+    from pipeline.engine_outlook import planned_outlook
+    from pipeline.plain_runs import NETWORKS
+
+    missing: dict[tuple[str, str], list[PlannedRun]] = {}
+    for run in planned:
+        if run.spec.algo in NETWORKS and run.is_to_do:
+            missing.setdefault((run.agent, run.environment), []).append(run)
+    outlooks = [
+        (runs[0].agent, planned_outlook(runs[0].spec), len(runs)) for runs in missing.values()
+    ]
+    return study_line([(label, each, n) for label, each, n in outlooks if each is not None])

@@ -145,6 +145,20 @@ def save_interval(text: str) -> SaveInterval:
     )
 
 
+ENGINES = ("auto", "compiled", "library", "interpreted")
+
+
+def add_engine_flag(group: argparse._ActionsContainer) -> None:
+    """The flag that says what trainings run on, the same for every command that has any."""
+    group.add_argument(
+        "--engine",
+        choices=ENGINES,
+        help="what trains: auto (compiled code where that is possible and the budget is worth it), "
+        "compiled, library (Stable-Baselines3's own loop; the default of dqn, ppo and a2c), or for "
+        "tables interpreted; the default of all others is auto",
+    )
+
+
 COUNT = whole_number(1)
 COUNT_OR_NONE = whole_number(0)
 # As rl_zoo3 has it: -1 stands for what the hyperparameters say.

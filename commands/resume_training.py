@@ -95,7 +95,13 @@ def _check_given(args: argparse.Namespace) -> None:
 
 
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
-    from commands.run_output import print_header, print_line, print_outcome, writing_watched
+    from commands.run_output import (
+        print_engine,
+        print_header,
+        print_line,
+        print_outcome,
+        writing_watched,
+    )
     from commands.terminal import TextConsole
     from pipeline.run_folder import INTERRUPTED
     from pipeline.run_lock import at_work_on, check_left
@@ -112,6 +118,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
         if is_finished(run):
             return _nothing_to_do(args, run, console)
         training = _prepared(args, run, spec, console)
+        print_engine(console, training)
         from pipeline.training import carry_out
 
         with writing_watched(console, training):

@@ -94,6 +94,17 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     console.print(settings, style="dim", highlight=False)
 
 
+def print_engine(console: Console, training: Training) -> None:
+    """Say on which engine it will run, and what that takes."""
+    from commands.engine_lines import training_line
+    from pipeline.engine_outlook import engine_outlook
+
+    model, callback = training.model, training.callback
+    line = training_line(engine_outlook(model, training.spec, [callback]), model, callback)
+    if line:
+        print_line(console, f"engine  {line}")
+
+
 def print_line(console: Console, line: str) -> None:
     """Say something beside the figures, in one line however long it is."""
     console.print(line, style="dim", highlight=False, soft_wrap=True)

@@ -20,6 +20,7 @@ from experiments.study_spec import (
     file_name,
     layered,
 )
+from pipeline.agent_checks import with_engine
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
 from pipeline.run_files import environment_name
@@ -123,7 +124,7 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     agents = tuple(
         replace(
             agent,
-            settings=layered(agent.settings, changes),
+            settings=layered(agent.settings, with_engine(agent.algo, changes, args.engine)),
             conf_file=files.get(agent.algo, agent.conf_file),
         )
         for agent in study.agents

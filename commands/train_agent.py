@@ -54,6 +54,7 @@ def _list(args: argparse.Namespace) -> int:
 
 def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     from commands.run_output import (
+        print_engine,
         print_header,
         print_line,
         print_outcome,
@@ -80,6 +81,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
             activity.now("making the environments and the agent")
             keeping = StateKeeping(args.save_state_every, stays=args.keep_state)
             training = prepare(spec, console, _recorded(args), command_line(), keeping=keeping)
+            print_engine(console, training)
         print_refusal(console, training.refusal)
         with (
             at_work_on(training.run, partial(print_line, console)),

@@ -12,6 +12,7 @@ from commands.flag_values import (
     SEED,
     THREADS,
     VERBOSITY,
+    add_engine_flag,
     filled,
     save_interval,
     whole_number,
@@ -25,7 +26,7 @@ RESUMING = ("resume", "resume_or_start", "save_state_every", "keep_state")
 
 EPILOG = """\
 examples:
-  python train.py --env Warehouse-v0 --algo ppo
+  python train.py --env Warehouse-v0 --algo ppo --engine auto
   python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
   python train.py --env CartPole-v1 --algo dqn -params learning_rate:1e-3 buffer_size:50000
   python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
@@ -80,7 +81,8 @@ def _add_resuming_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_training_flags(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument_group("budget and settings").add_argument
+    group = parser.add_argument_group("budget and settings")
+    add = group.add_argument
     add("-n", "--n-timesteps", type=BUDGET, default=-1, metavar="N", help="environment steps")
     add("--n-episodes", type=BUDGET, default=-1, metavar="N", help="episodes instead of steps")
     add("--seed", type=SEED, default=-1, help="seed of everything (default: a random one)")
@@ -92,6 +94,7 @@ def _add_training_flags(parser: argparse.ArgumentParser) -> None:
         metavar="KEY:VALUE",
         help="hyperparameters to change, e.g. learning_rate:0.01",
     )
+    add_engine_flag(group)
     add(
         "-conf",
         "--conf-file",

@@ -10,7 +10,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from commands.parsing import check_device, check_tensorboard
-from pipeline.agent_checks import check_algorithm, check_fit
+from pipeline.agent_checks import check_algorithm, check_fit, with_engine
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.map_contents import with_logs_located, with_maps_read
@@ -84,7 +84,8 @@ def _page_path(args: argparse.Namespace) -> Path | None:
 
 def _raw_hyperparams(args: argparse.Namespace) -> dict[str, Any]:
     """The file's entry for the environment, changed as the command line says."""
-    changes = parse_assignments(args.hyperparams, "--hyperparams")
+    typed = parse_assignments(args.hyperparams, "--hyperparams")
+    changes = with_engine(args.algo, typed, args.engine)
     try:
         entry = read_hyperparams(args.algo, args.env, args.conf_file)
     except NoEntryError:

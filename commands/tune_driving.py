@@ -13,6 +13,7 @@ from commands.places import give_way
 from commands.study_output import conclude, do_missing, read, say
 from commands.tune_how import How
 from commands.tune_output import (
+    print_engines,
     print_entry,
     print_opened,
     print_outcome,
@@ -46,6 +47,7 @@ def drive(console: Console, place: OpenTuning, how: How) -> int:
     """Search, run the best again, and say what came of it; the exit code."""
     with place.queue:
         print_opened(console, place, how.place(place.root).words)
+        print_engines(console, place)
         _search(console, place, how)
     print_search(console, place)
     try:

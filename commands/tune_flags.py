@@ -7,6 +7,7 @@ import argparse
 from commands.flag_values import (
     COUNT,
     RUN_TIMEOUT,
+    add_engine_flag,
     filled,
     folder_name,
     whole_number,
@@ -23,7 +24,7 @@ FIRST_SEED = whole_number(0, 2**31)
 EPILOG = """\
 examples:
   python tune.py --env Warehouse-v0 --algo ppo --trials 100
-  python tune.py --env FrozenLake8x8-v1 --algo ppo -params engine:compiled -j 4
+  python tune.py --env FrozenLake8x8-v1 --algo ppo --engine auto -j 4
   python tune.py --env CartPole-v1 --algo dqn --seeds-per-trial 10 --objective lower
   python tune.py --env Taxi-v4 --algo qlearning --sampler grid --storage journal:shared/taxi.log
 
@@ -145,8 +146,9 @@ def _add_run_flags(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="KEY:VALUE",
-        help="hyperparameters of every trial, which are not searched, e.g. engine:compiled",
+        help="hyperparameters of every trial, which are not searched, e.g. gamma:0.99",
     )
+    add_engine_flag(group)
     add("-conf", "--conf-file", type=filled, metavar="YAML", help="start from another file's entry")
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add("--gym-packages", nargs="+", type=filled, default=[], metavar="MODULE", help=MODULES_HELP)

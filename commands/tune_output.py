@@ -13,9 +13,11 @@ from rich.table import Table
 
 from commands.live_progress import duration
 from commands.study_output import say
+from pipeline.plain_runs import NETWORKS
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome, Retested
 from tuning.trial_queue import FAILURE, figures_of, seconds_of
+from tuning.trial_runs import planned_run, shipped_run
 
 
 def print_opened(console: Console, place: OpenTuning, where: str) -> None:
@@ -29,6 +31,21 @@ def print_opened(console: Console, place: OpenTuning, where: str) -> None:
     )
     for name in space.widened:
         say(console, f"{name}: the search space is widened to hold the shipped value")
+
+
+def print_engines(console: Console, place: OpenTuning) -> None:
+    """Say on which engines the search and the re-test will run, and what a run takes."""
+    tuning, shipped = place.tuning, place.suggestions.shipped
+    if tuning.agent.algo not in NETWORKS:
+        return
+    from commands.engine_lines import search_line
+    from pipeline.engine_outlook import planned_outlook
+
+    searched = planned_run(tuning, place.root, shipped, tuning.seeds[0])
+    runs = (searched, shipped_run(tuning, place.root))
+    line = search_line(tuning.agent.algo, *(planned_outlook(run.spec) for run in runs))
+    if line:
+        say(console, f"engine: {line}")
 
 
 def print_search(console: Console, place: OpenTuning) -> None:

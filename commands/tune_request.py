@@ -10,6 +10,7 @@ from typing import Any
 from agents import ALGORITHMS
 from commands.flag_values import LONGEST_FOLDER_NAME
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name
+from pipeline.agent_checks import with_engine
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
 from pipeline.run_files import environment_name
@@ -93,4 +94,5 @@ def _agent(args: argparse.Namespace) -> AgentSpec:
         if getattr(args, key) is not None:
             settings[key] = getattr(args, key)
     conf_file = None if args.conf_file is None else Path(args.conf_file)
+    settings = with_engine(args.algo, settings, args.engine)
     return AgentSpec(SHIPPED, args.algo, settings, conf_file=conf_file)

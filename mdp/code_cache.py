@@ -172,6 +172,12 @@ class OwnFiles(IndexDataCacheFile):
             yield file
 
 
+def is_compiled_before(name: str) -> bool:
+    """Whether machine code of a function of ours is kept, for whatever argument types."""
+    kept_in = folder()
+    return kept_in is not None and any(kept_in.glob(f"*/*.{name}-*.nbi"))
+
+
 def remove_old(parent: Path) -> None:
     """Leave the folder in use and the few that were used last before it."""
     dated = []

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from agents import ALGORITHMS, fitting_algorithms
+from collections.abc import Mapping, Sequence
+from typing import Any, get_args
+
+from agents import ALGORITHMS, fitting_algorithms, load_algorithm
 from agents.algorithm_entries import is_bandit
 from envs.action_masks import has_masks
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError, unknown
+from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.train_spec import TrainSpec
 
 
@@ -23,6 +27,37 @@ def check_algorithm(algo: str) -> None:
         raise UserError(
             f"{algo} needs {entry.package}, which is not installed: {entry.install_command}"
         )
+
+
+def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:
+    """The typed settings of an agent, with what ``--engine`` says; None where it says nothing.
+
+    Raises:
+        UserError: if the settings say something else, or the agent has no such engine.
+    """
+    if word is None or algo not in ALGORITHMS:
+        return dict(settings)
+    said = settings.get("engine", word)
+    if said != word:
+        raise UserError(f"--engine {word} and -params engine:{said} disagree: give one of them")
+    engines = _engines_of(algo)
+    if len(engines) > 1 and word in engines:
+        return {**settings, "engine": word}
+    if len(engines) < 2 and word in ("auto", *engines):
+        return dict(settings)
+    has = (
+        f"the engines {', '.join(engines)}" if len(engines) > 1 else "one engine, which auto means"
+    )
+    raise UserError(f"--engine {word}: {algo} has {has}")
+
+
+def _engines_of(algo: str) -> Sequence[str]:
+    """The engines of an agent; of one of the user's own, as its class has it."""
+    entry = ALGORITHMS[algo]
+    if entry.engines or entry.entry_point.startswith("agents."):
+        return entry.engines
+    parameter = algorithm_parameters(load_algorithm(algo)).get("engine")
+    return () if parameter is None else get_args(parameter.annotation)
 
 
 def check_fit(spec: TrainSpec) -> None:

@@ -17,7 +17,7 @@ from pipeline.train_spec import TrainSpec
 # Agents whose random numbers are all their own, or drawn after they have been seeded.
 FAMILIES = frozenset({"tabular", "linear"})
 # Those of the library, once they train on compiled code: weights are drawn after that too. In the
-# library's own loop they take too long to gain anything.
+# library's own loop they take too long to gain anything, but for what `auto` leaves there.
 NETWORKS = frozenset({"dqn", "double_dqn", "deep_qlearning", "ppo", "a2c"})
 
 HOMES = ("envs.", "gymnasium.envs.")
@@ -56,7 +56,8 @@ def is_plain(spec: TrainSpec) -> bool:
 
 def _is_known_agent(spec: TrainSpec) -> bool:
     if spec.algo in NETWORKS:
-        return bool(spec.hyperparams.algorithm.get("engine") == "compiled")
+        default = ALGORITHMS[spec.algo].engines[0]
+        return bool(spec.hyperparams.algorithm.get("engine", default) != "library")
     return spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].family in FAMILIES
 
 

@@ -151,7 +151,7 @@ def set_up(
     undo.callback(end_workers_after_stop)
     trained = model_to_continue(spec)
     spec, env = _training_env(spec, trained, run, undo, appends=keeping.state is not None)
-    model = _make_model(spec, trained, env, kwargs)
+    model = make_model(spec, trained, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
     elif keeping.state is not None:
@@ -262,9 +262,17 @@ def is_unread(spec: TrainSpec) -> bool:
     return spec.tensorboard_log is None and spec.verbose < 2
 
 
-def _make_model(
+def make_model(
     spec: TrainSpec, trained: ModelFile | None, env: VecEnv, kwargs: dict[str, Any]
 ) -> BaseAlgorithm:
+    """The agent of a run, a new one or the one that it goes on from.
+
+    Args:
+        spec: the run.
+        trained: the file of an agent that goes on; None for a new one.
+        env: the environments of the training.
+        kwargs: the constructor's arguments, see `algorithm_kwargs`.
+    """
     folder = spec.tensorboard_log
     common: dict[str, Any] = {
         "seed": spec.seed,

@@ -39,6 +39,8 @@ def write_record(
         "n_trials": place.queue.n_trials,
         "seeds": list(tuning.seeds),
         "held_out_seeds": list(tuning.held_out),
+        "search_engine": tuning.searched(place.suggestions.shipped).get("engine"),
+        "engine": place.suggestions.shipped.get("engine"),
         "widened": list(place.suggestions.space.widened),
         "trials": [_trial(trial) for trial in place.queue.trials()],
         "retest": None if outcome is None else _outcome(outcome, winner_file),

@@ -55,4 +55,4 @@ def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: 
 
 
 def _agent(tuning: TuningSpec, label: str, entry: Mapping[str, Any]) -> AgentSpec:
-    return AgentSpec(label, tuning.agent.algo, dict(entry), tuned=False)
+    return AgentSpec(label, tuning.agent.algo, tuning.searched(entry), tuned=False)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from experiments.study_spec import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec, layered
+from agents import ALGORITHMS
+from experiments.study_spec import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.json_text import plain
 
@@ -92,9 +93,14 @@ class TuningSpec:
         """The seeds of the re-test."""
         return range(self.first_retest_seed, self.first_retest_seed + self.retest_seeds)
 
-    def with_settings(self, label: str, suggested: Mapping[str, Any]) -> AgentSpec:
-        """The agent with what is suggested for it."""
-        return replace(self.agent, label=label, settings=layered(suggested, self.agent.settings))
+    def searched(self, entry: Mapping[str, Any]) -> dict[str, Any]:
+        """Settings as the search runs them, which may be on another engine than the agent's own.
+
+        The library's agents compile wherever ``auto`` does, unless somebody says otherwise. The
+        re-test is of what will be used, and leaves them to the engine that they train in.
+        """
+        engines = ALGORITHMS[self.agent.algo].engines
+        return {**({"engine": "auto"} if "auto" in engines[1:] else {}), **entry}
 
     def check(self) -> None:
         """Make sure that nothing is judged on what it was chosen by.
@@ -117,9 +123,12 @@ class TuningSpec:
             space: the distributions of the space, as JSON.
         """
         kept = {key: value for key, value in vars(self).items() if key not in _MAY_CHANGE}
+        entry = self.searched(shipped)
+        engine = {"search_engine": entry["engine"]} if entry.keys() - shipped.keys() else {}
         data = plain(
             {
                 **kept,
+                **engine,
                 "algo": self.agent.algo,
                 "env": self.environment.env_id,
                 "hyperparams": dict(shipped),

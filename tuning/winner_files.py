@@ -16,6 +16,7 @@ from tuning.tuning_spec import TuningSpec
 
 FILE = "winner.yml"
 LONGEST_LINE = 100
+LIBRARY_LOOP = "Stable-Baselines3's own loop, in which the agent trains unless told otherwise"
 
 
 def write_winner(
@@ -23,7 +24,7 @@ def write_winner(
 ) -> Path:
     """Write the winner's entry, as `hyperparams/` and ``--conf-file`` take it; the file."""
     path = root / FILE
-    write_text(path, entry_text(tuning, entry, provenance(tuning, outcome, n_trials)))
+    write_text(path, entry_text(tuning, entry, provenance(tuning, outcome, entry, n_trials)))
     return path
 
 
@@ -32,7 +33,9 @@ def remove_winner(root: Path) -> None:
     (root / FILE).unlink(missing_ok=True)
 
 
-def provenance(tuning: TuningSpec, outcome: Outcome, n_trials: int) -> list[str]:
+def provenance(
+    tuning: TuningSpec, outcome: Outcome, entry: Mapping[str, Any], n_trials: int
+) -> list[str]:
     """Where the winner's settings come from, in lines."""
     winner, shipped = outcome.winner, outcome.retested[0]
     assert winner is not None
@@ -44,9 +47,16 @@ def provenance(tuning: TuningSpec, outcome: Outcome, n_trials: int) -> list[str]
         f"({tuning.sampler}), {_words(tuning)} over the seeds {seeds.start} to {seeds.stop - 1}: "
         f"{_figure(winner.in_search)}. On the seeds {held_out.start} to {held_out.stop - 1}, which "
         f"the search has not seen{chosen}: {_held_out(tuning, winner)}; the settings before, "
-        f"there: {_held_out(tuning, shipped)}. Verdict: {winner.verdict}."
+        f"there: {_held_out(tuning, shipped)}. Verdict: {winner.verdict}.{_engines(tuning, entry)}"
     )
     return textwrap.wrap(text, LONGEST_LINE - len("# "))
+
+
+def _engines(tuning: TuningSpec, entry: Mapping[str, Any]) -> str:
+    """On which engines, where search and re-test had different ones."""
+    if tuning.searched(entry) == dict(entry):
+        return ""
+    return f" The search ran with engine: auto, the re-test in {LIBRARY_LOOP}."
 
 
 def _words(tuning: TuningSpec) -> str:

@@ -10,9 +10,10 @@ import stable_baselines3
 from numpy.typing import NDArray
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
 
 from agents.networks.coverage import check_q_agent
+from agents.networks.engine_costs import STEPS_OF_EPISODE, Work, work_of
 from agents.networks.engine_setting import CompiledNetworks
 from agents.networks.library_networks import Network, check_optimizer
 from agents.networks.q_training import QTraining, q_network, q_training
@@ -47,6 +48,17 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
         check_q_agent(self)
         check_optimizer(self.policy.optimizer)
         q_network(self.q_net, self._seen_in_python())
+
+    def _work_of(self, n_steps: float) -> Work:
+        train_freq: Any = self.train_freq
+        frequency = float(train_freq.frequency)
+        if train_freq.unit == TrainFrequencyUnit.EPISODE:
+            frequency *= STEPS_OF_EPISODE
+        between = frequency * self.n_envs
+        at_once = self.gradient_steps if self.gradient_steps >= 0 else between
+        n_updates = max(n_steps - self.learning_starts, 0.0) / between * at_once
+        seen = self.observation_space
+        return work_of("q", [self.q_net], seen, n_steps, self.n_envs, n_updates, self.batch_size)
 
     def _schedules(self) -> list[Schedule]:
         return [*super()._schedules(), self.exploration_schedule]

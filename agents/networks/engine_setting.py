@@ -7,6 +7,7 @@ import sys
 from abc import abstractmethod
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
@@ -18,10 +19,11 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.type_aliases import Schedule
 from torch.optim import Optimizer
 
-from agents.common.callback_horizons import unknown_callbacks
+from agents.common.callback_horizons import EpisodeBudget, members, unknown_callbacks
 from agents.common.setting_checks import check_option
 from agents.compiled.compile_envs import NotCompilable
 from agents.compiled.learning_algorithm import compiled_schedule
+from agents.networks.engine_costs import STEPS_OF_EPISODE, Work
 from agents.networks.library_networks import Network
 from agents.networks.matrix_products import one_thread
 from agents.networks.network_engine import NetworkEngine
@@ -33,6 +35,7 @@ from agents.networks.rollout_events import RolloutEvents
 from agents.networks.shared_tensors import in_rows
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
+TOO_SHORT = "so short a training is not worth compiling"
 # Where PyTorch's ``_disable_dynamo`` keeps a method that the compiler leaves alone.
 _KEPT_OUT = "__dynamo_disable"
 
@@ -59,13 +62,39 @@ def _call_without_compiler(
     return getattr(Optimizer, name)(optimizer, *args, **kwargs)
 
 
+@dataclass(frozen=True)
+class EnginePlan:
+    """Which engine a training runs on, and why.
+
+    Attributes:
+        is_compiled: whether networks act and learn in compiled code, and not in the library's loop.
+        reason: why they do not although that would do; empty where nobody asked for it.
+        world: the compiled environments, and how networks see them; None where they run in Python.
+        in_python: why they do; empty where they do not, or nothing is compiled.
+    """
+
+    is_compiled: bool
+    reason: str = ""
+    world: tuple[Any, Any] | None = None
+    in_python: str = ""
+
+    def __str__(self) -> str:
+        if not self.is_compiled:
+            return f"library: {self.reason}" if self.reason else "library"
+        return (
+            f"compiled but for the environment: {self.in_python}" if self.in_python else "compiled"
+        )
+
+
 class CompiledNetworks(BaseAlgorithm):
     """An agent of the library that can train on compiled code.
 
     Args:
         engine: ``"library"`` trains in the library's own loop; ``"compiled"`` in compiled code, the
             environment too where its model is known, to the same results but for rounding and
-            random numbers, and is refused where that cannot be; ``"auto"`` compiles where it can.
+            random numbers, and is refused where that cannot be; ``"auto"`` compiles where it can
+            and the training is long enough, by `agents.networks.engine_costs.Work`, which goes by
+            settings and budget alone.
         args: the library's arguments.
         kwargs: likewise.
 
@@ -81,7 +110,7 @@ class CompiledNetworks(BaseAlgorithm):
 
     def __init__(self, *args: Any, engine: NetworkEngineChoice = "library", **kwargs: Any) -> None:
         check_option("engine", engine, NetworkEngineChoice)
-        self.engine = engine
+        self.engine: NetworkEngineChoice = engine
         self.engine_in_use = ""
         self._training: Any = None
         self._sharing: ExitStack | None = None
@@ -125,21 +154,58 @@ class CompiledNetworks(BaseAlgorithm):
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
         """Train as the library's ``learn`` does, on the engine that was asked for."""
         library: Any = super()
-        if not self._takes_compiled():
-            library.learn(total_timesteps, *args, **kwargs)
-            return self
         given = inspect.signature(library.learn).bind(total_timesteps, *args, **kwargs)
         given.apply_defaults()
-        try:
-            world, seen = self._world_for(given.arguments["callback"])
-        except NotCompilable as reason:
-            self.engine_in_use = f"compiled but for the environment: {reason}"
+        plan = self.engine_plan(total_timesteps, given.arguments["callback"])
+        if self.engine == "compiled" and not plan.is_compiled:
+            raise ValueError(f"engine: compiled is not possible: {plan.reason}")
+        self.engine_in_use = str(plan)
+        if not plan.is_compiled:
+            library.learn(**given.arguments)
+        elif plan.world is None:
             with self._learning_compiled():
                 library.learn(**given.arguments)
         else:
-            self.engine_in_use = "compiled"
-            self._learn_compiled(world, seen, **given.arguments)
+            self._learn_compiled(*plan.world, **given.arguments)
         return self
+
+    def engine_plan(
+        self, total_timesteps: int, callback: Any, engine: NetworkEngineChoice | None = None
+    ) -> EnginePlan:
+        """Which engine `learn` would run on, and why.
+
+        Args:
+            total_timesteps: its argument.
+            callback: likewise.
+            engine: as if the agent had this one.
+        """
+        engine = self.engine if engine is None else engine
+        if engine == "library":
+            return EnginePlan(is_compiled=False)
+        try:
+            self._check_compilable()
+        except NotCompilable as reason:
+            return EnginePlan(is_compiled=False, reason=str(reason))
+        if engine == "auto" and not self.work(total_timesteps, callback).is_worth_compiling:
+            return EnginePlan(
+                is_compiled=False, reason="so short a training is not worth compiling"
+            )
+        try:
+            return EnginePlan(is_compiled=True, world=self._world_for(callback))
+        except NotCompilable as reason:
+            return EnginePlan(is_compiled=True, in_python=str(reason))
+
+    def work(self, total_timesteps: int, callback: Any = None) -> Work:
+        """What a training with these arguments of `learn` does."""
+        steps = float(total_timesteps)
+        for each in _each(callback):
+            if isinstance(each, EpisodeBudget):
+                steps = min(steps, float(each.n_episodes * STEPS_OF_EPISODE))
+        return self._work_of(steps)
+
+    @abstractmethod
+    def _work_of(self, n_steps: float) -> Work:
+        """What a training of so many steps does."""
 
     @contextmanager
     def _learning_compiled(self) -> Iterator[None]:
@@ -163,32 +229,16 @@ class CompiledNetworks(BaseAlgorithm):
         training_now: NetworkTraining = self._training
         return training_now
 
-    def _takes_compiled(self) -> bool:
-        if self.engine == "library":
-            self.engine_in_use = "library"
-            return False
-        try:
-            self._check_compilable()
-        except NotCompilable as reason:
-            if self.engine == "compiled":
-                raise ValueError(f"engine: compiled is not possible: {reason}") from None
-            self.engine_in_use = f"library: {reason}"
-            return False
-        return True
-
     def _world_for(self, callback: Any) -> tuple[Any, Any]:
         """The environments as compiled code, and how networks see them.
 
         Raises:
             NotCompilable: if they have to be called step by step.
         """
-        if isinstance(callback, list):
-            callback = CallbackList(callback)
-        if callback is not None:
-            known = isinstance(callback, BaseCallback)
-            unknown = unknown_callbacks(callback) if known else ["a function"]
-            if unknown:
-                raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
+        known = isinstance(callback, BaseCallback | list | None)
+        unknown = unknown_callbacks(CallbackList(_each(callback))) if known else ["a function"]
+        if unknown:
+            raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
         for schedule in self._schedules():
             compiled_schedule(schedule)
         assert self.env is not None
@@ -228,3 +278,10 @@ class CompiledNetworks(BaseAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), *self._own]
+
+
+def _each(callback: Any) -> list[BaseCallback]:
+    """The callbacks in what `learn` takes as ``callback``; a function is none of them."""
+    if isinstance(callback, BaseCallback):
+        return members(callback)
+    return [each for one in callback for each in members(one)] if isinstance(callback, list) else []

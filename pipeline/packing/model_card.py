@@ -62,7 +62,8 @@ def _text(value: object) -> str:
 def _trained(record: Mapping[str, Any]) -> str:
     steps, seed = record["n_timesteps"], record["spec"]["seed"]
     maker = "Trained with Yardstick (the Python package `rl-yardstick`)"
-    return f"{maker} for {steps:,} environment steps, seed {_text(seed)}.\n"
+    engine = f"; engine: {_text(record['engine'])}" if record.get("engine") else ""
+    return f"{maker} for {steps:,} environment steps, seed {_text(seed)}{engine}.\n"
 
 
 def _front_matter(record: Mapping[str, Any]) -> str:

@@ -91,8 +91,9 @@ def _column(infos: list[Mapping[str, Any]]) -> dict[str, str]:
     steps = sorted(info["n_timesteps"] for info in infos)
     lengths = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
     column = {"agent": spec["algo"], "steps run": lengths}
-    if infos[0].get("engine"):
-        column["engine"] = str(infos[0]["engine"])
+    engines = sorted({str(info["engine"]) for info in infos if info.get("engine")})
+    if engines:
+        column["engine"] = "; ".join(engines)
     return column | {name: setting(value) for name, value in spec["hyperparams"].items()}
 
 

@@ -77,6 +77,8 @@ TRAININGS = [
     (LEFT_RIGHT, "dqn", 300, {**EAGER, "n_steps": 3, "exploration_fraction": 0.5}),
     ("Warehouse-v0", "double_dqn", 300, {**EAGER, "mask_actions": True}),
     ("Warehouse-v0", "deep_qlearning", 200, {}),
+    # Long enough for `auto` to compile it, as a whole and for what is left.
+    (GRID, "double_dqn", 5000, {**EAGER}),
     (LEFT_RIGHT, "ppo", 600, {**SMALL, "learning_rate": "lin_0.001", "clip_range": "lin_0.2"}),
     (SWING, "ppo", 600, {**SMALL, "use_sde": True, "normalize": True, "frame_stack": 2}),
     (LEFT_RIGHT, "a2c", 300, {}),
