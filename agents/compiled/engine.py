@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.common.callback_horizons import (
     NEVER,
@@ -18,8 +18,10 @@ from agents.common.callback_horizons import (
 )
 from agents.common.online import is_read
 from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
+from agents.compiled.compile_envs import compile_envs
 from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.generators import handles_of
+from agents.compiled.greedy_play import CompiledEvaluations, Playground
 from agents.compiled.interrupts import interrupts_held
 from agents.compiled.kept_worlds import World
 from agents.compiled.learning_algorithm import compiled_schedule
@@ -67,10 +69,16 @@ class CompiledEngine:
         )
         self.made_from: tuple[Any, ...] = ()
         self.learner: Any = None
+        self.evaluations = CompiledEvaluations(agent, callback, self._playground)
         self._read()
 
     def _make_states(self) -> EnvStates:
         return EnvStates(self.agent.env, self.world)
+
+    def _playground(self, vec_env: VecEnv) -> Playground:
+        """The compiled counterpart of environments to evaluate on."""
+        world: Any = compile_envs(vec_env)
+        return world, EnvStates(cast(DummyVecEnv, vec_env), world), None
 
     def _learner(self) -> Any:
         """The agent as compiled functions see it, also after a callback has changed it."""
@@ -160,7 +168,8 @@ class CompiledEngine:
             self._record_earlier()
         pass_over(self.callback, n_steps - 1, earlier)
         self.callback.update_locals(self._last_step(episodes, earlier, times))
-        keep_going = self.callback.on_step()
+        with self.evaluations.taking_over():
+            keep_going = self.callback.on_step()
         if keep_going or self.counts_where_stopped:
             self._update_statistics(episodes, earlier, len(episodes.envs), times)
         return keep_going
