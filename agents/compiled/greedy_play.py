@@ -26,7 +26,7 @@ from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.finite_model import FiniteModel
 from agents.compiled.generators import handles_of
 from agents.compiled.loop import EpisodeLog, act, learn_from_last_step, run_block
-from agents.compiled.training_records import EPISODE, PROGRESS, UNDECIDED
+from agents.compiled.training_records import EPISODE, PROGRESS, RECORD, UNDECIDED
 from mdp.array_types import Bools, Ints
 from mdp.machine_code import inlined
 
@@ -107,7 +107,9 @@ def play_episodes(
     generators = [env.unwrapped.np_random for env in states.vec_env.envs]
     handles, progress = handles_of(generators), np.zeros(1, dtype=PROGRESS)
     log = EpisodeLog(
-        np.zeros(STEPS_AT_ONCE * n_envs, dtype=EPISODE), np.empty((STEPS_AT_ONCE, n_envs))
+        np.zeros(STEPS_AT_ONCE * n_envs, dtype=EPISODE),
+        np.empty((STEPS_AT_ONCE, n_envs)),
+        np.zeros(0, dtype=RECORD),
     )
     ended: Any = np.zeros(0, dtype=EPISODE)
     while n_missing := _n_missing(ended["env"], wanted):
