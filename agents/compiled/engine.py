@@ -18,8 +18,8 @@ from agents.common.callback_horizons import (
     wants_position,
 )
 from agents.common.online import is_read
-from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
 from agents.compiled.compile_envs import compile_envs
+from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
 from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.generators import handles_of
 from agents.compiled.greedy_play import CompiledEvaluations, Playground
@@ -163,7 +163,7 @@ class CompiledEngine:
         return keep_going
 
     def _keep_records(self) -> None:
-        """Let the loop note what the log is to say, where that can wait for the end of the block."""
+        """Let the loop note what the log is to say, where that can wait until the block ends."""
         progress, interval = self.progress[0], self.log_interval
         progress["record_interval"] = progress["n_records"] = 0
         if interval is not None and keeps_records(self.agent, interval):

@@ -220,7 +220,8 @@ class CompiledEvaluations:
         ours = {id(each.unwrapped) for each in self.agent.env.envs}
         if any(id(each.unwrapped) in ours for each in states.vec_env.envs):
             return None
-        return (world, states, seen) if draws_alike(states.vec_env) and _counts(world, states) else None
+        is_alike = draws_alike(states.vec_env) and _counts(world, states)
+        return (world, states, seen) if is_alike else None
 
     def _player(self, deterministic: bool, playground: Playground | None) -> Any:
         """What acts as the agent's `predict`; None where that is not compiled."""
@@ -253,12 +254,11 @@ _HOOKS = {"_on_step", "_log_success_callback"}
 
 
 def _predicts_as_ours(agent: Any) -> bool:
-    """Whether `predict` is that of the agents here or of the library, and not a user's."""
-    things = (agent, agent.policy)
-    owners = [next(cls for cls in type(each).__mro__ if "predict" in vars(cls)) for each in things]
-    own = any("predict" in vars(each) for each in things)
-    known = ("agents", "stable_baselines3")
-    return not own and all(owner.__module__.partition(".")[0] in known for owner in owners)
+    """Whether nobody has put a `predict` of their own into the agent or its policy."""
+    asked = ((agent, "predict"), (agent.policy, "predict"), (agent.policy, "_predict"))
+    modules = [getattr(type(thing), name).__module__ for thing, name in asked]
+    known = all(module.partition(".")[0] in ("agents", "stable_baselines3") for module in modules)
+    return known and not any(name in vars(thing) for thing, name in asked)
 
 
 def _counts(world: Any, states: EnvStates) -> bool:

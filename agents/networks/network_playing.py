@@ -29,7 +29,7 @@ from agents.networks.references import Reference, address_of, call
 from agents.networks.shared_tensors import FlatTensors
 from mdp.machine_code import inlined, kernel
 
-# By so much, relative to the largest output, the best has to be ahead: a hundred times what rounding
+# By so much, relative to the largest output, the best has to be ahead: many times what rounding
 # makes of layers of 256 units. And by so much at least, since PyTorch compares probabilities.
 CLEARLY, AT_LEAST = 1e-4, 1e-6
 
@@ -145,9 +145,7 @@ class NetworkPlayer(NamedTuple):
             raise errors.pop()
 
 
-def network_player(
-    network: Network, seen: Any, predict: Callable[[Inputs], int]
-) -> NetworkPlayer:
+def network_player(network: Network, seen: Any, predict: Callable[[Inputs], int]) -> NetworkPlayer:
     """A network as it is now, whose parameters are copied.
 
     Args:
