@@ -33,6 +33,16 @@ from mdp.machine_code import inlined
 # Some hundredths of a second with networks: what a signal waits for.
 STEPS_AT_ONCE = 4096
 
+# What the library says, for whom it evaluates without Monitor.
+UNMONITORED = (
+    "Evaluation environment is not wrapped with a ``Monitor`` wrapper. "
+    "This may result in reporting modified episode lengths and rewards, if other wrappers happen "
+    "to modify these. Consider wrapping environment first with ``Monitor`` wrapper."
+)
+
+# Whoever has set one of these on a callback gets what is set.
+_HOOKS = {"_on_step", "_log_success_callback"}
+
 # A compiled environment, the state of what it stands for, and how its observations are read.
 Playground = tuple[Any, EnvStates, Any]
 
@@ -232,13 +242,6 @@ class CompiledEvaluations:
         return make(playground[2])
 
 
-UNMONITORED = (
-    "Evaluation environment is not wrapped with a ``Monitor`` wrapper. "
-    "This may result in reporting modified episode lengths and rewards, if other wrappers happen "
-    "to modify these. Consider wrapping environment first with ``Monitor`` wrapper."
-)
-
-
 def _evaluating(callback: BaseCallback) -> Iterator[EvalCallback]:
     """The `EvalCallback`s among the callbacks and those that they trigger, but for changed ones."""
     if library_callbacks.evaluate_policy is not evaluate_policy:  # type: ignore[attr-defined]
@@ -248,9 +251,6 @@ def _evaluating(callback: BaseCallback) -> Iterator[EvalCallback]:
             yield member
         elif isinstance(member, EventCallback) and member.callback is not None:
             yield from _evaluating(member.callback)
-
-
-_HOOKS = {"_on_step", "_log_success_callback"}
 
 
 def _predicts_as_ours(agent: Any) -> bool:
