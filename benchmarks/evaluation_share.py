@@ -127,7 +127,11 @@ TRAININGS = [
 ]
 PPO = {"n_steps": 128, "batch_size": 512, "n_epochs": 10, "learning_rate": 1e-3, "ent_coef": 0.01}
 TABLE = {"learning_rate": 0.1, "exploration_initial_eps": 0.1, "exploration_decay": "constant"}
-POLE_IN_BINS = {"bins": 50, "low": [-0.41887903, -0.87266463], "high": [0.41887903, 0.87266463]}
+POLE_IN_BINS: dict[str, Any] = {
+    "bins": 50,
+    "low": [-0.41887903, -0.87266463],
+    "high": [0.41887903, 0.87266463],
+}
 LOGS = {"TensorBoard": "tensorboard", "CSV logger": "csv"}
 EACH_STEP = "own callback, each step"
 
@@ -175,9 +179,9 @@ def seconds_a_step(name: str, algo: str, env_id: str, n_envs: int, n_steps: int)
         n_steps //= 50
     with tempfile.TemporaryDirectory() as folder:
         settings: dict[str, Any] = {"policy": "MlpPolicy", **PPO} if algo == "ppo" else TABLE
-        model: Any = load_algorithm(algo)(
-            env=environments(algo, env_id, n_envs, folder), seed=0, engine="auto", **settings
-        )
+        algorithm: Any = load_algorithm(algo)
+        env = environments(algo, env_id, n_envs, folder)
+        model = algorithm(env=env, seed=0, engine="auto", **settings)
         if name in LOGS:
             model.set_logger(configure(folder, [LOGS[name]]))
         interval = (1 if algo == "ppo" else 100) if name in LOGS else None

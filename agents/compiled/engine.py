@@ -89,7 +89,7 @@ class CompiledEngine:
         if not takes_records or self.log_interval is None or self.log_interval < 1:
             return 0
         n_episodes = self.block_steps * self.agent.n_envs
-        return min(self.block_steps, n_episodes // self.log_interval + 1)
+        return int(min(self.block_steps, n_episodes // self.log_interval + 1))
 
     def _playground(self, vec_env: VecEnv) -> Playground:
         """The compiled counterpart of environments to evaluate on."""
@@ -221,7 +221,8 @@ class CompiledEngine:
         steps = agent.num_timesteps - n_steps * agent.n_envs + n_done
         now = time.time_ns()
         times = began + (now - began) * (records["step"] + 1) // n_steps
-        n_before, agent._episode_num = agent._episode_num, int(records["episodes"][-1])
+        n_before = int(agent._episode_num)
+        agent._episode_num = int(records["episodes"][-1])
         columns = {
             "time/episodes": records["episodes"].tolist(),
             "train/n_updates": (agent._n_updates + n_done).tolist(),
@@ -230,7 +231,7 @@ class CompiledEngine:
             **agent.log_columns(records),
         }
         write_records(agent, columns, times)
-        return int(agent._episode_num) - n_before
+        return int(records["episodes"][-1]) - n_before
 
     def _record_earlier(self) -> None:
         """Hand the logger what callbacks may read there of a block's steps but the last."""

@@ -170,7 +170,8 @@ def _append(
 ) -> bool:
     """Append the numbers to TensorBoard's file; False where it takes more than that."""
     keys = [key for key in sorted(table) if "tensorboard" not in (excluded[key] or ())]
-    events = getattr(output.writer._get_file_writer(), "event_writer", None)
+    writer: Any = output.writer
+    events: Any = getattr(writer._get_file_writer(), "event_writer", None)
     file = getattr(events, "_general_file_writer", None)
     are_numbers = all(isinstance(table[key][0], int | float | np.number) for key in keys)
     if file is None or not are_numbers or max(map(len, keys), default=0) > _LONGEST_TAG:
