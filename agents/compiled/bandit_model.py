@@ -162,6 +162,10 @@ class PullRecord(NamedTuple):
         self.rewards[pull] = env.reward
         self.regrets[pull] = env.regret
 
+    @inlined
+    def note_progress(self, progress: Any, step: int) -> None:
+        """Pulls are all that is written down."""
+
 
 def check_bandit(env: gym.Env[Any, Any]) -> None:
     """Make sure that there is compiled code for the environment and all its wrappers.

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+import time
+from typing import Any, cast
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.common.callback_horizons import (
     NEVER,
@@ -17,14 +18,22 @@ from agents.common.callback_horizons import (
     wants_position,
 )
 from agents.common.online import is_read
+from agents.compiled.compile_envs import compile_envs
 from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
 from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.generators import handles_of
+from agents.compiled.greedy_play import CompiledEvaluations, Playground
 from agents.compiled.interrupts import interrupts_held
 from agents.compiled.kept_worlds import World
 from agents.compiled.learning_algorithm import compiled_schedule
+from agents.compiled.log_records import (
+    Statistics,
+    keeps_records,
+    time_columns,
+    write_records,
+)
 from agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
-from agents.compiled.training_records import EPISODE, PROGRESS
+from agents.compiled.training_records import EPISODE, PROGRESS, RECORD
 
 # Some hundredths of a second: what a signal waits for.
 MAX_BLOCK_STEPS = 262_144
@@ -64,13 +73,28 @@ class CompiledEngine:
         self.log = EpisodeLog(
             np.zeros(self.block_steps * agent.n_envs, dtype=EPISODE),
             np.empty((self.block_steps, agent.n_envs)),
+            np.zeros(self._most_records(), dtype=RECORD),
         )
         self.made_from: tuple[Any, ...] = ()
         self.learner: Any = None
+        self.evaluations = CompiledEvaluations(agent, callback, self._playground)
         self._read()
 
     def _make_states(self) -> EnvStates:
         return EnvStates(self.agent.env, self.world)
+
+    def _most_records(self) -> int:
+        """How many records of the log can be due in a block."""
+        takes_records = getattr(self.agent, "logs_by_records", False)
+        if not takes_records or self.log_interval is None or self.log_interval < 1:
+            return 0
+        n_episodes = self.block_steps * self.agent.n_envs
+        return int(min(self.block_steps, n_episodes // self.log_interval + 1))
+
+    def _playground(self, vec_env: VecEnv) -> Playground:
+        """The compiled counterpart of environments to evaluate on."""
+        world: Any = compile_envs(vec_env)
+        return world, EnvStates(cast(DummyVecEnv, vec_env), world), None
 
     def _learner(self) -> Any:
         """The agent as compiled functions see it, also after a callback has changed it."""
@@ -115,7 +139,9 @@ class CompiledEngine:
         else:
             self.callback.on_rollout_start()
         self.progress[0]["episodes"] = agent._episode_num
+        self._keep_records()
         ahead = horizon(self.callback)
+        began = time.time_ns()
         steps_left = -(-(total_timesteps - agent.num_timesteps) // agent.n_envs)
         n_steps = run_block(
             self.world,
@@ -129,22 +155,39 @@ class CompiledEngine:
             COMPENSATED_SUM,
         )
         episodes = Episodes.of(self.log.episodes[: self.progress[0]["logged_episodes"]])
-        keep_going = self._tell(episodes, n_steps)
+        keep_going = self._tell(episodes, n_steps, began)
         learn_from_last_step(self._learner(), self.envs, self.progress[0])
         last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._take_over_counts(1, len(episodes.envs) - last_step)
         self.callback.on_rollout_end()
         return keep_going
 
+    def _keep_records(self) -> None:
+        """Let the loop note what the log is to say, where that can wait until the block ends."""
+        progress, interval = self.progress[0], self.log_interval
+        progress["record_interval"] = progress["n_records"] = 0
+        if interval is not None and keeps_records(self.agent, interval):
+            progress["record_interval"] = interval
+            progress["next_record"] = (self.agent._episode_num // interval + 1) * interval
+
     def _episodes_to_log(self) -> int:
-        """Episodes until something is written that somebody reads."""
-        if self.log_interval is None or not is_read(self.agent.logger):
+        """Episodes until something is written that somebody reads, and that cannot wait."""
+        waits = self.progress[0]["record_interval"] > 0
+        if self.log_interval is None or waits or not is_read(self.agent.logger):
             return NEVER
         return self.log_interval - int(self.agent._episode_num) % self.log_interval
 
-    def _tell(self, episodes: Episodes, n_steps: int) -> bool:
-        """Monitor, statistics and callbacks; False once a callback asks to stop."""
+    def _tell(self, episodes: Episodes, n_steps: int, began: int = 0) -> bool:
+        """Monitor, statistics and callbacks; False once a callback asks to stop.
+
+        Args:
+            episodes: those of the block.
+            n_steps: of the block.
+            began: when it did, in nanoseconds since the epoch.
+        """
         agent = self.agent
+        records = self.log.records[: self.progress[0]["n_records"]]
+        before = Statistics(agent) if len(records) else None
         self.states.keep_rewards(episodes, self.log.rewards[:n_steps])
         times = record_in_monitors(self.states.monitors, episodes)
         for monitor in self.states.monitors:
@@ -154,16 +197,41 @@ class CompiledEngine:
         earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._update_statistics(episodes, 0, earlier, times)
         agent.num_timesteps += n_steps * agent.n_envs
+        n_recorded = 0
+        if before is not None:
+            n_recorded = self._write_records(before, records, episodes, n_steps, began)
         # Callbacks come before the last step is learnt from: until then the counters end before it.
-        self._take_over_counts(n_steps - 1, earlier)
+        self._take_over_counts(n_steps - 1, earlier - n_recorded)
         if n_steps > 1:
             self._record_earlier()
         pass_over(self.callback, n_steps - 1, earlier)
         self.callback.update_locals(self._last_step(episodes, earlier, times))
-        keep_going = self.callback.on_step()
+        with self.evaluations.taking_over():
+            keep_going = self.callback.on_step()
         if keep_going or self.counts_where_stopped:
             self._update_statistics(episodes, earlier, len(episodes.envs), times)
         return keep_going
+
+    def _write_records(
+        self, before: Statistics, records: Any, episodes: Episodes, n_steps: int, began: int
+    ) -> int:
+        """Write the records of the log, and return how many episodes they have counted."""
+        agent = self.agent
+        n_done = (records["step"] + 1) * agent.n_envs
+        steps = agent.num_timesteps - n_steps * agent.n_envs + n_done
+        now = time.time_ns()
+        times = began + (now - began) * (records["step"] + 1) // n_steps
+        n_before = int(agent._episode_num)
+        agent._episode_num = int(records["episodes"][-1])
+        columns = {
+            "time/episodes": records["episodes"].tolist(),
+            "train/n_updates": (agent._n_updates + n_done).tolist(),
+            **time_columns(agent, steps, times),
+            **before.columns(episodes, records["logged_episodes"]),
+            **agent.log_columns(records),
+        }
+        write_records(agent, columns, times)
+        return int(records["episodes"][-1]) - n_before
 
     def _record_earlier(self) -> None:
         """Hand the logger what callbacks may read there of a block's steps but the last."""

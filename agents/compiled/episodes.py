@@ -43,6 +43,12 @@ class Episodes:
         """The episodes of records of type `EPISODE`, shape (n_episodes,)."""
         return cls(log["env"], log["step"], log["episode_return"], log["length"], log["success"])
 
+    def rounded_returns(self) -> Floats:
+        """Returns as Monitor tells them, shape (n_episodes,)."""
+        if (self.returns == np.rint(self.returns)).all():
+            return self.returns
+        return np.array([_rounded(total) for total in self.returns.tolist()])
+
     def infos(self, chosen: slice, times: list[float]) -> list[dict[str, Any]]:
         """What Monitor would have put into ``info["episode"]`` for some of the episodes."""
         return [

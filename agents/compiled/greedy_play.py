@@ -1,22 +1,50 @@
-"""Episodes that an agent plays on compiled environments, learning nothing."""
+"""Episodes that an agent plays on compiled environments, learning nothing.
+
+They are the episodes that the library's `evaluate_policy` plays, from the same generators, which
+are left in the same state. `EvalCallback`s of a compiled training are answered by them.
+"""
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from types import FunctionType
 from typing import Any, NamedTuple
 
 import numpy as np
+from stable_baselines3.common import callbacks as library_callbacks
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EventCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnv
 
+from agents.common.callback_horizons import members
+from agents.compiled.compile_envs import NotCompilable, draws_alike
 from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
-from agents.compiled.episodes import Episodes
+from agents.compiled.episodes import Episodes, record_in_monitors
+from agents.compiled.finite_model import FiniteModel
 from agents.compiled.generators import handles_of
-from agents.compiled.kept_worlds import World
-from agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
-from agents.compiled.training_records import EPISODE, PROGRESS
+from agents.compiled.loop import EpisodeLog, act, learn_from_last_step, run_block
+from agents.compiled.training_records import EPISODE, PROGRESS, RECORD, UNDECIDED
 from mdp.array_types import Bools, Ints
 from mdp.machine_code import inlined
 
 # Some hundredths of a second with networks: what a signal waits for.
 STEPS_AT_ONCE = 4096
+
+# What the library says, for whom it evaluates without Monitor.
+UNMONITORED = (
+    "Evaluation environment is not wrapped with a ``Monitor`` wrapper. "
+    "This may result in reporting modified episode lengths and rewards, if other wrappers happen "
+    "to modify these. Consider wrapping environment first with ``Monitor`` wrapper."
+)
+
+# Whoever has set one of these on a callback gets what is set.
+_HOOKS = {"_on_step", "_log_success_callback"}
+
+# A compiled environment, the state of what it stands for, and how its observations are read.
+Playground = tuple[Any, EnvStates, Any]
 
 
 class Plan(NamedTuple):
@@ -40,14 +68,37 @@ class Plan(NamedTuple):
             envs[i].obs = envs[i].new_obs
 
 
+class Explorer(NamedTuple):
+    """Acts as an agent does in training, at a moment of it.
+
+    Attributes:
+        agent: as compiled functions see it, drawing from another generator.
+        progress: how far the training is, of type `PROGRESS`, alone in an array.
+    """
+
+    agent: Any
+    progress: Any
+
+    @inlined
+    def act(self, env: Any, progress: Any) -> None:
+        """Choose anew; nothing was committed to."""
+        env.next_action = UNDECIDED
+        act(self.agent, env, self.progress[0])
+
+    @inlined
+    def learn_from_step(self, envs: Any, progress: Any) -> None:
+        """Nothing is learnt; the next observations are there."""
+        for i in range(len(envs)):
+            envs[i].obs = envs[i].new_obs
+
+
 def play_episodes(
-    world: World, player: Any, states: EnvStates, observations: Any, wanted: Ints
+    world: Any, player: Any, states: EnvStates, observations: Any, wanted: Ints
 ) -> Episodes:
     """Play on environments that have just been reset.
 
-    All of them step until each has ended as many episodes as are wanted of it, so that their
-    generators end where the library's `evaluate_policy` would leave them. The environments
-    themselves stay where they are.
+    All of them step until each has ended as many episodes as are wanted of it. The environments,
+    their generators and their Monitors end where the library's `evaluate_policy` would leave them.
 
     Args:
         world: their compiled counterpart.
@@ -66,16 +117,32 @@ def play_episodes(
     generators = [env.unwrapped.np_random for env in states.vec_env.envs]
     handles, progress = handles_of(generators), np.zeros(1, dtype=PROGRESS)
     log = EpisodeLog(
-        np.zeros(STEPS_AT_ONCE * n_envs, dtype=EPISODE), np.empty((STEPS_AT_ONCE, n_envs))
+        np.zeros(STEPS_AT_ONCE * n_envs, dtype=EPISODE),
+        np.empty((STEPS_AT_ONCE, n_envs)),
+        np.zeros(0, dtype=RECORD),
     )
     ended: Any = np.zeros(0, dtype=EPISODE)
     while n_missing := _n_missing(ended["env"], wanted):
         # Before so many more have ended, not all can be there.
         limits = STEPS_AT_ONCE, n_missing, COMPENSATED_SUM
-        run_block(world, player, states.records, handles, progress[0], log, *limits)
+        n_steps = run_block(world, player, states.records, handles, progress[0], log, *limits)
         learn_from_last_step(player, states.records, progress[0])
-        ended = np.concatenate([ended, log.episodes[: progress["logged_episodes"][0]]])
+        if hasattr(player, "check"):
+            player.check()
+        new = log.episodes[: progress["logged_episodes"][0]]
+        states.keep_rewards(Episodes.of(new), log.rewards[:n_steps])
+        ended = np.concatenate([ended, new])
+    _leave(states, Episodes.of(ended), int(progress["num_timesteps"][0]) // n_envs)
     return Episodes.of(ended[_are_first(ended["env"], wanted)])
+
+
+def _leave(states: EnvStates, ended: Episodes, n_steps: int) -> None:
+    """Let environments and Monitors be where all these episodes have led them."""
+    record_in_monitors(states.monitors, ended)
+    for monitor in states.monitors:
+        if monitor is not None:
+            monitor.total_steps += n_steps
+    states.write()
 
 
 def _n_missing(envs: Ints, wanted: Ints) -> int:
@@ -89,3 +156,121 @@ def _are_first(envs: Ints, wanted: Ints) -> Bools:
     for i, n_episodes in enumerate(wanted):
         chosen[np.flatnonzero(envs == i)[:n_episodes]] = True
     return chosen
+
+
+class CompiledEvaluations:
+    """Lets each `EvalCallback` of a training play its episodes in compiled code.
+
+    The callback's own code runs, and finds this where it looks for the library's `evaluate_policy`.
+    What is not covered is handed on to that: environments or agents that are not, or not all,
+    compiled bit for bit; networks that draw their actions, which PyTorch's generator does; what is
+    shown on the screen.
+
+    Args:
+        agent: what is trained.
+        callback: what is told of the steps.
+        playground: the compiled counterpart of environments to evaluate on.
+    """
+
+    def __init__(
+        self, agent: Any, callback: BaseCallback, playground: Callable[[VecEnv], Playground]
+    ) -> None:
+        self.agent = agent
+        self.playground = playground
+        self.callbacks = list(_evaluating(callback))
+        self.refused: list[VecEnv] = []
+        on_step: Any = EvalCallback._on_step
+        names = {**on_step.__globals__, "evaluate_policy": self.evaluate_policy}
+        self.on_step: Any = FunctionType(on_step.__code__, names, closure=on_step.__closure__)
+
+    @contextmanager
+    def taking_over(self) -> Iterator[None]:
+        """Within the ``with`` statement the callbacks evaluate so."""
+        for callback in self.callbacks:
+            vars(callback)["_on_step"] = partial(self.on_step, callback)
+        try:
+            yield
+        finally:
+            for callback in self.callbacks:
+                del vars(callback)["_on_step"]
+
+    def evaluate_policy(self, model: Any, env: VecEnv, **given: Any) -> Any:
+        """As the library's, with the arguments that `EvalCallback` has for it."""
+        playground = None if given["render"] else self._playground(model, env)
+        player = self._player(given["deterministic"], playground)
+        if playground is None or player is None:
+            return evaluate_policy(model, env, **given)
+        world, states, _ = playground
+        is_monitored = states.monitors[0] is not None
+        if given["warn"] and not is_monitored:
+            warnings.warn(UNMONITORED, stacklevel=1)
+        observations = env.reset()
+        wanted = (given["n_eval_episodes"] + np.arange(env.num_envs)) // env.num_envs
+        found = play_episodes(world, player, states, observations, wanted)
+        if "is_success" in (env.reset_infos[0] or {}):
+            for success in found.successes.tolist():
+                given["callback"]({"done": True, "info": {"is_success": success}}, {})
+        if not is_monitored:
+            return list(found.returns), list(found.lengths)
+        infos = found.infos(slice(None), [0.0] * env.num_envs)
+        return [info["r"] for info in infos], [info["l"] for info in infos]
+
+    def _playground(self, model: Any, env: VecEnv) -> Playground | None:
+        """The environments in compiled code, where they draw and count as they do in Python."""
+        of_agent = (self.agent.observation_space, self.agent.action_space)
+        if model is not self.agent or of_agent != (env.observation_space, env.action_space):
+            return None
+        if any(env is refused for refused in self.refused):
+            return None
+        try:
+            world, states, seen = self.playground(env)
+        except NotCompilable:
+            self.refused.append(env)
+            return None
+        ours = {id(each.unwrapped) for each in self.agent.env.envs}
+        if any(id(each.unwrapped) in ours for each in states.vec_env.envs):
+            return None
+        is_alike = draws_alike(states.vec_env) and _counts(world, states)
+        return (world, states, seen) if is_alike else None
+
+    def _player(self, deterministic: bool, playground: Playground | None) -> Any:
+        """What acts as the agent's `predict`; None where that is not compiled."""
+        name = "greedy_player" if deterministic else "exploring_player"
+        make = getattr(self.agent, name, None)
+        if playground is None or make is None or not _predicts_as_ours(self.agent):
+            return None
+        return make(playground[2])
+
+
+def _evaluating(callback: BaseCallback) -> Iterator[EvalCallback]:
+    """The `EvalCallback`s among the callbacks and those that they trigger, but for changed ones."""
+    if library_callbacks.evaluate_policy is not evaluate_policy:  # type: ignore[attr-defined]
+        return
+    for member in members(callback):
+        if type(member) is EvalCallback and not _HOOKS & vars(member).keys():
+            yield member
+        elif isinstance(member, EventCallback) and member.callback is not None:
+            yield from _evaluating(member.callback)
+
+
+def _predicts_as_ours(agent: Any) -> bool:
+    """Whether nobody has put a `predict` of their own into the agent or its policy."""
+    asked = ((agent, "predict"), (agent.policy, "predict"), (agent.policy, "_predict"))
+    modules = [getattr(type(thing), name).__module__ for thing, name in asked]
+    known = all(module.partition(".")[0] in ("agents", "stable_baselines3") for module in modules)
+    return known and not any(name in vars(thing) for thing, name in asked)
+
+
+def _counts(world: Any, states: EnvStates) -> bool:
+    """Whether the returns that the library sums up are known to the bit.
+
+    Without Monitor it adds what the agent is handed, in single precision: the same where all
+    rewards are whole numbers.
+    """
+    monitored = [monitor is not None for monitor in states.monitors]
+    if any(monitored):
+        return all(monitored)
+    if not isinstance(world, FiniteModel):
+        return True
+    rewards = world.outcomes["reward"]
+    return bool((rewards == np.rint(rewards)).all() and np.abs(rewards).max() < 2**24)

@@ -50,6 +50,8 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         parameters: types of the settings that compiled functions read, by the names of the agent's
             attributes.
         settings_type: the type of the record.
+        logs_by_records: whether `log_columns` has all that `_record_training` hands to the logger
+            besides the number of updates.
     """
 
     parameters: ClassVar[Mapping[str, Any]] = {
@@ -58,6 +60,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         "strategy": np.int64,
     }
     settings_type: ClassVar[np.dtype[np.void]]
+    logs_by_records: ClassVar[bool] = False
     # Arrays of the algorithm's own that compiled functions work on.
     _memory: tuple[Any, ...] = ()
     _read_settings: ClassVar[Any]
@@ -163,6 +166,18 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
             known = made_from, self._make_workspace(rng, n)
             self._workspaces[id(rng), n] = known
         return known[1]
+
+    def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
+        """What `_record_training` hands to the logger, at many moments of the training.
+
+        Args:
+            records: of type `RECORD`, shape (n,).
+        """
+        return {
+            "rollout/exploration_rate": records["exploration"].tolist(),
+            "train/mean_absolute_td_error": records["mean_td_error"].tolist(),
+            "train/learning_rate": records["learning_rate"].tolist(),
+        }
 
     def _note_progress(self, workspace: Any) -> None:
         """Tell a workspace how far the training is."""

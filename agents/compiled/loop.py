@@ -43,6 +43,11 @@ def note_step(log: Any, env: Any, i: int, step: int) -> None:
     """Write down what environment ``i`` has done."""
 
 
+@by_type
+def note_progress(log: Any, progress: Any, step: int) -> None:
+    """Write down how far the training is, where that is due."""
+
+
 class EpisodeLog(NamedTuple):
     """What Monitor and the logger are told of a block.
 
@@ -50,15 +55,32 @@ class EpisodeLog(NamedTuple):
         episodes: records of type `EPISODE`, filled with those that end, shape (capacity,).
         rewards: filled with what Monitor sees of the episode under way, from its first step in the
             block on, shape (steps, n_envs).
+        records: of type `RECORD`, filled where the log is due, shape (capacity,).
     """
 
     episodes: NDArray[Any]
     rewards: Floats
+    records: NDArray[Any]
 
     @inlined
     def note_step(self, env: Any, i: int, step: int) -> None:
         """Write down the reward, over those of the episode before."""
         self.rewards[min(step, env.elapsed - 1), i] = env.monitor_reward
+
+    @inlined
+    def note_progress(self, progress: Any, step: int) -> None:
+        """Write down what the log is to say, every so many episodes."""
+        interval = progress.record_interval
+        if interval > 0 and progress.episodes >= progress.next_record:
+            record = self.records[progress.n_records]
+            record.step = step
+            record.logged_episodes = progress.logged_episodes
+            record.episodes = progress.episodes
+            record.exploration = progress.exploration
+            record.learning_rate = progress.learning_rate
+            record.mean_td_error = progress.mean_td_error
+            progress.next_record = (progress.episodes // interval + 1) * interval
+            progress.n_records += 1
 
 
 @inlined
@@ -150,4 +172,5 @@ def run_block(
         if t == n_steps - 1 or progress.logged_episodes >= max_episodes:
             return t + 1
         learn_and_count(agent, envs, progress)
+        note_progress(log, progress, t)
     return n_steps

@@ -70,6 +70,7 @@ class TileAlgorithm(LearningAlgorithm):
     policy: TilePolicy
     parameters = {"gamma": np.float64}  # noqa: RUF012
     values_states: ClassVar[bool] = False
+    logs_by_records = True
 
     act = act_on_tiles
 

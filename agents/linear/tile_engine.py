@@ -8,7 +8,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.compiled.engine import CompiledEngine
-from agents.networks.network_worlds import NetworkEnvStates, network_world
+from agents.compiled.greedy_play import Playground
+from agents.networks.network_worlds import (
+    NetworkEnvStates,
+    network_playground,
+    network_world,
+)
 
 
 class SeenWorld(NamedTuple):
@@ -50,6 +55,9 @@ class TileEngine(CompiledEngine):
 
     def _make_states(self) -> NetworkEnvStates:
         return NetworkEnvStates(self.agent.env, self.world, self.seen)
+
+    def _playground(self, vec_env: VecEnv) -> Playground:
+        return network_playground(vec_env)
 
     def _compiled_agent(self) -> Any:
         return self.agent.compiled_agent(self.agent.rng, self.seen)

@@ -31,6 +31,7 @@ from agents.networks.network_playing import NetworkPlayer, network_player
 from agents.networks.network_training import NetworkTraining
 from agents.networks.network_worlds import network_world
 from agents.networks.observations import Numbers, OwnVectors
+from agents.networks.perceptron import Inputs
 from agents.networks.rollout_events import RolloutEvents
 from agents.networks.shared_tensors import in_rows
 
@@ -140,12 +141,20 @@ class CompiledNetworks(BaseAlgorithm):
         """The network whose largest output is the best action."""
 
     def greedy_player(self, seen: Any) -> NetworkPlayer:
-        """What plays as `predict` does on compiled environments, but for rounding.
+        """What plays as `predict` does on compiled environments.
 
         Args:
             seen: how observations are read, of `agents.networks.observations`.
         """
-        return network_player(self._acting_network(seen), seen)
+        space = self.observation_space
+
+        def predicted(inputs: Inputs) -> int:
+            shown = inputs.indices if isinstance(seen, Numbers) else inputs.vectors
+            observation = np.reshape(shown[0], space.shape or ()).astype(space.dtype)
+            actions, _ = self.predict(observation[None], deterministic=True)
+            return int(actions[0])
+
+        return network_player(self._acting_network(seen), seen, predicted)
 
     def _schedules(self) -> list[Schedule]:
         """What a training in the compiled loop works out by itself."""

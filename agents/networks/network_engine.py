@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.callback_horizons import (
     EpisodeBudget,
@@ -18,10 +19,11 @@ from agents.common.callback_horizons import (
 from agents.compiled.engine import CompiledEngine
 from agents.compiled.env_state import COMPENSATED_SUM
 from agents.compiled.episodes import Episodes
+from agents.compiled.greedy_play import Playground
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import learn_from_last_step, run_block
 from agents.networks.network_training import NetworkTraining
-from agents.networks.network_worlds import NetworkEnvStates
+from agents.networks.network_worlds import NetworkEnvStates, network_playground
 from agents.networks.rollout_events import RolloutEvents
 
 # Between two blocks signals are seen to, and displays move.
@@ -61,6 +63,9 @@ class NetworkEngine(CompiledEngine):
 
     def _make_states(self) -> NetworkEnvStates:
         return NetworkEnvStates(self.agent.env, self.world, self.training.seen)
+
+    def _playground(self, vec_env: VecEnv) -> Playground:
+        return network_playground(vec_env)
 
     def _learner(self) -> Any:
         """The agent as compiled functions see it, also after a callback has changed it."""

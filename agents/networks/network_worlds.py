@@ -138,3 +138,13 @@ class NetworkEnvStates(EnvStates):
         if np.array_equal(table[state], shown):
             return state
         return int(np.argmax((table == shown).all(axis=1)))
+
+
+def network_playground(vec_env: VecEnv) -> tuple[Any, NetworkEnvStates, Any]:
+    """Environments to evaluate networks or tiles on: compiled, their states, how they are seen.
+
+    Raises:
+        NotCompilable: where there is none; the message says why.
+    """
+    world, seen = network_world(vec_env)
+    return world, NetworkEnvStates(vec_env, world, seen), seen

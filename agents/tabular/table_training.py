@@ -13,7 +13,7 @@ from agents.common.observed_numbers import numbers_in
 from agents.common.online import Transitions
 from agents.compiled.engine_choice import choose_engine
 from agents.compiled.generators import handles_of
-from agents.compiled.greedy_play import Plan
+from agents.compiled.greedy_play import Explorer, Plan
 from agents.tabular.episode_keeping import EpisodeKeeper
 from agents.tabular.temporal_difference import (
     TabularAgent,
@@ -69,6 +69,10 @@ class TableTraining(EpisodeKeeper):
         """What plays as `predict` does on compiled environments, which show numbers."""
         numbers = np.arange(self.policy.q_tables.shape[1])
         return Plan(self.predict(numbers, deterministic=True)[0].astype(np.int64))
+
+    def exploring_player(self, seen: Any) -> Explorer:
+        """What plays as `predict` does that explores, and draws from the same generator."""
+        return Explorer(self.compiled_agent(self.predict_rng), self.progress())
 
     def _check_tables(self) -> None:
         super()._check_tables()

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Literal, Unpack
 
 import numpy as np
 import torch as th
+from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
@@ -65,6 +66,7 @@ class TabularAlgorithm(TableTraining):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"QTablePolicy": QTablePolicy}
     parameters = {"gamma": np.float64, "skip_terminal_update": np.bool_}  # noqa: RUF012
+    logs_by_records = True
 
     def __init__(
         self,
@@ -168,3 +170,11 @@ class TabularAlgorithm(TableTraining):
         if not self.averages_samples:
             rate = self.lr_schedule(self._current_progress_remaining)
             self.logger.record("train/learning_rate", rate)
+
+    def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
+        """As above; Gaussian noise falls with the episodes."""
+        columns = super().log_columns(records)
+        if self.exploration == "gaussian_noise":
+            rates = records["exploration"] / (records["episodes"] + 1)
+            columns["rollout/exploration_rate"] = rates.tolist()
+        return columns

@@ -1,8 +1,8 @@
 """Episodes of an evaluation on compiled code, for agents that were trained so.
 
 They are the episodes of `pipeline.evaluation.sampled.evaluate`: the same seeds, starts and order.
-Tables and tiles act by the same bits; networks by the compiled forward pass, whose sums are rounded
-in another order than the library's, in single precision.
+Tables and tiles act by the same bits; networks by the compiled forward pass, and by the library's
+`predict` where two actions are so close that rounding could decide.
 """
 
 from __future__ import annotations

@@ -1,0 +1,273 @@
+"""The library's `EvalCallback` beside a compiled training finds what it finds beside any other."""
+
+import warnings
+from functools import partial
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium.wrappers import TransformReward
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnNoModelImprovement,
+    StopTrainingOnRewardThreshold,
+)
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from agents import load_algorithm
+from agents.common.callback_horizons import Horizon, calls_until_multiple
+from agents.tabular.q_table_policy import QTablePolicy
+from envs.wrappers import DiscretizeObservation
+
+LAKE, WAREHOUSE, CART = "FrozenLake-v1", "envs:Warehouse-v0", "CartPole-v1"
+WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}
+IN_BINS = partial(DiscretizeObservation, bins=[1, 6, 12, 6], **WIDTHS)
+NETWORK = {"policy": "MlpPolicy", "policy_kwargs": {"net_arch": [16]}}
+STEPS = 1200
+
+
+class LibraryEvaluation(EvalCallback):
+    """Says when it acts, and is not answered in compiled code."""
+
+    def horizon(self):
+        return Horizon(calls_until_multiple(self.n_calls, self.eval_freq))
+
+    def pass_over(self, n_calls, n_episodes):
+        self.n_calls += n_calls
+
+
+class Noted(BaseCallback):
+    """What a callback that is triggered by an evaluation sees."""
+
+    def __init__(self):
+        super().__init__()
+        self.seen = []
+
+    def _on_step(self):
+        parent = self.parent
+        assert isinstance(parent.eval_env, DummyVecEnv)
+        assert parent.model is self.model
+        self.seen.append((self.n_calls, parent.last_mean_reward, parent.best_mean_reward))
+        return True
+
+
+@pytest.fixture
+def python_steps(monkeypatch):
+    """Counts what environments are stepped in Python."""
+    stepped = []
+    step_wait = DummyVecEnv.step_wait
+    monkeypatch.setattr(
+        DummyVecEnv, "step_wait", lambda self: stepped.append(self) or step_wait(self)
+    )
+    return stepped
+
+
+def found(algo, env_id, engine, folder, kind=EvalCallback, wrapper=None, n_envs=2, **settings):
+    """All that an evaluation leaves behind, beside a training that goes on after it."""
+    deterministic = settings.pop("deterministic", True)
+    eval_env = make_vec_env(
+        env_id, n_envs, seed=7, wrapper_class=wrapper, monitor_dir=str(folder / "eval")
+    )
+    train_env = make_vec_env(env_id, 2, seed=1, wrapper_class=wrapper)
+    model = load_algorithm(algo)(env=train_env, seed=0, engine=engine, **settings)
+    model.set_logger(configure(str(folder / "log"), ["csv"]))
+    best, after = Noted(), Noted()
+    callback = kind(
+        eval_env,
+        best,
+        after,
+        n_eval_episodes=5,
+        eval_freq=STEPS // 8,
+        log_path=str(folder),
+        best_model_save_path=str(folder),
+        deterministic=deterministic,
+    )
+    model.learn(STEPS, callback=callback, log_interval=None)
+    model.logger.close()
+    monitors = [_monitor(env) for env in eval_env.envs]
+    for monitor in monitors:
+        monitor.results_writer.file_handler.close()
+    with np.load(folder / "evaluations.npz") as file:
+        arrays = {name: file[name].tolist() for name in file.files}
+    unwrapped = [env.unwrapped for env in eval_env.envs]
+    logged = np.genfromtxt(folder / "log" / "progress.csv", delimiter=",", names=True)
+    texts = [(folder / "eval" / f"{i}.monitor.csv").read_text() for i in range(n_envs)]
+    return {
+        "attributes": [
+            callback.evaluations_results,
+            callback.evaluations_length,
+            callback.evaluations_successes,
+            callback.evaluations_timesteps,
+            callback._is_success_buffer,
+            (callback.best_mean_reward, callback.last_mean_reward),
+        ],
+        "file": arrays,
+        "best model": (folder / "best_model.zip").is_file(),
+        "told": (best.seen, after.seen),
+        "logged": (logged.dtype.names, logged.tolist()),
+        "rows": [[row.split(",")[:2] for row in text.splitlines()[1:]] for text in texts],
+        "monitors": [(monitor.total_steps, monitor.rewards) for monitor in monitors],
+        "states": [np.array(getattr(env, "s", getattr(env, "state", 0))) for env in unwrapped],
+        "generators": [env.np_random.bit_generator.state for env in unwrapped],
+        "predicting": getattr(model, "predict_rng", model.rng).bit_generator.state,
+        "learnt": {name: part.numpy() for name, part in model.policy.state_dict().items()},
+    }
+
+
+def _monitor(env):
+    while not hasattr(env, "results_writer"):
+        env = env.env
+    return env
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+@pytest.mark.parametrize(
+    ("algo", "env_id", "wrapper", "settings"),
+    [
+        ("qlearning", LAKE, None, {}),
+        ("qlearning", LAKE, None, {"deterministic": False}),
+        ("double_qlearning", WAREHOUSE, None, {"deterministic": False, "tie_breaking": "first"}),
+        ("sarsa", CART, IN_BINS, {}),
+        ("dyna_q", LAKE, None, {"deterministic": False, "exploration": "gaussian_noise"}),
+        ("semi_gradient_sarsa", "MountainCar-v0", None, {}),
+    ],
+)
+def test_tables_find_what_is_found_in_python(
+    algo, env_id, wrapper, settings, n_envs, tmp_path, python_steps, capsys
+):
+    said, results = [], []
+    for engine in ("interpreted", "compiled"):
+        python_steps.clear()
+        result = found(
+            algo, env_id, engine, tmp_path / engine, wrapper=wrapper, n_envs=n_envs, **settings
+        )
+        results.append(result)
+        said.append(capsys.readouterr().out)
+    np.testing.assert_equal(results[1], results[0])
+    assert said[1] == said[0]
+    assert "New best mean reward!" in said[0]
+    assert len(results[0]["attributes"][0]) == 4
+    assert not python_steps, "all was played in compiled code"
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id", "settings"),
+    [
+        ("ppo", CART, {"n_steps": 64}),
+        ("ppo", WAREHOUSE, {"n_steps": 64}),
+        ("dqn", LAKE, {}),
+        ("dqn", CART, {"learning_starts": 10}),
+    ],
+)
+def test_networks_find_what_the_library_finds(algo, env_id, settings, tmp_path, python_steps):
+    settings = {**NETWORK, **settings}
+    library = found(algo, env_id, "compiled", tmp_path / "a", LibraryEvaluation, **settings)
+    assert python_steps
+    python_steps.clear()
+    ours = found(algo, env_id, "compiled", tmp_path / "b", **settings)
+    np.testing.assert_equal(ours, library)
+    assert not python_steps
+
+
+def test_what_rounding_could_decide_is_asked_of_pytorch(tmp_path, python_steps):
+    """All outputs are equal but for the last bits of sums."""
+
+    def run(kind, folder):
+        model = load_algorithm("dqn")(env=make_vec_env(CART, 1, seed=0), seed=0, **NETWORK)
+        model.engine, model.learning_starts = "compiled", 10_000
+        with th.no_grad():
+            last = model.q_net.q_net[-1]
+            last.weight[1] = last.weight[0] + last.weight[0] * 1e-7
+            last.bias[:] = 0.3
+        callback = kind(
+            make_vec_env(CART, 1, seed=3), n_eval_episodes=20, eval_freq=50, log_path=str(folder)
+        )
+        model.learn(100, callback=callback)
+        return callback.evaluations_length
+
+    library = run(LibraryEvaluation, tmp_path / "a")
+    assert len(set(library[0])) > 1
+    python_steps.clear()
+    assert run(EvalCallback, tmp_path / "b") == library
+    assert not python_steps
+
+
+def test_environments_without_monitor_are_counted_as_the_library_counts(tmp_path, python_steps):
+    results, told = [], []
+    for engine in ("interpreted", "compiled"):
+        python_steps.clear()
+        model = load_algorithm("qlearning")(env=make_vec_env(LAKE, 1), seed=0, engine=engine)
+        env = gym.make(LAKE)
+        env.reset(seed=5)
+        callback = EvalCallback(env, eval_freq=100, log_path=str(tmp_path / engine))
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model.env.seed(0)
+            model.learn(400, callback=callback)
+        told.append([(str(w.message), w.category) for w in caught if "Monitor" in str(w.message)])
+        results.append((callback.evaluations_results, callback.evaluations_length))
+    assert results[1] == results[0]
+    assert told[1] == told[0]
+    assert len(told[0]) == 4
+    assert not python_steps
+
+
+class OwnPrediction(QTablePolicy):
+    def predict(self, observation, *args, **kwargs):
+        return np.zeros_like(observation), None
+
+
+@pytest.mark.parametrize(
+    ("algo", "env_id", "wrapper", "settings"),
+    [
+        ("ppo", CART, None, {**NETWORK, "n_steps": 64, "deterministic": False}),
+        ("qlearning", LAKE, partial(TransformReward, func=lambda r: 2 * r), {}),
+        ("qlearning", LAKE, None, {"policy": OwnPrediction}),
+    ],
+)
+def test_what_is_not_covered_is_the_librarys(algo, env_id, wrapper, settings, python_steps):
+    deterministic = settings.pop("deterministic", True)
+    train_env = make_vec_env(env_id, 1, seed=0)
+    model = load_algorithm(algo)(env=train_env, seed=0, engine="compiled", **settings)
+    eval_env = make_vec_env(env_id, 1, seed=1, wrapper_class=wrapper)
+    callback = EvalCallback(eval_env, eval_freq=100, deterministic=deterministic, verbose=0)
+    model.learn(250, callback=callback)
+    assert python_steps
+    assert set(map(id, python_steps)) == {id(eval_env)}
+
+
+def test_callbacks_within_and_beside_stop_the_training(python_steps):
+    """By a threshold, by no improvement, and where another callback triggers the evaluation."""
+
+    def n_steps(engine, make):
+        model = load_algorithm("qlearning")(
+            env=make_vec_env(LAKE, 1, seed=0), seed=0, engine=engine, initial_q=1.0
+        )
+        return model.learn(5000, callback=make()).num_timesteps
+
+    def evaluation(**callbacks):
+        return EvalCallback(make_vec_env(LAKE, 1, seed=2), verbose=0, **callbacks)
+
+    for make in (
+        lambda: evaluation(
+            eval_freq=50, callback_on_new_best=StopTrainingOnRewardThreshold(0.2, verbose=0)
+        ),
+        lambda: evaluation(
+            eval_freq=50, callback_after_eval=StopTrainingOnNoModelImprovement(3, 2, verbose=0)
+        ),
+        lambda: EveryNTimesteps(
+            70,
+            evaluation(
+                eval_freq=2, callback_after_eval=StopTrainingOnNoModelImprovement(2, verbose=0)
+            ),
+        ),
+    ):
+        stopped = n_steps("interpreted", make)
+        python_steps.clear()
+        assert n_steps("compiled", make) == stopped < 5000
+        assert not python_steps
