@@ -136,6 +136,22 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     console.print(command, highlight=False, markup=False, soft_wrap=True)
 
 
+def print_advice(console: Console, training: Training, outcome: Outcome) -> None:
+    """Say what an agent that failed does instead, and what to try first."""
+    if outcome.final is None:
+        return
+    from pipeline.evaluation.advice import advice
+
+    evaluator = training.evaluation.evaluator
+    found = advice(training.spec, training.model, evaluator, outcome.final, outcome.n_steps)
+    if found is None:
+        return
+    console.print(f"instead  {found.instead}", highlight=False, markup=False, soft_wrap=True)
+    if found.try_first is not None:
+        line = f"try      {found.try_first}; more: docs/not-learning.md"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
 def _describe_evaluations(outcome: Outcome) -> str:
     """What all evaluations have taken."""
     taken = f"in {outcome.evaluating.cpu_seconds:.1f} s of processor time"

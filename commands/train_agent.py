@@ -54,6 +54,7 @@ def _list(args: argparse.Namespace) -> int:
 
 def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     from commands.run_output import (
+        print_advice,
         print_header,
         print_line,
         print_outcome,
@@ -88,6 +89,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         ):
             outcome = carry_out(training)
             print_outcome(console, spec, outcome)
+            print_advice(console, training, outcome)
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 
