@@ -271,7 +271,7 @@ def _prepare(
         check_settings(study, planned)
         line = _engines(planned)
     if line:
-        console.print(f"engines: {line}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"engines: {line}", highlight=False, soft_wrap=True)
 
 
 def _engines(planned: Sequence[PlannedRun]) -> str:

@@ -16,7 +16,7 @@ from rich.text import Text
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from pipeline.action_figures import ActionFigures, action_figures
-from pipeline.playing import FrameTaker
+from pipeline.playing import FrameTaker, Repetition
 
 # In letters: a bar, a number such as -1.235e-05 or "probability", and what lies beside the map.
 BAR = 12
@@ -54,6 +54,8 @@ class LiveShow:
         self._names = names
         self._pause = 1.0 / fps
         self._step = 0  # of the episode
+        self._repetition = Repetition()
+        self._is_left_out = False
         self._live = Live(console=console, auto_refresh=False, vertical_overflow="crop")
 
     @contextmanager
@@ -66,9 +68,16 @@ class LiveShow:
 
     def before_step(self, obs: Any, actions: Any) -> None:
         """Draw where the agent is, and what it is about to do."""
+        frames = self.taker.take(done=False)
+        if frames and self._repetition.goes_on(frames[-1]):
+            if not self._is_left_out:
+                self._say(f"step {self._step}: it repeats itself, and is not shown any more")
+            self._is_left_out = True
+            return
+        self._is_left_out = False
         figures = action_figures(self._model, obs)
         chosen = int(np.asarray(actions).reshape(-1)[0]) if figures is not None else None
-        self._draw(self.taker.take(done=False), figures, chosen)
+        self._draw(frames, figures, chosen)
         time.sleep(self._pause)
 
     def after_step(self, done: bool) -> None:
@@ -78,12 +87,15 @@ class LiveShow:
             self._draw(self.taker.take(done=True), None, None)
             time.sleep(self._pause)
             self._step = 0
+            self._repetition.forget()
 
     def after_episode(self, total_return: float, length: int) -> None:
         """Say above the picture how an episode went."""
         self.returns.append(total_return)
         self.lengths.append(length)
-        line = f"episode {len(self.returns)}: return {total_return:.2f}, {length} steps"
+        self._say(f"episode {len(self.returns)}: return {total_return:.2f}, {length} steps")
+
+    def _say(self, line: str) -> None:
         self._live.console.print(line, highlight=False, soft_wrap=True)
 
     def _draw(self, frames: list[Any], figures: ActionFigures | None, chosen: int | None) -> None:

@@ -26,7 +26,14 @@ from pipeline.filming import write_film
 from pipeline.models.model_choice import ChosenModel
 from pipeline.models.model_loading import load_to_play
 from pipeline.models.normalization import with_normalised_rewards
-from pipeline.playing import KEPT_MODES, FrameTaker, RenderMode, play_episodes, playing_env
+from pipeline.playing import (
+    KEPT_MODES,
+    FrameTaker,
+    RenderMode,
+    Repetition,
+    play_episodes,
+    playing_env,
+)
 from pipeline.signs_of_life import Activity, can_move, doing
 from pipeline.train_spec import TrainSpec
 
@@ -92,6 +99,8 @@ class _Show:
     steps: int = 0
     returns: list[float] = field(default_factory=list)
     lengths: list[int] = field(default_factory=list)
+    repetition: Repetition = field(default_factory=Repetition)
+    n_left_out: int = 0  # pictures
 
     def shown(self) -> AbstractContextManager[None]:
         # Pictures of letters show by themselves that something goes on.
@@ -110,7 +119,23 @@ class _Show:
             self.frames += drawn
             return
         for text in drawn:
-            self.activity.console.file.write(f"{text}\n")
+            self._write(text)
+        if done:
+            self._tell_left_out()
+            self.repetition.forget()
+
+    def _write(self, text: str) -> None:
+        if self.repetition.goes_on(text):
+            self.n_left_out += 1
+            return
+        self._tell_left_out()
+        self.activity.console.file.write(f"{text}\n")
+
+    def _tell_left_out(self) -> None:
+        if self.n_left_out:
+            steps = f"{self.n_left_out:,} step{'s' if self.n_left_out > 1 else ''}"
+            self.activity.say(f"... {steps} left out, which repeat pictures from above")
+        self.n_left_out = 0
 
     def after_episode(self, total_return: float, length: int) -> None:
         self.returns.append(total_return)

@@ -99,7 +99,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
         print_engine,
         print_header,
         print_line,
-        print_outcome,
+        print_result,
         writing_watched,
     )
     from commands.terminal import TextConsole
@@ -122,7 +122,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
         from pipeline.training import carry_out
 
         with writing_watched(console, training):
-            outcome = carry_out(training, partial(print_outcome, console, spec))
+            outcome = carry_out(training, partial(print_result, console, training))
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 

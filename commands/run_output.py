@@ -116,6 +116,13 @@ def print_refusal(console: Console, refusal: str | None) -> None:
         console.print(f"{refusal}; figures are sampled", highlight=False, soft_wrap=True)
 
 
+def print_result(console: Console, training: Training, outcome: Outcome) -> None:
+    """Say what came out, and what to try first if the agent has failed."""
+    print_outcome(console, training.spec, outcome)
+    if outcome.final is not None and not console.quiet:
+        _print_advice(console, training, outcome.final, outcome.n_steps)
+
+
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
     speed = outcome.n_steps / max(outcome.taken.seconds, 1e-9)
@@ -144,6 +151,20 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     width = max(len(label) for label, _ in rows) + 2
     command = f"{'watch':<{width}}{watch_command(spec, outcome.run)}"
     console.print(command, highlight=False, soft_wrap=True)
+
+
+def _print_advice(console: Console, training: Training, final: Evaluation, n_steps: int) -> None:
+    """Say what an agent that failed does instead, and what to try first."""
+    from pipeline.evaluation.advice import advice
+
+    evaluator = training.evaluation.evaluator
+    found = advice(training.spec, training.model, evaluator, final, n_steps)
+    if found is None:
+        return
+    console.print(f"instead  {found.instead}", highlight=False, soft_wrap=True)
+    if found.try_first is not None:
+        line = f"try      {found.try_first}; more: docs/not-learning.md"
+        console.print(line, highlight=False, soft_wrap=True)
 
 
 def _describe_evaluations(outcome: Outcome) -> str:

@@ -57,7 +57,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         print_engine,
         print_header,
         print_line,
-        print_outcome,
+        print_result,
         print_refusal,
         telling_what_is_kept,
         writing_watched,
@@ -88,7 +88,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
             telling_what_is_kept(training.run),
             writing_watched(console, training),
         ):
-            outcome = carry_out(training, partial(print_outcome, console, spec))
+            outcome = carry_out(training, partial(print_result, console, training))
     return exit_code(stop.number) if outcome.state == INTERRUPTED else 0
 
 

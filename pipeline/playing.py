@@ -23,6 +23,9 @@ RenderMode = Literal["human", "ansi", "rgb_array"]
 # What an environment draws in these modes is handed over rather than shown at once.
 KEPT_MODES: tuple[RenderMode, ...] = ("ansi", "rgb_array")
 
+# So many frames one after the other that were shown before: who watches has seen it by then.
+FRAMES_OF_A_REPETITION = 20
+
 
 def playing_env(
     chosen: ChosenModel,
@@ -126,6 +129,25 @@ def _shares(n_episodes: int | None, n_envs: int) -> Any:
     if n_episodes is None:
         return np.full(n_envs, np.inf)
     return (n_episodes + np.arange(n_envs)) // n_envs
+
+
+class Repetition:
+    """Notices where an episode shows nothing any more that it has not shown before."""
+
+    def __init__(self) -> None:
+        self._seen: set[Any] = set()
+        self._n_known = 0  # one after the other
+
+    def goes_on(self, frame: Any) -> bool:
+        """Whether this frame, and as many before it as make a repetition, were shown before."""
+        self._n_known = self._n_known + 1 if frame in self._seen else 0
+        self._seen.add(frame)
+        return self._n_known > FRAMES_OF_A_REPETITION
+
+    def forget(self) -> None:
+        """Begin anew, with another episode."""
+        self._seen.clear()
+        self._n_known = 0
 
 
 class FrameTaker:

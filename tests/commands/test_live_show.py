@@ -164,3 +164,29 @@ def test_a_pace_is_for_letters_alone():
     for wrong in ("0", "61", "x"):
         with pytest.raises(SystemExit):
             build_parser().parse_args(["--fps", wrong])
+
+
+@pytest.fixture
+def wall(monkeypatch, tmp_path):
+    """An agent that has learnt nothing, and walks against the wall until the time limit, twice."""
+    monkeypatch.chdir(tmp_path)
+    agent = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--env-kwargs", "is_slippery:False"]
+    words = ["-n", "1", "--seed", "0", "--verbose", "0"]
+    monkeypatch.setattr("sys.argv", ["train.py", *agent, *words])
+    assert train.main() == 0
+    return choose_model(ModelRequest(algo="qlearning", env_id="FrozenLake-v1"))
+
+
+def test_what_repeats_itself_is_shown_for_a_while(wall, pauses, monkeypatch):
+    """The start, one step against the wall, and 20 that look like it, of 100; then it is told."""
+    console = TextConsole(file=io.StringIO())
+    play(console, wall, PlayingRequest(render="ansi", n_episodes=2))
+    shown = without_style(console.file.getvalue())
+    assert shown.count("SFFF") == 2 * 22
+    assert shown.count("... 79 steps left out, which repeat pictures from above") == 2
+    assert shown.count("return 0.00, 100 steps") == 2
+    monkeypatch.setenv("TERM", "xterm")
+    shown = without_style(played(wall, n_episodes=2))
+    assert shown.count("step 22: it repeats itself, and is not shown any more") == 2
+    assert shown.count("return 0.00, 100 steps") == 2
+    assert len(pauses) == 2 * 23  # the last one after the end

@@ -1,0 +1,225 @@
+"""What an agent that has not learnt its task does instead, and what to try first.
+
+Two signals tell which of two remedies helps. Where the agent values its start about as low as
+standing still for ever, the discount hides the goal: it has to be nearer to 1. Where it has tried
+its actions too seldom, it needs more steps. Neither is advised before exact planning has shown that
+it can help.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from agents.planning import PlanningAgent
+from agents.reference import RandomAgent
+from envs.known_models import observations_of_states, transition_model
+from envs.layout import GridLayout
+from mdp import TransitionModel, policy_return, state_visitation, value_iteration
+from mdp.array_types import Floats
+from pipeline.action_figures import action_figures
+from pipeline.environments import make_single_env
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.evaluation.sampled import Evaluation
+from pipeline.train_spec import TrainSpec
+
+# A score below this is a failure. One of planning above the other is a success.
+FAILED, SOLVED = 0.05, 0.5
+NEAR_OPTIMUM = 0.01  # of the optimum
+# The value of the start, as a share of that of standing still.
+NEAR_STANDING_STILL = 0.8
+# Steps of training for each state and action; more where the discount is to be nearer to 1.
+FEW_STEPS, FEW_STEPS_FAR = 130, 400
+MANY_STEPS = 1000
+# Of the score that planning reaches.
+MATTERS = 0.05
+# Planning takes about a second where states times actions times outcomes are so many.
+MOST_OUTCOMES = 500_000
+# Where an episode is caught: where it spends nearly all of its last steps.
+LAST_STEPS = 100
+NEARLY_ALL = 0.99
+MOST_STATES_NAMED = 3
+
+
+@dataclass(frozen=True)
+class Advice:
+    """What to say of a run that failed.
+
+    Attributes:
+        instead: what the greedy policy does instead of solving the task.
+        try_first: the change that is likely to help; None where no signal says so.
+    """
+
+    instead: str
+    try_first: str | None
+
+
+def advice(
+    spec: TrainSpec, agent: BaseAlgorithm, evaluator: object, final: Evaluation, n_steps: int
+) -> Advice | None:
+    """Say what a failed agent does instead, and what to try first.
+
+    Args:
+        spec: how the agent was trained.
+        agent: the agent.
+        evaluator: what has judged it; where it is no `ExactEvaluator`, little is known.
+        final: the last evaluation.
+        n_steps: environment steps of its training.
+
+    Returns:
+        The advice; None where the score is at least 0.05 and the greedy policy comes to an end, or
+        where that is not known.
+    """
+    if not isinstance(evaluator, ExactEvaluator) or isinstance(agent, RandomAgent):
+        return None
+    policy = evaluator.policy(agent, deterministic=True)
+    if policy.ndim == 2 and np.issubdtype(policy.dtype, np.integer):
+        if len(policy) > 1:  # of a planner that knows the time limit
+            return None
+        policy = policy[0]
+    yardstick = evaluator.yardstick
+    # A return that is as good as the optimum can be that of a constant action too.
+    near = yardstick.gap(final.mean_return) <= NEAR_OPTIMUM * abs(yardstick.optimum)
+    failed = yardstick.score(final.mean_return) < FAILED and not near
+    running = _still_running(evaluator, policy, 1)
+    if not failed and (running.sum() < NEARLY_ALL or not _can_end(evaluator)):
+        return None
+    return Advice(_instead(evaluator, policy, running), _try_first(spec, agent, evaluator, n_steps))
+
+
+def _can_end(evaluator: ExactEvaluator) -> bool:
+    """Whether the best policy ends its episodes."""
+    _, optimal = evaluator.optimum
+    return _still_running(evaluator, optimal.argmax(axis=1), 1).sum() < NEARLY_ALL
+
+
+def _still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats:
+    """How often an episode acts in each state in its last steps before the limit, shape (S,)."""
+    model, horizon = evaluator.model, evaluator.horizon
+    visits = state_visitation(model, policy, horizon)
+    if n_last < horizon:
+        visits = visits - state_visitation(model, policy, horizon - n_last)
+    return np.maximum(visits, 0.0)
+
+
+def _instead(evaluator: ExactEvaluator, policy: Any, running: Floats) -> str:
+    share = float(running.sum())
+    if share < 0.5:
+        worth = policy_return(evaluator.model, policy, evaluator.horizon, success=evaluator.success)
+        end = f"{1 - share:.0%} of its episodes end before the time limit"
+        rate = worth.success_rate
+        return end if rate is None else f"{end}, {rate:.1%} of all with success"
+    late = _still_running(evaluator, policy, min(LAST_STEPS, max(evaluator.horizon // 2, 1)))
+    order = np.argsort(-late, kind="stable")
+    n_states = int(np.searchsorted(np.cumsum(late[order]), NEARLY_ALL * late.sum())) + 1
+    places = [_place(evaluator.layout, int(state)) for state in order[:MOST_STATES_NAMED]]
+    if n_states == 1:
+        where = f"it stays at {places[0]}"
+    elif n_states <= MOST_STATES_NAMED:
+        where = f"it goes round between {'; '.join(places[:n_states])}"
+    else:
+        n_reachable = int(evaluator.model.reachable.sum())
+        where = f"it never leaves {n_states} of {n_reachable} states, such as {places[0]}"
+    return f"{share:.0%} of its episodes run out of time: {where}"
+
+
+def _place(layout: GridLayout | None, state: int) -> str:
+    """The name of a state: as pages count, rows and columns from 1."""
+    if layout is None:
+        return f"state {state}"
+    row, column = divmod(int(layout.cells[state]), layout.n_columns)
+    return f"row {row + 1}, column {column + 1}"
+
+
+def _try_first(
+    spec: TrainSpec, agent: BaseAlgorithm, evaluator: ExactEvaluator, n_steps: int
+) -> str | None:
+    gamma = getattr(agent, "gamma", None)
+    trained_on = _trained_on(spec, evaluator)
+    if not isinstance(gamma, float) or trained_on is None:
+        return None
+    model, observations = trained_on
+    is_near = _share_of_standing_still(agent, model, observations, gamma) >= NEAR_STANDING_STILL
+    nearer = max(1 - 0.5 / evaluator.horizon, gamma)
+    score, reached = (_planned(evaluator, model, discount) for discount in (gamma, nearer))
+    raises_gamma = nearer > gamma and (is_near or score < reached - MATTERS)
+    n_tables = len(getattr(agent.policy, "q_tables", [0]))
+    n_pairs = int(model.reachable.sum()) * model.n_actions * n_tables
+    # What is further away takes longer to learn.
+    few = FEW_STEPS_FAR if raises_gamma else FEW_STEPS
+    needs_steps = n_steps < few * n_pairs and not isinstance(agent, PlanningAgent)
+    if not (raises_gamma or needs_steps) or reached < SOLVED:
+        return None
+    changes = []
+    if raises_gamma:
+        even = (
+            f", where even exact planning scores {score:.2f}" if score < reached - MATTERS else ""
+        )
+        changes.append(f"-params gamma:{nearer:.6g} (now {gamma:.6g}{even})")
+    if needs_steps:
+        enough = _round_up(max(MANY_STEPS * n_pairs, 4 * n_steps))
+        changes.append(f"-n {enough} (now {n_steps / n_pairs:.0f} steps for each state and action)")
+    return " and ".join(changes)
+
+
+def _round_up(number: int) -> int:
+    """The next number with at most two digits before its zeros."""
+    unit = 10 ** max(len(str(number)) - 2, 0)
+    return -(-number // unit) * unit
+
+
+def _trained_on(spec: TrainSpec, evaluator: ExactEvaluator) -> tuple[TransitionModel, Any] | None:
+    """The model of the training's own environment and what is observed in its states.
+
+    None where that is not known, too large to plan on, or has other states than the evaluation's.
+    """
+    env = make_single_env(spec, training=True)
+    try:
+        model, observations = transition_model(env), observations_of_states(env)
+    finally:
+        env.close()
+    if model is None or observations is None or model.prob.size > MOST_OUTCOMES:
+        return None
+    return (model, observations) if model.prob.shape == evaluator.model.prob.shape else None
+
+
+def _planned(evaluator: ExactEvaluator, model: TransitionModel, gamma: float) -> float:
+    """The score of the best policy for a discount."""
+    plan = value_iteration(model, gamma)
+    found = policy_return(evaluator.model, plan.policy, evaluator.horizon)
+    return evaluator.yardstick.score(found.expected_return)
+
+
+def _share_of_standing_still(
+    agent: BaseAlgorithm, model: TransitionModel, observations: Any, gamma: float
+) -> float:
+    """The agent's own value of its start, as a share of the value of standing still for ever.
+
+    0 where standing still costs nothing, where nobody can, or where the agent has no values.
+    """
+    stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated
+    stays &= (model.prob > 0) & model.reachable[:, None, None]
+    if not stays.any() or gamma >= 1:
+        return 0.0
+    standing = float(model.reward[stays].max()) / (1 - gamma)
+    starts = np.flatnonzero(model.initial)
+    values = [_own_value(agent, observations[state : state + 1]) for state in starts]
+    if standing >= 0 or None in values:
+        return 0.0
+    return float(model.initial[starts] @ np.array(values, np.float64)) / standing
+
+
+def _own_value(agent: BaseAlgorithm, observation: Any) -> float | None:
+    """What the agent itself believes an observation to be worth; None where it has no values."""
+    figures = action_figures(agent, observation)
+    if figures is not None and figures.word == "value":
+        return float(figures.numbers.max())
+    policy: Any = agent.policy
+    if not hasattr(policy, "predict_values") or hasattr(policy, "lstm_actor"):
+        return None
+    with th.no_grad():
+        return float(policy.predict_values(policy.obs_to_tensor(observation)[0])[0, 0])
