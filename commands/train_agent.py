@@ -57,8 +57,8 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         print_engine,
         print_header,
         print_line,
-        print_result,
         print_refusal,
+        print_result,
         telling_what_is_kept,
         writing_watched,
     )
