@@ -94,7 +94,7 @@ def advice(
 def _can_end(evaluator: ExactEvaluator) -> bool:
     """Whether the best policy ends its episodes."""
     _, optimal = evaluator.optimum
-    return _still_running(evaluator, optimal.argmax(axis=1), 1).sum() < NEARLY_ALL
+    return bool(_still_running(evaluator, optimal.argmax(axis=1), 1).sum() < NEARLY_ALL)
 
 
 def _still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats:
@@ -168,7 +168,7 @@ def _try_first(
 
 def _round_up(number: int) -> int:
     """The next number with at most two digits before its zeros."""
-    unit = 10 ** max(len(str(number)) - 2, 0)
+    unit: int = 10 ** max(len(str(number)) - 2, 0)
     return -(-number // unit) * unit
 
 
