@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from pipeline.errors import one_line
 from pipeline.file_digests import DamagedFileError
+from safe_files.archives import read_member
 from safe_files.limits import Budget
 
 MOST_ARRAYS = 1000
@@ -64,7 +65,7 @@ def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
             infos = archive.infolist()
             _check_members(infos, len(content))
             return {
-                info.filename.removesuffix(_SUFFIX): _array(_member(archive, info))
+                info.filename.removesuffix(_SUFFIX): _array(read_member(archive, info))
                 for info in infos
             }
     except _DAMAGE as error:
@@ -81,15 +82,6 @@ def _check_members(infos: list[zipfile.ZipInfo], n_bytes: int) -> None:
         raise ValueError("it is compressed in a way that is not read here")
     # The bytes, those without the header, and the array.
     Budget(n_bytes).charge(3 * sum(info.file_size for info in infos))
-
-
-def _member(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytes:
-    with archive.open(info) as member:
-        # No more than it declares is unpacked; its checksum is compared when so much is read.
-        content = member.read(info.file_size)
-    if len(content) != info.file_size:
-        raise ValueError("it is cut off")
-    return content
 
 
 def _array(content: bytes) -> NDArray[Any]:

@@ -86,8 +86,12 @@ def _object_array(data: Any, count: int, shape: tuple[int, ...], order: Any) -> 
 
 
 def _from_buffer(made: Made, build: Build) -> NDArray[Any]:
-    data, dtype, shape, order = arguments(made, build, bytes, np.dtype, (tuple, int), str)
-    return _array(data, dtype, shape, order)
+    kinds = (bytes, np.dtype, (tuple, int), str, tuple)
+    data, dtype, shape, order, *axes = arguments(made, build, *kinds[: max(len(made.args), 4)])
+    if not axes:
+        return _array(data, dtype, shape, order)
+    # Since NumPy 2.3, of an array whose axes lie in the memory in another order.
+    return _array(data, dtype, shape, "C").transpose(axes[0])
 
 
 def _reconstructed(made: Made, build: Build) -> NDArray[Any]:
@@ -427,5 +431,6 @@ def read_pickle(
     """
     budget = budget or Budget(len(pickled))
     usual = admitted()
-    here = Admitted({**usual.makers, **(makers or {})}, {**usual.classes, **(classes or {})})
+    own = makers or {}
+    here = Admitted({**usual.makers, **own}, {**usual.classes, **(classes or {})}, own.keys())
     return rebuild(read_tree(pickled, budget), here, budget)

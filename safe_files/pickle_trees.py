@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import pickle
 import pickletools
+import re
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -36,8 +37,9 @@ _INSTRUCTIONS = (
 )
 INSTRUCTIONS = frozenset(_INSTRUCTIONS.split())
 # The most bytes that an instruction makes beside those that stand in the file, and a key.
-_BYTES, _BYTES_OF_AN_OBJECT, _BYTES_PER_KEY = 128, 320, 160
-_MAKES_AN_OBJECT = frozenset({"EMPTY_SET", "FROZENSET", "REDUCE", "NEWOBJ", "BINPERSID"})
+_BYTES, _BYTES_OF_A_PLACE, _BYTES_OF_AN_OBJECT, _BYTES_PER_KEY = 72, 104, 320, 160
+_MAKES_A_PLACE = re.compile("MARK|MEMOIZE|PUT|UNICODE|BYTE")
+_MAKES_AN_OBJECT = re.compile("SET$|REDUCE|NEWOBJ|PERSID")
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,16 +217,22 @@ class TreeReader(pickle._Unpickler):
 def instructions(known: Iterable[str]) -> dict[int, Callable[[TreeReader], None]]:
     """What a reader does at each code: it pays, or refuses what is not known."""
     return {
-        ord(op.code): partial(_step, op, op.name if op.name in known else None)
+        ord(op.code): partial(_step, op, _cost(op.name) if op.name in known else None)
         for op in pickletools.opcodes
     }
 
 
-def _step(op: pickletools.OpcodeInfo, known: str | None, reader: TreeReader) -> None:
-    if known is None:
+def _cost(name: str) -> int:
+    if _MAKES_AN_OBJECT.search(name):
+        return _BYTES_OF_AN_OBJECT
+    return _BYTES_OF_A_PLACE if _MAKES_A_PLACE.search(name) else _BYTES
+
+
+def _step(op: pickletools.OpcodeInfo, n_bytes: int | None, reader: TreeReader) -> None:
+    if n_bytes is None:
         raise UnsafeFileError(f"a pickle with the instruction {op.name}")
-    reader.budget.charge(_BYTES_OF_AN_OBJECT if known in _MAKES_AN_OBJECT else _BYTES)
-    own = getattr(reader, f"run_{known.lower()}", None)
+    reader.budget.charge(n_bytes)
+    own = getattr(reader, f"run_{op.name.lower()}", None)
     pythons: Any = pickle._Unpickler.dispatch
     own() if own is not None else pythons[ord(op.code)](reader)
     reader.check_top()

@@ -4,6 +4,7 @@ import contextlib
 import pickle
 import pickletools
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -71,6 +72,15 @@ def test_shared_parts_stay_shared():
     part = [1]
     first, second = read_pickle(pickle.dumps([part, part]))
     assert first is second
+
+
+@pytest.mark.parametrize("protocol", [4, 5])
+@pytest.mark.parametrize("axes", [(0, 1, 2), (2, 1, 0), (0, 2, 1)])
+def test_arrays_come_out_as_they_went_in(axes, protocol):
+    """Pictures with their channels in front are views with the axes in another order."""
+    array = np.arange(24, dtype=np.uint8).reshape(2, 3, 4).transpose(axes)
+    found = read_pickle(pickle.dumps(array, protocol))
+    assert (found.dtype, found.tolist()) == (array.dtype, array.tolist())
 
 
 def test_what_refers_to_itself_is_refused():
