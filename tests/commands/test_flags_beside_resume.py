@@ -13,6 +13,7 @@ ALLOWED = {
     "--progress": None,
 }
 OTHERS = {
+    "--engine": "auto",
     "--eval-freq": "5",
     "--eval-episodes": "5",
     "--hyperparams": "gamma:0.9",
