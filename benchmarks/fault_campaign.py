@@ -59,7 +59,7 @@ def disturbed(case: Case, seed: int, most: int) -> int:
     draw = random.Random(f"{case.name} {seed}")  # noqa: S311  # to be repeated, not kept secret
     logs = case.folder_of(f"disturbed {seed}")
     disturb = _stop_at_a_call if case.is_short else _stop_after_seconds
-    signals = 0
+    signals, kills = 0, case.counts["SIGKILL"]
     for _ in range(MOST_STARTS):
         if signals < most:
             process, is_stopped = disturb(case, logs, draw)
@@ -73,7 +73,7 @@ def disturbed(case: Case, seed: int, most: int) -> int:
             break
     else:
         case.counts["never done"] += 1
-    _judge(case, logs)
+    _judge(case, logs, was_killed=case.counts["SIGKILL"] > kills)
     return signals
 
 
@@ -152,7 +152,7 @@ def _has_traceback(case: Case) -> int:
     return int(found)
 
 
-def _judge(case: Case, logs: Path) -> None:
+def _judge(case: Case, logs: Path, *, was_killed: bool) -> None:
     """Hold what the disturbed command has left against the undisturbed one."""
     case.counts["done"] += 1
     try:
@@ -162,7 +162,7 @@ def _judge(case: Case, logs: Path) -> None:
         print(f"{case.name}: {logs}: {error!r}", file=sys.stderr)
         return
     left, missing = found.keys() - case.whole.keys(), case.whole.keys() - found.keys()
-    if case.counts["SIGKILL"]:  # nothing looks for the draft of a pack that was killed
+    if was_killed:  # nothing looks for the draft of a pack that was killed
         left = {name for name in left if not re.match(r"\.pack.*\.[0-9a-f]{16}\.tmp", name)}
     differing = [n for n in found.keys() & case.whole.keys() if found[n] != case.whole[n]]
     case.counts["files left"] += len(left)
