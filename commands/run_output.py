@@ -89,8 +89,12 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     console.print(
         f"[bold]{spec.algo}[/] on [bold]{spec.env_id}[/], seed {spec.seed}, {budget:,} {unit}"
     )
-    settings = "  ".join(f"{key}={_brief(value)}" for key, value in spec.saved_hyperparams.items())
-    console.print(f"[dim]{settings}[/]", highlight=False)
+    origins = spec.origins or {}
+    settings = "  ".join(
+        f"{key}={_brief(value)}{f' ({origins[key]})' if key in origins else ''}"
+        for key, value in spec.saved_hyperparams.items()
+    )
+    console.print(f"[dim]{escape(settings)}[/]", highlight=False)
 
 
 def print_line(console: Console, line: str) -> None:
