@@ -17,6 +17,7 @@ import numpy as np
 from gymnasium import spaces
 
 from envs.known_models import time_limit, transition_model
+from pipeline.agent_checks import check_fit
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError, shown
 from pipeline.settings.hyperparams import component_specs, split
@@ -65,7 +66,7 @@ def _budget(env: Env, amount: str | None, where: str) -> Found:
     return Found(steps * max(pairs, FEWEST_PAIRS), f"auto: {steps:,} x {counted}")
 
 
-def _initial_value(env: Env, amount: str | None, where: str) -> Found:
+def _highest_value(env: Env, amount: str | None, where: str) -> Found:
     """No return is higher where only the end of an episode is rewarded, as on FrozenLake."""
     model = transition_model(env)
     if model is None:
@@ -79,7 +80,8 @@ def _initial_value(env: Env, amount: str | None, where: str) -> Found:
 _RULES: Mapping[str, Callable[[Env, str | None, str], Found]] = {
     "gamma": _discount,
     "n_timesteps": _budget,
-    "initial_q": _initial_value,
+    "initial_q": _highest_value,
+    "value_bound": _highest_value,
 }
 
 
@@ -144,11 +146,11 @@ def resolved_spec(
     """A spec with a number in place of each ``auto``.
 
     ``gamma: auto`` is 1 - 1/(2 x time limit) of the environment that the agent is judged on.
-    ``n_timesteps: auto_K`` is K steps for each pair of state and action, ``auto`` alone being
-    ``auto_1000``; 100 pairs are counted at least. ``initial_q: auto`` is the highest reward that
-    ends an episode. ``scale: auto`` of a `ScaleReward` in ``train_env_wrapper`` is 1 by the largest
-    reward of training, its sign aside. In other settings the word is what it was, such as
-    ``engine: auto``.
+    ``n_timesteps: auto_K`` is K steps for each pair of state and action, of which 100 are counted
+    at least; ``auto`` is ``auto_1000``. ``initial_q: auto`` and ``value_bound: auto`` are the
+    highest reward that ends an episode. ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1
+    by the largest reward of training, its sign aside. In other settings the word is what it was,
+    such as ``engine: auto``.
 
     Args:
         raw: an entry of hyperparameters.
@@ -163,6 +165,7 @@ def resolved_spec(
     spec = TrainSpec(hyperparams=split(rest, where), saved_hyperparams=rest, **fields)
     found = _scale(raw, spec, where)
     if len(rest) < len(raw):
+        check_fit(spec)
         env = make_single_env(spec)
         for key, value in raw.items():
             match = _word(key, value)
