@@ -26,8 +26,12 @@ from pipeline.train_spec import TrainSpec
 AUTO = "auto"
 # Steps of training for each pair of an observation and an action, where only ``auto`` is said, and
 # the fewest pairs that are counted: a small map takes its time to be explored too.
-STEPS_PER_PAIR = 1000
+STEPS_PER_PAIR = 2500
 FEWEST_PAIRS = 100
+# A step size of 1 / n averages over the last n visits, about; where it begins, and may end.
+VISITS_AVERAGED = 10
+FIRST_STEP_SIZE = 0.3
+LAST_STEP_SIZES = (0.003, 0.05)
 _WORD = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 Env = gym.Env[Any, Any]
@@ -46,40 +50,74 @@ class Found:
     how: str
 
 
-def _discount(env: Env, amount: str | None, where: str) -> Found:
-    """With 1 - 1/(2 x time limit) what lies a whole episode ahead still counts for 0.6."""
-    limit = time_limit(env)
+@dataclass(frozen=True)
+class _Asked:
+    """A setting that says ``auto``.
+
+    Attributes:
+        env: the environment that the agent is judged on.
+        amount: what follows the word, as in ``auto_1000``; empty for nothing.
+        n_timesteps: of the training, where that is known already.
+        where: begins every error message.
+    """
+
+    env: Env
+    amount: str
+    n_timesteps: int | None
+    where: str
+
+    def pairs(self) -> tuple[int, int]:
+        """The numbers of states and of actions."""
+        sizes = self.env.observation_space, self.env.action_space
+        if not all(isinstance(space, spaces.Discrete) for space in sizes):
+            raise UserError(f"{self.where}: auto needs Discrete observations and actions")
+        states, actions = (int(space.n) for space in sizes if isinstance(space, spaces.Discrete))
+        return states, actions
+
+
+def _budget(asked: _Asked) -> Found:
+    states, actions = asked.pairs()
+    steps, counted = int(asked.amount or STEPS_PER_PAIR), max(states * actions, FEWEST_PAIRS)
+    least = f", counted as {counted}" if counted > states * actions else ""
+    how = f"auto: {steps:,} x {states:,} states x {actions:,} actions{least}"
+    return Found(steps * counted, how)
+
+
+def _discount(asked: _Asked) -> Found:
+    """So what lies a whole episode ahead still counts for 0.6."""
+    limit = time_limit(asked.env)
     if limit is None:
-        raise UserError(f"{where}: auto needs a time limit, which the environment does not have")
+        raise UserError(f"{asked.where}: auto needs an environment with a time limit")
     return Found(1 - 1 / (2 * limit), f"auto: 1 - 1/(2 x time limit of {limit:,})")
 
 
-def _budget(env: Env, amount: str | None, where: str) -> Found:
-    sizes = env.observation_space, env.action_space
-    if not all(isinstance(space, spaces.Discrete) for space in sizes):
-        raise UserError(f"{where}: auto needs Discrete observations and actions: give a number")
-    n_states, n_actions = (int(space.n) for space in sizes if isinstance(space, spaces.Discrete))
-    steps, pairs = int(amount or STEPS_PER_PAIR), n_states * n_actions
-    counted = f"{n_states:,} states x {n_actions:,} actions"
-    if pairs < FEWEST_PAIRS:
-        counted = f"{FEWEST_PAIRS}, the fewest that are counted, for {counted}"
-    return Found(steps * max(pairs, FEWEST_PAIRS), f"auto: {steps:,} x {counted}")
+def _step_size(asked: _Asked) -> Found:
+    """In a short training the step size stays large: what is learnt late has far to go."""
+    states, actions = asked.pairs()
+    low, high = LAST_STEP_SIZES
+    if asked.n_timesteps is None:  # counted in episodes
+        return Found(f"exp_{FIRST_STEP_SIZE:g}_{high:g}", "auto")
+    last = min(max(VISITS_AVERAGED * states * actions / asked.n_timesteps, low), high)
+    how = f"auto: ends at {VISITS_AVERAGED} pairs of state and action by steps, {low} to {high}"
+    return Found(f"exp_{FIRST_STEP_SIZE:g}_{last:.2g}", how)
 
 
-def _highest_value(env: Env, amount: str | None, where: str) -> Found:
+def _highest_value(asked: _Asked) -> Found:
     """No return is higher where only the end of an episode is rewarded, as on FrozenLake."""
-    model = transition_model(env)
+    model = transition_model(asked.env)
     if model is None:
-        raise UserError(f"{where}: auto needs an environment whose model is known: give a number")
+        raise UserError(f"{asked.where}: auto needs an environment whose model is known")
     ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
     if not ends.any():
-        raise UserError(f"{where}: auto needs an environment whose episodes can end")
+        raise UserError(f"{asked.where}: auto needs an environment whose episodes can end")
     return Found(float(model.reward[ends].max()), "auto: the highest reward that ends an episode")
 
 
-_RULES: Mapping[str, Callable[[Env, str | None, str], Found]] = {
-    "gamma": _discount,
+# In this order: the step size goes by the number of steps.
+_RULES: Mapping[str, Callable[[_Asked], Found]] = {
     "n_timesteps": _budget,
+    "gamma": _discount,
+    "learning_rate": _step_size,
     "initial_q": _highest_value,
     "value_bound": _highest_value,
 }
@@ -145,12 +183,15 @@ def resolved_spec(
 ) -> TrainSpec:
     """A spec with a number in place of each ``auto``.
 
-    ``gamma: auto`` is 1 - 1/(2 x time limit) of the environment that the agent is judged on.
-    ``n_timesteps: auto_K`` is K steps for each pair of state and action, of which 100 are counted
-    at least; ``auto`` is ``auto_1000``. ``initial_q: auto`` and ``value_bound: auto`` are the
-    highest reward that ends an episode. ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1
-    by the largest reward of training, its sign aside. In other settings the word is what it was,
-    such as ``engine: auto``.
+    - ``gamma: auto`` is 1 - 1/(2 x time limit) of the environment that the agent is judged on.
+    - ``n_timesteps: auto_K`` is K steps for each pair of state and action, of which 100 are counted
+      at least; ``auto`` is ``auto_2500``.
+    - ``learning_rate: auto`` falls from 0.3 to ten pairs by the steps, within 0.003 and 0.05.
+    - ``initial_q: auto`` and ``value_bound: auto`` are the highest reward that ends an episode.
+    - ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1 by the largest reward of training,
+      its sign aside.
+
+    In other settings the word is what it was, such as ``engine: auto``.
 
     Args:
         raw: an entry of hyperparameters.
@@ -166,12 +207,7 @@ def resolved_spec(
     found = _scale(raw, spec, where)
     if len(rest) < len(raw):
         check_fit(spec)
-        env = make_single_env(spec)
-        for key, value in raw.items():
-            match = _word(key, value)
-            if match is not None and key in _RULES:
-                found[key] = _RULES[key](env, match[1], f"{where}: {key}")
-        env.close()
+        found |= _answers(raw, spec, where)
     if not found:
         return replace(spec, origins=dict(origins) if origins else None)
     numbers = {**raw, **{key: one.value for key, one in found.items()}}
@@ -182,6 +218,20 @@ def resolved_spec(
         saved_hyperparams=numbers,
         origins={**(origins or {}), **told},
     )
+
+
+def _answers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
+    """What each ``auto`` of an entry stands for; ``spec`` is without them."""
+    found: dict[str, Found] = {}
+    n_timesteps = spec.hyperparams.n_timesteps
+    env = make_single_env(spec)
+    for key, rule in _RULES.items():
+        match = _word(key, raw.get(key))
+        if match is not None:
+            found[key] = rule(_Asked(env, match[1] or "", n_timesteps, f"{where}: {key}"))
+            n_timesteps = found[key].value if key == "n_timesteps" else n_timesteps
+    env.close()
+    return found
 
 
 def _word(key: str, value: Any) -> re.Match[str] | None:
