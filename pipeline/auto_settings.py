@@ -88,7 +88,7 @@ def _discount(asked: _Asked) -> Found:
     limit = time_limit(asked.env)
     if limit is None:
         raise UserError(f"{asked.where}: auto needs an environment with a time limit")
-    return Found(1 - 1 / (2 * limit), f"auto: 1 - 1/(2 x time limit of {limit:,})")
+    return Found(round(1 - 1 / (2 * limit), 7), f"auto: 1 - 1/(2 x time limit of {limit:,})")
 
 
 def _step_size(asked: _Asked) -> Found:
