@@ -26,6 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from agents import load_algorithm
+from pipeline.auto_settings import resolved_spec
 from pipeline.environments import make_training_env
 from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator
 from pipeline.preparation import algorithm_kwargs
@@ -100,8 +101,8 @@ class Scores:
 
 def score(entry: Mapping[str, Any], seed: int) -> float:
     """Train with one seed; the score of the final policy."""
-    raw = dict(entry)
-    spec = TrainSpec(ALGO, ENV, split(raw), raw, seed=seed)
+    spec = resolved_spec(entry, algo=ALGO, env_id=ENV, seed=seed)
+    raw = spec.saved_hyperparams
     algorithm: Any = load_algorithm(ALGO)
     env = make_training_env(spec, None)
     agent = algorithm(env=env, device="cpu", seed=seed, **algorithm_kwargs(spec))

@@ -62,17 +62,16 @@ def final_return(case: Case, seed: int) -> float:
     import torch as th
 
     from agents import load_algorithm
+    from pipeline.auto_settings import resolved_spec
     from pipeline.environments import make_training_env
     from pipeline.evaluation.exact import exact_evaluator
     from pipeline.preparation import algorithm_kwargs
     from pipeline.settings.hyperparam_entries import override, read_hyperparams
-    from pipeline.settings.hyperparams import split
-    from pipeline.train_spec import TrainSpec
 
     th.set_num_threads(1)
     changes = {"n_timesteps": case.n_timesteps, "n_envs": case.n_envs}
     raw = override(read_hyperparams(case.algo, case.env_id), changes)
-    spec = TrainSpec(case.algo, case.env_id, split(raw), raw, seed=seed)
+    spec = resolved_spec(raw, algo=case.algo, env_id=case.env_id, seed=seed)
     env = make_training_env(spec, None)
     algorithm: Any = load_algorithm(case.algo)
     agent = algorithm(env=env, device="cpu", seed=seed, **algorithm_kwargs(spec))

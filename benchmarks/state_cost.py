@@ -18,11 +18,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from pipeline.auto_settings import resolved_spec
 from pipeline.resuming import state_saver
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.settings.hyperparam_entries import override, read_hyperparams
-from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
 from pipeline.training import train
 
 CASES: tuple[tuple[str, str, int, dict[str, Any]], ...] = (
@@ -70,11 +69,10 @@ def main() -> None:
         raw = override({**read_hyperparams(algo, env_id, None), "n_timesteps": steps}, settings)
         raw.pop("n_episodes", None)
         with tempfile.TemporaryDirectory() as folder:
-            spec = TrainSpec(
-                algo,
-                env_id,
-                split(raw),
+            spec = resolved_spec(
                 raw,
+                algo=algo,
+                env_id=env_id,
                 seed=1,
                 log_folder=Path(folder),
                 verbose=0,

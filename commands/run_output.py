@@ -90,7 +90,11 @@ def print_header(console: Console, spec: TrainSpec) -> None:
     console.print(
         Text.assemble(agent, " on ", environment, f", seed {spec.seed}, {budget:,} {unit}")
     )
-    settings = "  ".join(f"{key}={_brief(value)}" for key, value in spec.saved_hyperparams.items())
+    origins = spec.origins or {}
+    settings = "  ".join(
+        f"{key}={_brief(value)}{f' ({origins[key]})' if key in origins else ''}"
+        for key, value in spec.saved_hyperparams.items()
+    )
     console.print(settings, style="dim", highlight=False)
 
 

@@ -11,11 +11,11 @@ from typing import Any
 
 from commands.parsing import check_device, check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit, with_engine
+from pipeline.auto_settings import resolved_spec, training_follows
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.map_contents import with_logs_located, with_maps_read
 from pipeline.settings.hyperparam_entries import NoEntryError, override, read_hyperparams
-from pipeline.settings.hyperparams import split
 from pipeline.settings.literals import parse_assignments
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_typed
@@ -32,18 +32,18 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     check_env_id(args.env)
     check_tensorboard(args.tensorboard_log)
     check_device(args.device)
-    raw = with_logs_located(args.env, with_maps_read(args.env, _raw_hyperparams(args)))
+    raw, typed = _raw_hyperparams(args)
+    raw = with_logs_located(args.env, with_maps_read(args.env, raw))
     trained_agent = None
     if args.trained_agent:
         from pipeline.models.continuation import agent_to_continue
 
         trained_agent = agent_to_continue(Path(args.trained_agent))
     # A flag that has the name of a field goes there as it is.
-    named = {key.name: getattr(args, key.name) for key in fields(TrainSpec) if key.name in args}
+    names = {key.name for key in fields(TrainSpec)} - {"hyperparams"}
+    named = {name: getattr(args, name) for name in names if name in args}
     changed = {
         "env_id": args.env,
-        "hyperparams": split(raw),
-        "saved_hyperparams": raw,
         "seed": args.seed if args.seed >= 0 else randbelow(2**31),
         "log_folder": Path(args.log_folder),
         "tensorboard_log": Path(args.tensorboard_log) if args.tensorboard_log else None,
@@ -54,7 +54,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
         "final_episodes": args.eval_episodes,
         "watch_learning": _page_path(args),
     }
-    spec = TrainSpec(**{**named, **changed})
+    spec = resolved_spec(raw, origins=typed, **{**named, **changed})
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
         raise UserError("how long to train? give -n STEPS or --n-episodes EPISODES")
     check_fit(spec)
@@ -82,8 +82,8 @@ def _page_path(args: argparse.Namespace) -> Path | None:
     return path
 
 
-def _raw_hyperparams(args: argparse.Namespace) -> dict[str, Any]:
-    """The file's entry for the environment, changed as the command line says."""
+def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
+    """The file's entry for the environment, changed as the command line says; and what gave way."""
     typed = parse_assignments(args.hyperparams, "--hyperparams")
     changes = with_engine(args.algo, typed, args.engine)
     try:
@@ -92,11 +92,12 @@ def _raw_hyperparams(args: argparse.Namespace) -> dict[str, Any]:
         if not changes:
             raise
         entry = {}
+    typed = {"env_kwargs": changes.get("env_kwargs")}
     for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
         if given:
-            flag = f"--{key.replace('_', '-')}"
-            changes[key] = {**(entry.get(key) or {}), **parse_assignments(given, flag)}
+            typed[key] = parse_assignments(given, f"--{key.replace('_', '-')}")
+            changes[key] = {**(entry.get(key) or {}), **typed[key]}
     for key, budget in (("n_timesteps", args.n_timesteps), ("n_episodes", args.n_episodes)):
         if budget > 0:
             changes[key] = budget
-    return override(entry, changes)
+    return training_follows(override(entry, changes), {**changes, **typed})

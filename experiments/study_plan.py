@@ -14,6 +14,7 @@ from envs.known_models import time_limit
 from experiments.planned_runs import PlannedRun
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from pipeline.agent_checks import check_algorithm, check_fit
+from pipeline.auto_settings import resolved_spec, training_follows
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
 from pipeline.map_contents import with_maps_read
@@ -182,17 +183,16 @@ def _is_compiled_bandit(algo: str) -> bool:
 
 def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
     check_algorithm(agent.algo)
-    raw = with_maps_read(environment.env_id, _raw_hyperparams(agent, environment))
+    raw, gave_way = _raw_hyperparams(agent, environment)
     place = f"{agent.label} on {environment.label}"
-    if study.is_quick:
-        raw = _shortened(raw, study.quick.budget)
     # A field of the study that has the name of one of the run goes there as it is.
     named = {key.name for key in fields(TrainSpec)} & {key.name for key in fields(StudySpec)}
-    spec = TrainSpec(
+    spec = resolved_spec(
+        with_maps_read(environment.env_id, raw),
+        place,
+        origins=gave_way,
         algo=agent.algo,
         env_id=environment.env_id,
-        hyperparams=split(raw, place),
-        saved_hyperparams=raw,
         seed=0,
         verbose=0,
         pictures=False,
@@ -200,10 +200,15 @@ def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec
     )
     if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
         raise UserError(f"{place}: how long to train? give n_timesteps or n_episodes")
+    if study.is_quick:
+        raw = _shortened(spec.saved_hyperparams, study.quick.budget)
+        spec = replace(spec, hyperparams=split(raw, place), saved_hyperparams=raw)
     return spec
 
 
-def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str, Any]:
+def _raw_hyperparams(
+    agent: AgentSpec, environment: EnvironmentSpec
+) -> tuple[dict[str, Any], dict[str, str] | None]:
     """The agent's file, changed by the environment's settings, and these by the agent's own."""
     raw: dict[str, Any] = {}
     if agent.tuned or agent.conf_file is not None:
@@ -212,9 +217,8 @@ def _raw_hyperparams(agent: AgentSpec, environment: EnvironmentSpec) -> dict[str
         except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
-    for settings in (environment.settings, agent.settings):
-        raw = layered(raw, settings)
-    return raw
+    own = layered(environment.settings, agent.settings)
+    return training_follows(layered(raw, own), own)
 
 
 def _shortened(raw: Mapping[str, Any], share: float) -> dict[str, Any]:

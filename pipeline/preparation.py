@@ -25,7 +25,7 @@ from pipeline.environments import (
 from pipeline.errors import UserError
 from pipeline.evaluation.asked_policies import why_not_exact
 from pipeline.evaluation.evaluation_budget import n_environments
-from pipeline.evaluation.exact import ExactEvaluator, model_refusal
+from pipeline.evaluation.exact import ExactEvaluator, discount_note, model_refusal
 from pipeline.evaluation.kept_evaluators import evaluator_of
 from pipeline.evaluation.sampled import takes_batches
 from pipeline.evaluation.value_maps import map_refusal
@@ -156,10 +156,15 @@ def set_up(
         model.set_logger(Logger(folder=None, output_formats=[]))
     elif keeping.state is not None:
         model.set_logger(resumed_logger(model, keeping.state.note))
+    is_bandit = are_bandits(env)
     exact = _exact_evaluator(spec, model, console)
+    gamma = getattr(model, "gamma", None)
+    if spec.verbose and exact is not None and isinstance(gamma, float) and not is_bandit:
+        note = discount_note(spec, exact, gamma)
+        if note is not None:
+            _say(console, note)
     eval_env = make_evaluation_env(spec, _n_eval_envs(spec, model, is_exact=exact is not None))
     undo.callback(close_environments, eval_env)
-    is_bandit = are_bandits(env)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
     saver = StateSaver(

@@ -53,6 +53,8 @@ class TrainSpec:
         watch_learning: file of a page that plays the training step by step, or None.
         watch_episodes: how many episodes that page shows of an agent with tables; 0 for as many as
             there are in its first steps.
+        origins: by setting, where its value comes from if it does not stand so in the entry, such
+            as ``"auto: 1 - 1/(2 x time limit of 1,000)"``; None for none.
     """
 
     algo: str
@@ -82,6 +84,7 @@ class TrainSpec:
     pictures: bool = True
     watch_learning: Path | None = None
     watch_episodes: int = 0
+    origins: dict[str, str] | None = None
 
     def as_data(self) -> dict[str, Any]:
         """The spec as JSON."""

@@ -23,6 +23,9 @@ def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
         *_tuned(seeds, tuning.files, "the settings in"),
     ]
     these = "these" if len(seeds) > 1 else "it"
+    if tuning.elsewhere:
+        names = _names(tuning.elsewhere)
+        parts.append(f"the settings of {names} were tuned with other arguments of the environment")
     if not parts and not tuning.unknown:
         parts = [f"nothing was tuned on {these}"]
     elif not parts and (tuning.shipped or tuning.files):

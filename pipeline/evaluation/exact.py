@@ -31,6 +31,7 @@ from mdp import (
     finite_horizon_optimum,
     optimal_choices,
     optimum_far_from_limit,
+    policy_iteration,
     policy_return,
     state_values,
 )
@@ -48,6 +49,10 @@ MOST_BYTES_OBSERVED = 1 << 30
 # second does some hundred million. Beyond the first number there may be a shorter way.
 FEW_BACKUPS = 200_000_000
 MOST_BACKUPS = 20_000_000_000
+# Planning to see what a discount costs: the outcomes of all states and actions, with which it takes
+# a tenth of a second, and the score below which that is worth a word.
+MOST_OUTCOMES_PLANNED = 250_000
+LOW_SCORE = 0.95
 
 
 @dataclass(frozen=True)
@@ -173,6 +178,38 @@ def model_refusal(spec: TrainSpec) -> str | None:
     finally:
         env.close()
     return None if check is None else check.refusal
+
+
+def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> str | None:
+    """What the discount that an agent learns under costs, in one line; None where that is little.
+
+    The best policy under the discount, planned exactly on what the agent is trained on, is judged
+    as agents are. No learner can be relied on to do better.
+
+    Args:
+        spec: the run.
+        exact: what judges it.
+        discount: the agent's.
+    """
+    env = make_single_env(spec, training=True)
+    model = transition_model(env)
+    env.close()
+    if model is None or model.prob.shape != exact.model.prob.shape:
+        return None
+    if model.prob.size > MOST_OUTCOMES_PLANNED or not 0 <= discount < 1:
+        return None
+
+    def score(gamma: float) -> float:
+        plan = policy_iteration(model, gamma)
+        worth = policy_return(exact.model, plan.policy, exact.horizon)
+        return exact.yardstick.score(worth.expected_return)
+
+    reached, other = score(discount), 1 - 1 / (2 * exact.horizon)
+    if reached >= LOW_SCORE:
+        return None
+    said = f"at gamma {discount:g} even exact planning scores {reached:.2f} here"
+    better = score(other)
+    return f"{said}; {other:g}: {better:.2f} (gamma: auto)" if better > reached + 0.01 else said
 
 
 def _is_wrapped_as_vector(spec: TrainSpec) -> bool:

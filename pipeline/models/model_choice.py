@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.agent_checks import check_algorithm
+from pipeline.auto_settings import without_auto
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.models.companions import statistics_of
@@ -195,7 +196,7 @@ def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
         entry = read_hyperparams(algo, env_id)
     except NoEntryError:
         return {}
-    return {key: value for key, value in entry.items() if key != "normalize"}
+    return {key: value for key, value in without_auto(entry).items() if key != "normalize"}
 
 
 def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenModel:

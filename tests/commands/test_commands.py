@@ -16,9 +16,12 @@ import pytest
 import yaml
 
 import train
+from commands.train_flags import build_parser
+from commands.train_request import train_spec
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
+from pipeline.environments import training_kwargs
 from pipeline.errors import UserError
 from pipeline.filming import FRAMES_PER_SECOND, check_film_path, write_film
 from pipeline.settings import hyperparam_entries
@@ -467,3 +470,32 @@ def test_where_tensorboard_is_missing_it_is_named_beforehand(type_command, tmp_p
     assert (code, out) == (2, "")
     assert err == "train.py: error: -tb needs: pip install 'rl-yardstick[tensorboard]'\n"
     assert contents(tmp_path) == []
+
+
+def test_the_head_says_what_auto_stands_for_and_what_a_discount_costs(type_command, tmp_path):
+    slipping = ["--algo", "qlearning", "--env", "Warehouse-v0", "--env-kwargs", "slip:0.2"]
+    code, out, _ = type_command("train.py", *slipping, "-n", "500", "--seed", "0")
+    assert code == 0
+    assert "gamma=0.9995 (auto: 1 - 1/(2 x time limit of 1,000))" in " ".join(out.split())
+    assert "exact planning" not in out
+    run = tmp_path / "logs" / "qlearning" / "Warehouse-v0_1"
+    spec = json.loads((run / "run.json").read_text())["spec"]
+    assert (spec["hyperparams"]["gamma"], *spec["origins"]) == (0.9995, "gamma", "learning_rate")
+    assert yaml.safe_load((run / "Warehouse-v0" / "config.yml").read_text())["gamma"] == 0.9995
+    code, out, _ = type_command(
+        *("train.py", *slipping, "-n", "500", "--seed", "0", "-params", "gamma:0.99")
+    )
+    assert code == 0
+    assert "at gamma 0.99 even exact planning scores 0.00 here; 0.9995: 1.00" in out
+
+
+def test_typed_arguments_of_the_environment_win_over_what_an_entry_trains_on():
+    words = ["--algo", "ppo", "--env", "Warehouse-v0", "--env-kwargs", "shelf_reward:-1"]
+    spec = train_spec(build_parser().parse_args(words))
+    assert training_kwargs(spec) == {
+        "shelf_reward": -1,
+        "random_start": True,
+        "max_episode_steps": 100,
+    }
+    assert "without shelf_reward: -10" in spec.origins["train_env_kwargs"]
+    assert training_kwargs(train_spec(build_parser().parse_args(words[:4])))["shelf_reward"] == -10

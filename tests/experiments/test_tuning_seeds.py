@@ -100,3 +100,15 @@ def test_many_names_are_cut_short():
 )
 def test_spans(numbers, text):
     assert spans(numbers) == text
+
+
+def test_nobody_tuned_on_other_arguments_of_the_environment():
+    slippery = EnvironmentSpec("slip", "Warehouse-v0", {"env_kwargs": {"slip": 0.1}})
+    elsewhere = "the settings of dqn were tuned with other arguments of the environment"
+    assert said(DQN, places=(slippery,)) == f"Seeds 0 to 9: {elsewhere}."
+    assert said(DQN, places=(slippery,), first=1000) == f"Seeds 1000 to 1009: {elsewhere}."
+    assert said(RANDOM, places=(slippery,)) == "Seeds 0 to 9: nothing was tuned on these."
+    both = said(DQN, places=(slippery, LAKE))
+    assert both == f"Seeds 0 to 9: the shipped settings of dqn were tuned on these; {elsewhere}."
+    own = replace(DQN, settings={"env_kwargs": {"is_slippery": False}})
+    assert said(own) == f"Seeds 0 to 9: {elsewhere}."

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from pipeline.auto_settings import resolved_spec
 from pipeline.resuming.monitor_rows import LENGTHS, RETURNS, TIMES
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.resuming.unfinished_runs import go_on, recorded_training
 from pipeline.settings.hyperparam_entries import override, read_hyperparams
 from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
 
 LAKE = "FrozenLake-v1"
@@ -30,7 +30,7 @@ def spec_of(folder, settings):
     raw = override({**read_hyperparams("qlearning", LAKE, None), "n_timesteps": 3000}, settings)
     raw.pop("n_episodes", None)
     common = {"seed": 3, "log_folder": folder, "verbose": 0, "pictures": False}
-    return TrainSpec("qlearning", LAKE, split(raw), raw, eval_freq=-1, **common)
+    return resolved_spec(raw, algo="qlearning", env_id=LAKE, eval_freq=-1, **common)
 
 
 def training_of(spec, keeping, run=None):

@@ -14,6 +14,7 @@ import torch as th
 from rich.console import Console
 
 from agents import ALGORITHMS
+from pipeline.auto_settings import resolved_spec
 from pipeline.errors import UserError
 from pipeline.evaluation import evaluation_shares
 from pipeline.file_digests import LOCK
@@ -32,7 +33,6 @@ from pipeline.run_folder import Run
 from pipeline.run_lock import at_work_on
 from pipeline.settings.hyperparam_entries import override, read_hyperparams
 from pipeline.settings.hyperparams import split
-from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
 from pipeline.user_modules import import_typed
 from snapshots.recording import Snapshot
@@ -123,7 +123,7 @@ def spec_of(folder, env_id, algo, n_timesteps, settings, **more):
     raw.pop("n_episodes", None)
     common = {"seed": 3, "log_folder": folder, "verbose": 0, "pictures": False}
     sparing = {"eval_episodes": None, "final_episodes": None}
-    return TrainSpec(algo, env_id, split(raw), raw, **{**common, **sparing, **more})
+    return resolved_spec(raw, algo=algo, env_id=env_id, **{**common, **sparing, **more})
 
 
 def training_of(spec, keeping, run=None):
@@ -283,9 +283,9 @@ def test_budgets_in_episodes_callbacks_and_checkpoints(tmp_path, monkeypatch, al
     settings["callback"][0]["pipeline.callbacks.EpisodeCheckpoint"]["every_n_episodes"] = 7
     if algo == "dqn":
         settings |= {**EAGER, "callback": [*settings["callback"], EXPLORATION]}
-    raw = {**read_hyperparams(algo, GRID, None), **settings}
-    raw.pop("n_timesteps", None)
     spec = spec_of(tmp_path / "whole", GRID, algo, 1, settings, save_freq=50)
+    raw = {**spec.saved_hyperparams, "n_episodes": settings["n_episodes"]}
+    raw.pop("n_timesteps", None)
     spec = replace(spec, hyperparams=split(raw), saved_hyperparams=raw)
     whole = undisturbed(spec)
     run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch, every=20)

@@ -7,6 +7,7 @@ import pytest
 from gymnasium.utils import seeding
 
 from agents import load_algorithm
+from pipeline.auto_settings import resolved_spec, without_auto
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation.sampled import evaluate, evaluation_seed
 from pipeline.settings import hyperparam_entries
@@ -23,7 +24,7 @@ TUNED, JUDGED = range(10), range(1000, 1010)
 
 def spec_of(algo, env_id, seed=0, **changes):
     raw = {**read_hyperparams(algo, env_id), **changes}
-    return TrainSpec(algo, env_id, split(raw), raw, seed=seed)
+    return resolved_spec(raw, algo=algo, env_id=env_id, seed=seed)
 
 
 def seeds_of_run(n_envs, seed, n_eval_envs=TrainSpec.n_eval_envs):
@@ -65,7 +66,7 @@ def test_a_run_takes_the_seeds_that_are_said(algo, seeds_taken):
 def test_tuning_and_judgement_share_no_stream():
     """With every shipped entry, and with any two of them: runs of one study may be of several."""
     entries = [entry for path in FILES for key, entry in read_yaml(path).items() if key != TUNED_ON]
-    numbers = {split(entry).n_envs for entry in entries}
+    numbers = {split(without_auto(entry)).n_envs for entry in entries}
     assert numbers == {1, 4, 8, 16, 32}
     tuned, judged = (
         set().union(*(seeds_of_run(n_envs, seed) for n_envs in numbers for seed in seeds))

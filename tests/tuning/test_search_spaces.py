@@ -9,6 +9,7 @@ import pytest
 from optuna.trial import FixedTrial
 
 from agents import ALGORITHMS, load_algorithm
+from pipeline.auto_settings import resolved_spec
 from pipeline.errors import UserError
 from pipeline.settings import hyperparam_entries
 from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
@@ -79,11 +80,17 @@ def read(tmp_path, text, env_id="Foo-v0", algo="dqn"):
     return read_search_space(algo, env_id, path)
 
 
+def as_run(algo, env_id):
+    """The entry with numbers for ``auto``, as a search begins with it."""
+    entry = read_hyperparams(algo, env_id)
+    return resolved_spec(entry, algo=algo, env_id=env_id, seed=0).saved_hyperparams
+
+
 def shipped(algo):
     """The entries of an agent's files, both of settings and of spaces, by environment."""
     names = [*entry_names(algo), *(set(read_yaml(FOLDER / f"{algo}.yml")) - {"default"})]
     names = list(dict.fromkeys(names))
-    entries = {name: read_hyperparams(algo, name) for name in names}
+    entries = {name: as_run(algo, name) for name in names}
     return {**entries, "Unknown-v0": read_hyperparams(algo, "Unknown-v0")}
 
 
