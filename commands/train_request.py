@@ -84,8 +84,8 @@ def _page_path(args: argparse.Namespace) -> Path | None:
 
 def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
     """The file's entry for the environment, changed as the command line says; and what gave way."""
-    typed = parse_assignments(args.hyperparams, "--hyperparams")
-    changes = with_engine(args.algo, typed, args.engine)
+    asked = parse_assignments(args.hyperparams, "--hyperparams")
+    changes = with_engine(args.algo, asked, args.engine)
     try:
         entry = read_hyperparams(args.algo, args.env, args.conf_file)
     except NoEntryError:
