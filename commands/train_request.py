@@ -82,7 +82,7 @@ def _page_path(args: argparse.Namespace) -> Path | None:
     return path
 
 
-def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
+def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str] | None]:
     """The file's entry for the environment, changed as the command line says; and what gave way."""
     asked = parse_assignments(args.hyperparams, "--hyperparams")
     changes = with_engine(args.algo, asked, args.engine)
@@ -92,7 +92,7 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
         if not changes:
             raise
         entry = {}
-    typed = {"env_kwargs": changes.get("env_kwargs")}
+    typed: dict[str, Any] = {"env_kwargs": changes.get("env_kwargs")}
     for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
         if given:
             typed[key] = parse_assignments(given, f"--{key.replace('_', '-')}")
