@@ -82,7 +82,9 @@ def _page_path(args: argparse.Namespace) -> Path | None:
     return path
 
 
-def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str]]:
+def _raw_hyperparams(
+    args: argparse.Namespace,
+) -> tuple[dict[str, Any], dict[str, str] | None]:
     """The file's entry for the environment, changed as the command line says; and what gave way."""
     changes = parse_assignments(args.hyperparams, "--hyperparams")
     try:
@@ -94,8 +96,8 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     typed = {"env_kwargs": changes.get("env_kwargs")}
     for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
         if given:
-            typed[key] = parse_assignments(given, f"--{key.replace('_', '-')}")
-            changes[key] = {**(entry.get(key) or {}), **typed[key]}
+            named = parse_assignments(given, f"--{key.replace('_', '-')}")
+            typed[key], changes[key] = named, {**(entry.get(key) or {}), **named}
     for key, budget in (("n_timesteps", args.n_timesteps), ("n_episodes", args.n_episodes)):
         if budget > 0:
             changes[key] = budget
