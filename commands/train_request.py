@@ -95,8 +95,8 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     typed: dict[str, Any] = {"env_kwargs": changes.get("env_kwargs")}
     for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
         if given:
-            typed[key] = parse_assignments(given, f"--{key.replace('_', '-')}")
-            changes[key] = {**(entry.get(key) or {}), **typed[key]}
+            named = parse_assignments(given, f"--{key.replace('_', '-')}")
+            typed[key], changes[key] = named, {**(entry.get(key) or {}), **named}
     for key, budget in (("n_timesteps", args.n_timesteps), ("n_episodes", args.n_episodes)):
         if budget > 0:
             changes[key] = budget
