@@ -17,6 +17,7 @@ from pipeline.train_spec import TrainSpec, completed
 # What a run of the same settings may differ in: where it is written, what is shown meanwhile, and
 # where the modules lie that its names come from.
 _MAY_DIFFER = (
+    "origins",
     "log_folder",
     "tensorboard_log",
     "gym_packages",

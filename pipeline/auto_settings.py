@@ -107,7 +107,8 @@ def _highest_value(asked: _Asked) -> Found:
     model = transition_model(asked.env)
     if model is None:
         raise UserError(f"{asked.where}: auto needs an environment whose model is known")
-    ends = model.terminated & (model.prob > 0) & model.reachable[:, None, None]
+    # Of cells that nobody comes to as well: to find these would take longer than all else here.
+    ends = model.terminated & (model.prob > 0)
     if not ends.any():
         raise UserError(f"{asked.where}: auto needs an environment whose episodes can end")
     return Found(float(model.reward[ends].max()), "auto: the highest reward that ends an episode")
@@ -138,7 +139,7 @@ def _scale(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Fou
     env.close()
     if model is None:
         raise UserError(f"{where}: scale: auto needs an environment whose model is known")
-    largest = float(np.abs(model.reward[model.reachable][model.prob[model.reachable] > 0]).max())
+    largest = float(np.abs(model.reward[model.prob > 0]).max())
     scaled = replace(wrappers[place], kwargs={"scale": 1 / largest if largest else 1.0})
     listed = [{one.name: one.kwargs} for one in (*wrappers[:place], scaled, *wrappers[place + 1 :])]
     return {"train_env_wrapper": Found(listed, f"scale auto: 1 / the largest reward, {largest:g}")}

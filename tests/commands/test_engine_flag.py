@@ -272,14 +272,13 @@ def test_a_run_says_and_records_what_it_trains_on(type_command, tmp_path):
     assert f"engine: library: {TOO_SHORT}" in card(record, [])
 
 
-def test_a_table_says_what_a_callback_costs(type_command, tmp_path, monkeypatch):
-    (tmp_path / "mine.py").write_text(
+def test_a_table_says_what_a_callback_costs(type_in_own_folder, own_folder):
+    (own_folder / "each_step.py").write_text(
         "from stable_baselines3.common.callbacks import BaseCallback\n"
         "class Mine(BaseCallback):\n    def _on_step(self):\n        return True\n"
     )
-    monkeypatch.syspath_prepend(str(tmp_path))
-    words = ["--algo", "qlearning", *ENV, "-n", "100", "--gym-packages", "mine"]
-    _, out, err = type_command("train.py", *words, "-params", "callback:mine.Mine")
+    words = ["--algo", "qlearning", *ENV, "-n", "100", "--gym-packages", "each_step"]
+    _, out, err = type_in_own_folder("train.py", *words, "-params", "callback:each_step.Mine")
     assert err == ""
     assert (
         "engine  interpreted, about a hundred times slower or more: Mine must be asked after each "

@@ -68,7 +68,7 @@ def test_without_flags_a_run_is_the_default_one():
     own = {"algo", "env_id", "hyperparams", "saved_hyperparams", "seed"}
     # A study has the same number of episodes in all its runs; a run by itself as few as will do.
     assert (spec.eval_episodes, spec.final_episodes) == (None, None)
-    own |= {"eval_episodes", "final_episodes"}
+    own |= {"eval_episodes", "final_episodes", "origins"}
     assert {
         key.name: getattr(spec, key.name) for key in fields(TrainSpec) if key.name not in own
     } == {key.name: key.default for key in fields(TrainSpec) if key.name not in own}

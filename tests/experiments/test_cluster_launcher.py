@@ -183,11 +183,11 @@ def answer_of(port, context=None):
         return b""
 
 
-def check_ports(n_processes):
+def check_ports(n_processes, before):
     """All sockets of so many processes speak TLS, with those alone who have a certificate."""
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
-    ports = listening_in(os.getpid())
+    ports = {port: pid for port, pid in listening_in(os.getpid()).items() if port not in before}
     assert len(set(ports.values())) == n_processes
     for port in ports:
         assert answer_of(port) == b""
@@ -196,16 +196,18 @@ def check_ports(n_processes):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
 def test_all_ports_of_workers_here_want_a_certificate():
+    before = listening_in(os.getpid())  # of servers that other tests have left
     with opened(LocalWorkers(1), 1, is_told=False) as (connect, _), connect() as client:
         client.wait_for_workers(1, timeout=60)
         assert client.dashboard_link == ""
-        check_ports(2)  # this one, with the scheduler and the nanny, and the worker
+        check_ports(2, before)  # this one, with the scheduler and the nanny, and the worker
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file")  # dask-jobqueue's, which hold the keys
 @pytest.mark.skipif(sys.platform != "linux", reason="it looks into /proc")
 def test_all_ports_of_jobs_want_a_certificate(tmp_path):
     """The queue is played by a shell, which does what the script of a job says."""
+    before = listening_in(os.getpid())
     settings = {"cores": 1, "memory": "1GB", "shared-temp-directory": str(tmp_path)}
     settings |= {"interface": "lo", "python": sys.executable, "local-directory": str(tmp_path)}
     queue = opened_queue(JobQueue("slurm", settings, 1, tmp_path / "slurm.yml"))
@@ -213,7 +215,7 @@ def test_all_ports_of_jobs_want_a_certificate(tmp_path):
         job = subprocess.Popen(["bash", "-c", queue.job_script()], stderr=subprocess.DEVNULL)
         try:
             client.wait_for_workers(1, timeout=60)
-            check_ports(3)  # this one, with the scheduler, the nanny and the worker
+            check_ports(3, before)  # this one, with the scheduler, the nanny and the worker
         finally:
             client.shutdown()
             job.wait(30)

@@ -234,7 +234,7 @@ def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
         read_looks(tmp_path)
     path.unlink()
     path.mkdir()
-    with pytest.raises(UserError, match="cannot be read"):
+    with pytest.raises(UserError, match="is no regular file"):
         read_looks(tmp_path)
 
 

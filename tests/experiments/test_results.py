@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from PIL import Image
-from rich.console import Console
 
+from commands.terminal import TextConsole
 from experiments.analysis import analyse
 from experiments.early_results import EarlyResults
 from experiments.run_curves import CURVE_COLUMNS
@@ -439,7 +439,7 @@ def test_scores_over_environments(tmp_path):
 def everything(results, tmp_path):
     """All that is made of results; the text in the terminal."""
     analysis = analyse(results)
-    console = Console(record=True, width=300, quiet=False, file=(tmp_path / "out").open("w"))
+    console = TextConsole(record=True, width=300, quiet=False, file=(tmp_path / "out").open("w"))
     print_analysis(console, analysis)
     blocks = episodes_table(results, 4)
     print_episodes_table(console, blocks, 4)

@@ -210,6 +210,7 @@ def found_files(folder):
 
 def test_runs_in_one_process_leave_what_each_leaves_alone(tmp_path):
     """Of the last seed, whose runs come after all others, one of each agent."""
+    (tmp_path / "together").mkdir()
     together, alone = runs_of(tmp_path / "together"), runs_of(tmp_path / "alone")[-5::2]
     assert all(is_plain(run.spec) for run in together)
     assert not execute(together, *one_at_a_time(tmp_path / "together"))
@@ -230,6 +231,7 @@ def test_so_do_runs_of_compiled_networks(tmp_path):
     """On an environment that is evaluated exactly, and on one where episodes are played."""
     lake = EnvironmentSpec("lake", "FrozenLake-v1", {"train_env_wrapper": CLIPPED})
     poles = EnvironmentSpec("poles", "CartPole-v1", {})
+    (tmp_path / "together").mkdir()
     together = runs_of(tmp_path / "together", 2, NETWORKS, (lake, poles))
     alone = runs_of(tmp_path / "alone", 2, NETWORKS, (lake, poles))[-4:]
     assert all(is_plain(run.spec) for run in together)

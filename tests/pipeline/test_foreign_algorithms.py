@@ -271,5 +271,6 @@ def test_a_zip_says_what_it_is_where_it_holds_json(says, algo, tmp_path):
     path = tmp_path / "model.zip"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("data", json.dumps({"algorithm": says}))
-        archive.writestr("policy.pth", b"")
+        th.save({}, policy := io.BytesIO())
+        archive.writestr("policy.pth", policy.getvalue())
     assert hand_written_algorithm(read_model(path)) == algo

@@ -2,6 +2,7 @@
 
 import json
 import math
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -180,10 +181,15 @@ def canvases(monkeypatch):
 
     seen = {}
 
-    def keep(self, target, **options):
-        seen[target.name.strip(".").partition(".")[0]] = self.axes
-        target.touch()
+    @contextmanager
+    def named(path):
+        path.touch()
+        yield path
 
+    def keep(self, target, **options):
+        seen[target.name.partition(".")[0]] = self.axes
+
+    monkeypatch.setattr(style, "replacing", named)
     monkeypatch.setattr(style.Figure, "savefig", keep)
     return seen
 
