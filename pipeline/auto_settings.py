@@ -142,7 +142,8 @@ def _scale(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Fou
     largest = float(np.abs(model.reward[model.prob > 0]).max())
     scaled = replace(wrappers[place], kwargs={"scale": 1 / largest if largest else 1.0})
     listed = [{one.name: one.kwargs} for one in (*wrappers[:place], scaled, *wrappers[place + 1 :])]
-    return {"train_env_wrapper": Found(listed, f"scale auto: 1 / the largest reward, {largest:g}")}
+    spelt = listed if len(listed) > 1 else listed[0]
+    return {"train_env_wrapper": Found(spelt, f"scale auto: 1 / the largest reward, {largest:g}")}
 
 
 def without_auto(entry: Mapping[str, Any]) -> dict[str, Any]:
