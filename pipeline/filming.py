@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import errno
 import io
 import os
 from pathlib import Path
@@ -91,4 +92,7 @@ def _as_mp4(frames: list[Any]) -> bytes:
     film: bytes = imageio.mimwrite(
         "<bytes>", even, format="mp4", fps=FRAMES_PER_SECOND, macro_block_size=1
     )
+    # It goes through a temporary file, and on a full disk nobody says so.
+    if b"moov" not in film:
+        raise OSError(errno.EIO, "the encoder wrote no whole film: is the disk full?")
     return film
