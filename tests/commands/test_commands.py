@@ -157,7 +157,7 @@ def test_where_no_film_can_be_written_nothing_is_played(tmp_path, monkeypatch):
 def test_a_film_that_finds_the_disk_full_leaves_the_one_before_it(tmp_path, small_disk, suffix):
     film = tmp_path / f"film.{suffix}"
     film.write_bytes(b"an earlier one")
-    with small_disk(20), pytest.raises(OSError, match="too large|no whole film"):
+    with small_disk(20), pytest.raises(OSError, match=r"too large|no whole film"):
         write_film(film, [np.zeros((8, 8, 3), np.uint8)])
     assert [path.name for path in tmp_path.iterdir()] == [film.name]
     assert film.read_bytes() == b"an earlier one"
