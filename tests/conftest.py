@@ -17,6 +17,7 @@ import pytest
 
 from experiments.fork_server import PRELOADED
 from pipeline.stopping import SIGNALS
+from safe_files import regular_files
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -75,6 +76,14 @@ def signals_are_left_as_they_were():
         if after[number] != before[number]:
             signal.signal(number, before[number])
     assert after == before
+
+
+@pytest.fixture(autouse=True)
+def folders_are_held_for_one_test():
+    """A process holds folders for good; tests share one, and the folders above their own."""
+    before = set(regular_files._held)
+    yield
+    regular_files._held.intersection_update(before)
 
 
 @pytest.fixture
