@@ -22,14 +22,24 @@ REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty
 
 
 @pytest.fixture
-def lake(monkeypatch, tmp_path):
-    """An agent on ice that is not slippery, which walks straight to the goal or into a wall."""
-    monkeypatch.chdir(tmp_path)
-    agent = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--env-kwargs", "is_slippery:False"]
-    words = ["-n", "3000", "--seed", "0", "--verbose", "0"]
-    monkeypatch.setattr("sys.argv", ["train.py", *agent, *words])
-    assert train.main() == 0
-    return choose_model(ModelRequest(algo="qlearning", env_id="FrozenLake-v1"))
+def on_ice(monkeypatch, tmp_path):
+    """Trains an agent for so many steps on ice that is not slippery."""
+
+    def trained(n_steps):
+        monkeypatch.chdir(tmp_path)
+        words = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", str(n_steps)]
+        words += ["--env-kwargs", "is_slippery:False", "--seed", "0", "--verbose", "0"]
+        monkeypatch.setattr("sys.argv", ["train.py", *words])
+        assert train.main() == 0
+        return choose_model(ModelRequest(algo="qlearning", env_id="FrozenLake-v1"))
+
+    return trained
+
+
+@pytest.fixture
+def lake(on_ice):
+    """An agent that walks straight to the goal."""
+    return on_ice(3000)
 
 
 @pytest.fixture
@@ -167,14 +177,9 @@ def test_a_pace_is_for_letters_alone():
 
 
 @pytest.fixture
-def wall(monkeypatch, tmp_path):
-    """An agent that has learnt nothing, and walks against the wall until the time limit, twice."""
-    monkeypatch.chdir(tmp_path)
-    agent = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--env-kwargs", "is_slippery:False"]
-    words = ["-n", "1", "--seed", "0", "--verbose", "0"]
-    monkeypatch.setattr("sys.argv", ["train.py", *agent, *words])
-    assert train.main() == 0
-    return choose_model(ModelRequest(algo="qlearning", env_id="FrozenLake-v1"))
+def wall(on_ice):
+    """An agent that has learnt nothing, and walks against the wall until the time limit."""
+    return on_ice(1)
 
 
 def test_what_repeats_itself_is_shown_for_a_while(wall, pauses, monkeypatch):
