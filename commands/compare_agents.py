@@ -260,6 +260,7 @@ def _prepare(
 
         repair(console, study, planned)
     with doing(console, "looking for runs that are there") as activity, loading_libraries():
+        from experiments.child_processes import do_aside
         from experiments.replaced_runs import check_settings_kept
         from experiments.study_plan import check_settings
 
@@ -268,7 +269,8 @@ def _prepare(
         if any(run.is_to_do for run in planned):
             place.get_ready(planned)
         activity.now("loading the libraries")
-        check_settings(study, planned)
+        first = [run for run in planned if run.seed == study.first_seed]
+        do_aside(check_settings, study, first)
         line = _engines(planned)
     if line:
         console.print(f"engines: {line}", highlight=False, soft_wrap=True)
@@ -276,14 +278,17 @@ def _prepare(
 
 def _engines(planned: Sequence[PlannedRun]) -> str:
     """On which engines the missing runs of networks will train, and what that takes."""
-    from commands.engine_lines import study_line
-    from pipeline.engine_outlook import planned_outlook
     from pipeline.plain_runs import NETWORKS
 
     missing: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in planned:
         if run.spec.algo in NETWORKS and run.is_to_do:
             missing.setdefault((run.agent, run.environment), []).append(run)
+    if not missing:
+        return ""
+    from commands.engine_lines import study_line
+    from pipeline.engine_outlook import planned_outlook
+
     outlooks = [
         (runs[0].agent, planned_outlook(runs[0].spec), len(runs)) for runs in missing.values()
     ]

@@ -268,7 +268,7 @@ def _draw(
 def _films(results: StudyResults, activity: Activity) -> list[Path]:
     """Write the films of training, and say which there cannot be."""
     activity.now("filming")
-    from report.training_films import write_films
+    from report.films import write_films
 
     films, refused = write_films(results, activity.at)
     for reason in refused:

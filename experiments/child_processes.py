@@ -97,6 +97,22 @@ def supervise(
     raise TaskDiedError(f"its process died {tries} times ({how})", details)
 
 
+def do_aside(function: Callable[..., Any], *args: Any) -> Any:
+    """Call a function in a child of the fork server, which has the libraries, where there is one.
+
+    Importing them here too would take more than a second and 200 MB. Without a server, and where
+    the child fails, it is called here, so that what it raises is raised from here.
+    """
+    if fork_server.server_pid() is not None:
+        with contextlib.suppress(TaskFailedError, OSError, EOFError, RuntimeError):
+            return supervise(function, *args, clean_up=_nothing)
+    return function(*args)
+
+
+def _nothing() -> None:
+    """Clean up after a task that leaves nothing."""
+
+
 class _Child:
     """A child process, and what goes to it and comes from it."""
 

@@ -13,8 +13,8 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.bandits.pull_log import PullLog
 from pipeline.files import replacing
+from pipeline.run_files import PULLS_FILE
 
-PULLS_FILE = "pulls.npz"
 LAST_PULLS = 100
 
 

@@ -9,6 +9,8 @@ from pathlib import Path
 from pipeline.file_digests import RECORD, STATE_FOLDER
 from pipeline.files import portable_name
 
+PULLS_FILE = "pulls.npz"
+
 
 def environment_name(env_id: str) -> str:
     """The environment's id as a file name: no module before it, and no slash in it."""

@@ -199,7 +199,8 @@ def report_study(tmp_path_factory):
     from experiments.run_in_child import do_run
     from experiments.study_plan import plan
     from experiments.study_results import read_results
-    from report.page import film_section, write_report
+    from report import films
+    from report.page import write_report
     from report.series.study_series import study_series
 
     study, root = small_study(), tmp_path_factory.mktemp("study")
@@ -211,7 +212,7 @@ def report_study(tmp_path_factory):
     analysis = analyse(dataclasses.replace(read_results(study, planned, root), failures=details))
     page = root / "report.html"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(film_section, "MAX_STEPS", 20)  # longer films take ten seconds to draw
+        patch.setattr(films, "MAX_STEPS", 20)  # longer films take ten seconds to draw
         write_report(study_series(analysis), page, "python compare.py 'a & b.yml'")
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mdp.array_types import Floats
-from pipeline.evaluation.sampled import Yardstick
 from pipeline.pictures.picture_files import fix_layout, write_png
 from pipeline.run_folder import Run
 from safe_files.regular_files import NO_LIMIT, read_file
@@ -18,6 +17,8 @@ from safe_files.regular_files import NO_LIMIT, read_file
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from pipeline.evaluation.sampled import Yardstick
 
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 BLUE = "#0072B2"

@@ -8,6 +8,8 @@ has it, not a text.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import deepcopy
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +45,8 @@ def _parse(content: str | bytes, where: str, loader: type[StrictLoader]) -> Any:
     if len(content) > _MAX_BYTES:
         raise UserError(f"{where}: is larger than {_MAX_BYTES:,} bytes")
     try:
-        return _load(content, loader)
+        loader_class: Any = loader  # mypy takes no class for hashable
+        return deepcopy(_load(content, loader_class))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark or error.context_mark
         place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
@@ -131,7 +134,8 @@ def _node_lines(
             yield from _node_lines(value, (*keys, index))
 
 
-def _load(content: str | bytes, loader_class: type[StrictLoader]) -> Any:
+@lru_cache(maxsize=32)  # a study asks for the same entries again and again
+def _load(content: str | bytes, loader_class: Any) -> Any:
     loader = loader_class(content)
     try:
         return loader.get_single_data()

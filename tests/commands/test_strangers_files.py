@@ -22,7 +22,7 @@ from pipeline.models.model_choice import model_of_run
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
-from report.training_films import episode_in_training
+from report.films import episode_in_training
 
 ENV = "SegmentBandit-v0"
 PLAY = ("--render", "none", "--n-episodes", "1")

@@ -11,13 +11,17 @@ from rich.console import Console
 
 from agents.bandits.batch import run_batch
 from experiments.analysis import analyse
-from experiments.bandit_batches import STATISTICS_FILE, read_run, stacked_statistics
-from experiments.bandit_results import run_regret
+from experiments.bandit_results import (
+    STATISTICS_FILE,
+    read_run,
+    run_regret,
+    stacked_statistics,
+)
 from experiments.pull_statistics import PullStatistics
 from experiments.study_files import read_study
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.pull_recording import PULLS_FILE
+from pipeline.run_files import PULLS_FILE
 from pipeline.run_folder import Run
 from pipeline.training import train
 from report.conclusions import conclusion

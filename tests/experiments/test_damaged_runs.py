@@ -15,7 +15,7 @@ from rich.console import Console
 import compare
 from commands.places import Place
 from commands.study_output import repair, run_study
-from experiments.bandit_batches import STATISTICS_FILE
+from experiments.bandit_results import STATISTICS_FILE
 from experiments.drafts import draft_path
 from experiments.launching import local_launcher
 from experiments.repair import move_damaged_aside
@@ -25,7 +25,7 @@ from experiments.study_plan import plan
 from experiments.study_results import read_results, read_run
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.file_digests import DamagedFileError
-from pipeline.pull_recording import PULLS_FILE
+from pipeline.run_files import PULLS_FILE
 
 STEPS = {"n_timesteps": 60}
 WAREHOUSE = EnvironmentSpec("grid", "Warehouse-v0", STEPS)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import envs  # noqa: F401  # registers the bandits
-from experiments.bandit_batches import true_means
+from experiments.bandit_results import true_means
 from experiments.pull_statistics import MAX_POINTS, PullStatistics, points_of, pull_statistics
 
 # Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.

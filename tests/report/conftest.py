@@ -13,7 +13,7 @@ from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalys
 from experiments.run_curves import CURVE_COLUMNS
 from experiments.study_results import RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from report.page import film_section
+from report import films
 from verdicts import Estimate, PairComparison, Summary, ThresholdSummary
 
 
@@ -95,7 +95,7 @@ def made_up():
 @pytest.fixture(autouse=True)
 def short_films(monkeypatch):
     """As long as those of the study that many tests share."""
-    monkeypatch.setattr(film_section, "MAX_STEPS", 20)
+    monkeypatch.setattr(films, "MAX_STEPS", 20)
 
 
 @pytest.fixture

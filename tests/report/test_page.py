@@ -16,6 +16,7 @@ from plotly.offline import get_plotlyjs
 from experiments.looks import Look, LookLog, Looks, Question
 from report.conclusions import conclusion
 from report.figures.figure_style import line_style
+from report.films import MAX_BYTES, MAX_SIDE, film_of
 from report.page import (
     film_section,
     overview_section,
@@ -25,7 +26,6 @@ from report.page import (
 )
 from report.page.assembly import SECTIONS
 from report.page.comparison_section import improvement_matrix
-from report.page.film_section import MAX_BYTES, MAX_SIDE, film_of
 from report.page.markup import breakable, inline_script, p_value, packed, plain, setting
 from report.page.sections import Report
 from report.series.agent_marks import COLOURS, agent_marks

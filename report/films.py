@@ -1,0 +1,202 @@
+"""Films of agents: an episode of each run's final agent, and of training as it explored.
+
+They take the libraries, which a study's own process does without: it has `films_of` done aside.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from experiments.planned_runs import PlannedRun
+from experiments.study_spec import file_name
+from pipeline.environments import MISTAKES
+from pipeline.errors import UserError, one_line
+from pipeline.files import replacing, write_json
+from pipeline.signs_of_life import Tell, tell_nobody
+from safe_files.regular_files import read_file
+
+if TYPE_CHECKING:
+    from experiments.study_results import StudyResults
+    from pipeline.models.model_choice import ChosenModel
+
+MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
+TRAINING_STEPS = 500  # fifty seconds
+COLOURS = 128
+MAX_SIDE = 320  # pixels of a picture's longer side
+MAX_BYTES = 300_000  # of a film
+MAX_FIGURE = 1e300  # in the caption
+
+
+def films_of(runs: Sequence[PlannedRun]) -> list[Path | None]:
+    """The film of each run, see `film_of`; those that are not there yet are made."""
+    return [film_of(run) for run in runs]
+
+
+def film_of(planned: PlannedRun) -> Path | None:
+    """The film of a run's final agent, kept in the run folder for the next page.
+
+    Returns:
+        A GIF, which has how the episode went beside it in a JSON file; None where the environment
+        cannot be drawn.
+    """
+    path = planned.path / "episode.gif"
+    if not is_kept(path):
+        from pipeline.filming import as_gif
+
+        try:
+            frames, episode = _play(planned)
+        except (UserError, *MISTAKES):
+            return None
+        film = as_gif(frames)
+        kept = min(len(frames), max(len(frames) * MAX_BYTES // len(film), 1))
+        if kept < len(frames):
+            film = as_gif(frames[:kept])
+        with replacing(path) as file:
+            file.write(film)
+        write_json(path.with_suffix(".json"), {**episode, "frames": kept})
+    return path
+
+
+def is_kept(path: Path) -> bool:
+    """Whether a film and how it went lie there, as this module leaves them."""
+    try:
+        episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
+        # Films are no part of the run, so that it has no digest of them.
+        with Image.open(io.BytesIO(read_file(path, 2 * MAX_BYTES)), formats=["GIF"]) as picture:
+            is_small = max(picture.size) <= MAX_SIDE
+            picture.load()
+        numbers = [episode["frames"], episode["return"] or 0.0, episode["steps"] or 0]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError, SyntaxError):
+        return False
+    return is_small and all(
+        isinstance(one, int | float) and abs(one) < MAX_FIGURE for one in numbers
+    )
+
+
+def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
+    """The frames of an episode, and how it went."""
+    import torch as th
+
+    from pipeline.evaluation.sampled import evaluation_seed
+    from pipeline.filming import film_episode
+    from pipeline.models.model_choice import model_of_run
+    from pipeline.models.model_loading import load_model
+    from pipeline.playing import playing_env
+
+    # Pictures alone: no display is needed, nor looked for.
+    os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
+    spec = planned.spec
+    th.set_num_threads(spec.num_threads)
+    chosen = model_of_run(planned.run.model_path, spec, planned.run)
+    env = playing_env(chosen, "rgb_array")
+    try:
+        model = load_model(spec.algo, chosen.file, env, spec.user_modules)
+        env.seed(evaluation_seed(planned.seed, 3))
+        frames, ended = film_episode(model, env, MAX_STEPS, deterministic=True)
+    finally:
+        env.close()
+    total_return, length = ended or (None, None)
+    return _shrunk(frames), {"return": total_return, "steps": length}
+
+
+def _shrunk(frames: list[Any]) -> list[Any]:
+    """The frames, small and in few colours that they share.
+
+    What does not move then looks the same in all of them, and takes no room in the film.
+    """
+    factor = -(-max(frames[0].shape[:2]) // MAX_SIDE)
+    pictures = [Image.fromarray(frame).reduce(factor) for frame in frames]
+    samples = [pictures[0], pictures[len(pictures) // 2], pictures[-1]]
+    palette = Image.fromarray(np.hstack([np.asarray(p) for p in samples])).quantize(COLOURS)
+    few = (p.quantize(palette=palette, dither=Image.Dither.NONE) for p in pictures)
+    return [np.asarray(picture.convert("RGB")) for picture in few]
+
+
+def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[Path], list[str]]:
+    """Film an episode at each checkpoint of the first run of every agent, into ``films``.
+
+    The agent acts as it did in training, exploration included. A film that is younger than its
+    checkpoint is left as it is.
+
+    Returns:
+        The files, and for runs that cannot be filmed the reason.
+    """
+    paths: list[Path] = []
+    refused: list[str] = []
+    for planned in results.finished:
+        is_asked_for = planned.spec.save_every_n_episodes > 0 and not planned.is_batch
+        if is_asked_for:
+            tell(f"{planned.agent} on {planned.environment}")
+            try:
+                paths += _films_of(planned, results.root / "films")
+            except (UserError, *MISTAKES) as error:
+                refused.append(f"{planned.agent} on {planned.environment}: {one_line(error)}")
+    return paths, refused
+
+
+def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
+    name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"
+    from pipeline.evaluation.sampled import evaluation_seed
+    from pipeline.filming import write_film
+    from pipeline.models.model_choice import model_of_run
+
+    for checkpoint, episode in _checkpoints(planned):
+        path = folder / f"{name}_{episode}.gif"
+        if not (path.exists() and path.stat().st_mtime >= checkpoint.stat().st_mtime):
+            chosen = model_of_run(checkpoint, planned.spec, planned.run)
+            frames = episode_in_training(chosen, evaluation_seed(planned.seed, 4), TRAINING_STEPS)
+            folder.mkdir(exist_ok=True)
+            write_film(path, frames)
+        yield path
+
+
+def _checkpoints(planned: PlannedRun) -> Iterator[tuple[Path, int]]:
+    """The checkpoints that were due, each with the number of the episode it followed."""
+    from experiments.run_figures import read_episodes
+
+    every = planned.spec.save_every_n_episodes
+    ends = read_episodes(planned.run).steps
+    for path in planned.run.checkpoints():
+        n_steps = int(path.name.split("_")[2])
+        n_episodes = int((ends <= n_steps).sum())
+        if n_episodes >= every and n_steps in ends:
+            yield path, n_episodes // every * every
+
+
+def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[Any]:
+    """The frames of an episode, in which the agent samples or explores as it did in training.
+
+    Args:
+        chosen: the model.
+        seed: of the episode.
+        max_steps: after how many steps to stop, where it has not ended before.
+
+    Returns:
+        Pictures, uint8 of shape (height, width, 3).
+
+    Raises:
+        UserError: if the model cannot be loaded or its environment cannot be drawn.
+    """
+    import torch as th
+
+    from pipeline.filming import film_episode
+    from pipeline.models.model_loading import load_model
+    from pipeline.playing import playing_env
+
+    th.set_num_threads(chosen.spec.num_threads)
+    env = playing_env(chosen, "rgb_array")
+    try:
+        model = load_model(chosen.spec.algo, chosen.file, env, chosen.spec.user_modules)
+        model.set_random_seed(seed)
+        frames, _ = film_episode(model, env, max_steps, deterministic=False)
+    finally:
+        env.close()
+    return frames
