@@ -174,9 +174,13 @@ def test_what_is_about_to_be_trained(entry, budget):
 @pytest.fixture
 def lists(monkeypatch):
     """The lines of both lists, on a wide terminal."""
+    return listed(monkeypatch, 600)
+
+
+def listed(monkeypatch, width):
     file = io.StringIO()
     monkeypatch.setattr(
-        listing, "TextConsole", lambda **more: Console(file=file, width=300, **more)
+        listing, "table_console", lambda **more: Console(file=file, width=width, **more)
     )
     listing.print_lists()
     return [line.rstrip() for line in file.getvalue().splitlines()]
@@ -194,8 +198,10 @@ def test_every_agent_has_a_line(lists):
 
 
 def test_an_environment_names_the_agents_that_are_tuned_for_it_and_those_that_fit(lists):
-    (line,) = (line for line in lists if line.startswith("Warehouse-v0 "))
-    tuned, fitting = line.removeprefix("Warehouse-v0").strip().split("   ", 1)
+    (place,) = (n for n, line in enumerate(lists) if line.startswith("Warehouse-v0 "))
+    tuned = lists[place].removeprefix("Warehouse-v0")
+    also, fitting = lists[place + 1].split(maxsplit=1)
+    assert also == "also:"
     assert {"qlearning", "sarsa", "ppo"} <= set(tuned.split())
     assert not set(tuned.split()) & set(fitting.split())
     assert set(tuned.split()) | set(fitting.split()) <= set(ALGORITHMS)
@@ -272,13 +278,21 @@ def test_redirected_no_sentence_is_broken(is_terminal):
     assert (file.getvalue() == "a line of more than twenty letters\n") is not is_terminal
 
 
-def test_the_lists_have_a_line_for_each_row_where_they_are_redirected(monkeypatch):
-    file = io.StringIO()
-    monkeypatch.setattr(
-        listing, "TextConsole", lambda **more: TextConsole(file=file, width=80, _environ={}, **more)
-    )
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_the_lists_fit_the_terminal_and_keep_every_name(width, monkeypatch):
+    lines, widest = listed(monkeypatch, width), listed(monkeypatch, 2000)
+    n_tables = lines.index("", len(ALGORITHMS) + 2)  # a sentence comes after them
+    assert max(map(len, lines[:n_tables])) <= width
+    assert sorted(" ".join(lines).split()) == sorted(" ".join(widest).split())
+
+
+@pytest.mark.parametrize(("columns", "width"), [(None, 80), ("132", 132)])
+def test_redirected_tables_have_80_columns(columns, width, monkeypatch, capsys):
+    if columns:
+        monkeypatch.setenv("COLUMNS", columns)
+    else:
+        monkeypatch.delenv("COLUMNS", raising=False)
     listing.print_lists()
-    lines = file.getvalue().splitlines()
-    (lake,) = [line for line in lines if line.startswith("FrozenLake-v1 ")]
-    assert " qlearning " in lake
-    assert max(map(len, lines)) > 120
+    lines = capsys.readouterr().out.splitlines()
+    # The last is a sentence, and on one line.
+    assert width - 15 < max(map(len, lines[:-1])) <= width

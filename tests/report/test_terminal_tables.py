@@ -333,3 +333,21 @@ def test_blocks_of_episodes_agents_side_by_side():
         ["episode", "first"],
         ["1,000", "4  3  8"],
     ]
+
+
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_agents_for_whom_there_is_no_room_beside_the_others_come_below(width):
+    names = ["qlearning", "expected_sarsa", "dqn, engine: auto", "a name of more than 20 letters"]
+    returns = {"average": -27_427.5, "minimum": -30_000.25, "maximum": -200.25}
+    rows = [
+        {"environment": "lake", "agent": name, "episode": 100, **returns, "maximum": place}
+        for place, name in enumerate(names)
+    ]
+    _, lines = lines_of(
+        lambda console: print_episodes_table(console, pd.DataFrame(rows), 100), width
+    )
+    assert max(map(len, lines)) <= width
+    found = [row for row in cells(lines) if row[0] != "episode"]
+    ends = [int(cell.split()[-1]) for row in found for cell in row[1:]]
+    assert ends == [*range(len(names))]
+    assert all(cell.startswith("-27,428  -30,000  ") for row in found for cell in row[1:])
