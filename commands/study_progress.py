@@ -11,9 +11,10 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from commands.live_progress import LiveProgress, duration
+from commands.live_progress import LiveProgress
 from experiments.launching import RunFailure
 from experiments.planned_runs import PlannedRun
+from pipeline.signs_of_life import duration
 
 
 class StudyProgress(LiveProgress):

@@ -124,7 +124,7 @@ def test_pulls_in_words(pulls, words):
 
 def test_a_run_with_nothing_to_tell():
     assert printed(outcome_of(), spec_of()) == [
-        "trained  12,345 steps in 2.0 s (6,172 steps/s)",
+        "trained  12,345 steps in 1.5 s of processor time (8,230 steps/s)",
         "files    logs/qlearning/Lake-v1_3",
         "watch    python enjoy.py --algo qlearning --env Lake-v1",
     ]
@@ -144,12 +144,12 @@ def test_a_run_with_everything():
         n_steps=1000,
     )
     assert printed(outcome, spec_of("else where")) == [
-        "interrupted  1,000 steps in 0.0 s (1,000,000,000,000 steps/s)",
+        "interrupted  1,000 steps in 0.0 s of processor time (1,000,000,000,000 steps/s)",
         "engine       compiled",
         "regret       not known: none of 1,500 pulls is in the log",
         "final        return 2.00 ± 1.00 over 2 episodes",
         "best         return 3.25 over 5 episodes, first at step 10,000",
-        "judged       by 700 steps (70% of training's) in 0.5 s of processor time",
+        "tests        700 steps beside training (70% of it); 0.5 s of processor time",
         "files        logs/qlearning/Lake-v1_3",
         "watch        python enjoy.py --algo qlearning --env Lake-v1 -f 'else where'",
     ]
@@ -166,6 +166,41 @@ def test_what_is_about_to_be_trained(entry, budget):
     assert console.file.getvalue() == (
         f"qlearning on Lake-v1, seed 7, {budget}\ngamma=0.9  {key}={value}\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("algo", "settings", "lines"),
+    [
+        ("qlearning", {"policy": "QTablePolicy"}, ["n_timesteps=9"]),
+        ("dqn", {"policy": "MlpPolicy"}, ["policy=MlpPolicy  n_timesteps=9"]),
+        (
+            "qlearning",
+            {"learning_rate": "exp_0.3_0.05"},
+            [
+                "n_timesteps=9",
+                "learning_rate=exp_0.3_0.05 (falls exponentially from 0.3 to 0.05)",
+            ],
+        ),
+        (
+            "ppo",
+            {"clip_range": "lin_0.2", "ent_coef": "lin_0.01_0.02"},
+            [
+                "n_timesteps=9",
+                "clip_range=lin_0.2 (falls linearly from 0.2 to 0)",
+                "ent_coef=lin_0.01_0.02 (rises linearly from 0.01 to 0.02)",
+            ],
+        ),
+        (
+            "qlearning",
+            {"train_env_kwargs": {"slip": 0.1}},
+            ["n_timesteps=9", "train_env_kwargs={'slip': 0.1} (in training alone)"],
+        ),
+    ],
+)
+def test_settings_that_newcomers_cannot_read_are_explained(algo, settings, lines):
+    console = console_of()
+    print_header(console, replace(spec_of(**settings, n_timesteps=9), algo=algo))
+    assert console.file.getvalue().splitlines()[1:] == lines
 
 
 # --- lists ----------------------------------------------------------------------------------------

@@ -225,7 +225,9 @@ def test_an_assignment_in_another_spelling_gets_ours(words: str, meant: str) -> 
 
 
 def test_spaces_in_what_was_meant_are_quoted() -> None:
-    with pytest.raises(UserError, match=r"did you mean 'policy_kwargs:dict\(net_arch=\[64, 64\]\)'"):
+    with pytest.raises(
+        UserError, match=r"did you mean 'policy_kwargs:dict\(net_arch=\[64, 64\]\)'"
+    ):
         parse_assignments(["policy_kwargs=dict(net_arch=[64, 64])"])
 
 

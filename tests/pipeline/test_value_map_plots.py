@@ -187,15 +187,15 @@ def test_rows_and_columns_count_from_one_as_pages_and_advice_do(desc, monkeypatc
     draw_value_map(tmp_path / "map.png", "title", found)
     panel = figures[0].axes[0]
     goal = len(desc) * len(desc[0]) - 1
-    texts = [
-        {round(place): label.get_text() for place, label in zip(axis.get_ticklocs(), labels)}
-        for axis, labels in (
-            (panel.yaxis, panel.get_yticklabels()),
-            (panel.xaxis, panel.get_xticklabels()),
+    shown = [
+        dict(zip(axis.get_ticklocs().tolist(), texts, strict=True))
+        for axis, texts in (
+            (panel.yaxis, [text.get_text() for text in panel.get_yticklabels()]),
+            (panel.xaxis, [text.get_text() for text in panel.get_xticklabels()]),
         )
     ]
     row, column = divmod(goal, len(desc[0]))
-    expected = f"row {texts[0][row]}, column {texts[1][column]}"
+    expected = f"row {shown[0][row]}, column {shown[1][column]}"
     assert found.layout.place_name(goal) == expected == f"row 2, column {len(desc[0])}"
 
 
