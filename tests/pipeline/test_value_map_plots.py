@@ -164,7 +164,7 @@ def test_whole_values_need_no_decimals():
 
 
 def test_of_a_maze_the_layers_are_drawn_that_somebody_comes_to():
-    # Always up: the agent stays on the start, and the best way collects the power in row 2, column 4.
+    # Always up: the agent stays on the start, and the best way collects power.
     found = map_of("MineMaze-v0")
     assert shown_layers(found) == [0, 1]
     names = [layer_name(found.layout, layer) for layer in (0, 1, 5)]
