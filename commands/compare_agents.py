@@ -215,7 +215,7 @@ def _do_study(
     from experiments.looks_file import read_looks
 
     read_looks(root)
-    _prepare(args, study, planned, root, console, place)
+    place = _prepare(args, study, planned, root, console, place)
     from commands.study_output import run_study
 
     page = not args.no_report
@@ -236,7 +236,7 @@ def _grow_study(
     looks = settled_looks(study, root, args.max_seeds)
     counts = counts_of(study, looks)
     planned = plan(grown(study, counts), root, counts)
-    _prepare(args, grown(study, counts), planned, root, console, place)
+    place = _prepare(args, grown(study, counts), planned, root, console, place)
     settle(root, looks)
     from commands.growing_output import grow_study
 
@@ -253,8 +253,12 @@ def _prepare(
     root: Path,
     console: Console,
     place: Place,
-) -> None:
-    """Make sure that the runs can be done, before any is; and load the libraries for them."""
+) -> Place:
+    """Make sure that the runs can be done, before any is; and load the libraries for them.
+
+    Returns:
+        The place, with what is expected of the runs.
+    """
     if args.repair:
         from commands.study_output import repair
 
@@ -271,25 +275,33 @@ def _prepare(
         activity.now("loading the libraries")
         first = [run for run in planned if run.seed == study.first_seed]
         do_aside(check_settings, study, first)
-        line = _engines(planned)
+        line, expected = _engines(planned)
     if line:
         console.print(f"engines: {line}", highlight=False, soft_wrap=True)
+    return replace(place, expected=expected)
 
 
-def _engines(planned: Sequence[PlannedRun]) -> str:
-    """On which engines the missing runs of networks will train, and what that takes."""
+def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], float]]:
+    """On which engines the missing runs of networks will train, and what each run takes."""
     from pipeline.plain_runs import NETWORKS
 
     missing: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in planned:
         if run.spec.algo in NETWORKS and run.is_to_do:
             missing.setdefault((run.agent, run.environment), []).append(run)
-    if not missing:
-        return ""
-    from commands.engine_lines import study_line
+    if not missing:  # without the libraries
+        return "", {}
+    from agents.networks.engine_costs import machine_pace
+    from commands.engine_lines import seconds_of, study_line
+    from experiments.time_left import expected_seconds
     from pipeline.engine_outlook import planned_outlook
 
-    outlooks = [
-        (runs[0].agent, planned_outlook(runs[0].spec), len(runs)) for runs in missing.values()
-    ]
-    return study_line([(label, each, n) for label, each, n in outlooks if each is not None])
+    found = {key: planned_outlook(runs[0].spec) for key, runs in missing.items()}
+    outlooks = {key: each for key, each in found.items() if each is not None}
+    pace = machine_pace() if outlooks else 1.0
+    expected = {
+        key: expected_seconds(missing[key][0].spec, pace * seconds_of(each.plan, each))
+        for key, each in outlooks.items()
+    }
+    lines = [(key[0], each, len(missing[key])) for key, each in outlooks.items()]
+    return study_line(lines), expected

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from agents import ALGORITHMS, fitting_algorithms
 from agents.algorithm_entries import is_bandit
-from commands.terminal import TextConsole, print_rows
+from commands.terminal import table_console
 from envs.action_masks import has_masks
 from pipeline.environments import make_env
 from pipeline.settings.hyperparam_entries import entry_names
@@ -16,7 +16,7 @@ from pipeline.settings.hyperparam_entries import entry_names
 
 def print_lists() -> None:
     """Print the table of agents and that of environments."""
-    console = TextConsole(highlight=False)
+    console = table_console(highlight=False)
     _print_agents(console)
     console.print()
     _print_environments(console)
@@ -29,7 +29,7 @@ def _print_agents(console: Console) -> None:
     for name, entry in ALGORITHMS.items():
         missing = "" if entry.is_installed else f"  needs: {entry.install_command}"
         table.add_row(name, entry.summary + missing)
-    print_rows(console, table)
+    console.print(table)
 
 
 def _print_environments(console: Console) -> None:
@@ -37,8 +37,7 @@ def _print_environments(console: Console) -> None:
     tuned = {name: set(entry_names(name)) for name in ALGORITHMS}
     table = Table(box=None, padding=(0, 2, 0, 0))
     table.add_column("environment (--env)", style="bold", no_wrap=True)
-    table.add_column("agents with hyperparameters for it")
-    table.add_column("also fit, with default ones")
+    table.add_column("agents with hyperparameters for it; also: those that take the default ones")
     for env_id in sorted(set().union(*tuned.values()) & set(gym.registry)):
         env = make_env(env_id, {})
         with_entry = [name for name in ALGORITHMS if env_id in tuned[name]]
@@ -47,8 +46,9 @@ def _print_environments(console: Console) -> None:
         )
         others = [name for name in fitting if name not in with_entry]
         env.close()
-        table.add_row(env_id, " ".join(with_entry), " ".join(others))
-    print_rows(console, table)
+        also = "\nalso: " + " ".join(others) if others else ""
+        table.add_row(env_id, " ".join(with_entry) + also)
+    console.print(table)
     console.print(
         "\nAny other environment registered with Gymnasium works where the spaces fit; "
         "--gym-packages imports modules that register more, and agents of your own."

@@ -101,12 +101,3 @@ class LiveProgress(ABC):
         """Print a line that stays."""
         self.silence.end()
         self.console.print(line, highlight=False, soft_wrap=True)
-
-
-def duration(seconds: float) -> str:
-    """A time in hours, minutes and seconds, as far as they matter."""
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    if hours:
-        return f"{hours} h {minutes} min"
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"

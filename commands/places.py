@@ -7,8 +7,8 @@ import argparse
 import contextlib
 import importlib.util
 import signal
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -33,12 +33,14 @@ class Place:
         get_ready: called with the runs that are planned, before it is opened: what they compile is
             compiled once.
         n_workers: how many processes may work on this machine at once.
+        expected: seconds of a run by agent and environment, where something is known of them.
     """
 
     launchers: Launchers
     words: str
     get_ready: Callable[[Sequence[PlannedRun]], None]
     n_workers: int = 1
+    expected: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
 
 def add_place_flags(group: argparse._ArgumentGroup) -> None:

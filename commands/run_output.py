@@ -11,11 +11,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from agents import ALGORITHMS
 from commands.parsing import called_as
 from commands.terminal import print_rows
 from pipeline.errors import UserError
 from pipeline.module_records import as_flag
 from pipeline.run_folder import FINISHED, Run, numbered_runs
+from pipeline.settings.coercion import parse_schedule
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
     from pipeline.training import Outcome
 
 _LONGEST_SETTING = 200
+_NOTES = {"train_env_kwargs": "in training alone", "train_env_wrapper": "in training alone"}
 
 
 def describe(evaluation: Evaluation) -> str:
@@ -91,11 +94,38 @@ def print_header(console: Console, spec: TrainSpec) -> None:
         Text.assemble(agent, " on ", environment, f", seed {spec.seed}, {budget:,} {unit}")
     )
     origins = spec.origins or {}
-    settings = "  ".join(
-        f"{key}={_brief(value)}{f' ({origins[key]})' if key in origins else ''}"
+    settings = {
+        key: f"{key}={_brief(value)}"
         for key, value in spec.saved_hyperparams.items()
-    )
-    console.print(settings, style="dim", highlight=False)
+        if key != "policy" or _is_choice(spec.algo, str(value))
+    }
+    explained = {
+        key: "; ".join(filter(None, (_NOTES.get(key), _schedule_in_words(value), origins.get(key))))
+        for key, value in spec.saved_hyperparams.items()
+    }
+    plain = [text for key, text in settings.items() if not explained[key]]
+    lines = [f"{text} ({explained[key]})" for key, text in settings.items() if explained[key]]
+    for line in ["  ".join(plain), *lines] if plain else lines:
+        console.print(line, style="dim", highlight=False)
+
+
+def _is_choice(algo: str, policy: str) -> bool:
+    """Whether an agent has other policies too: tables and bandits of this project have one each."""
+    is_ours = algo in ALGORITHMS and ALGORITHMS[algo].entry_point.startswith("agents.")
+    return not is_ours or policy.startswith(("Mlp", "Cnn", "MultiInput"))
+
+
+def _schedule_in_words(value: object) -> str:
+    """What ``exp_0.3_0.05`` means; empty for what is no schedule."""
+    if not isinstance(value, str):
+        return ""
+    try:
+        found = parse_schedule(value, "")
+    except UserError:
+        return ""
+    moves = "falls" if found.end < found.start else "rises"
+    how = "linearly" if found.kind == "linear" else "exponentially"
+    return f"{moves} {how} from {found.start:g} to {found.end:g}"
 
 
 def print_engine(console: Console, training: Training) -> None:
@@ -129,11 +159,11 @@ def print_result(console: Console, training: Training, outcome: Outcome) -> None
 
 def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
     """Say what came out and where the files lie."""
-    speed = outcome.n_steps / max(outcome.taken.seconds, 1e-9)
+    taken = outcome.taken.cpu_seconds
+    speed = outcome.n_steps / max(taken, 1e-9)
     done = "trained" if outcome.state == FINISHED else "interrupted"
-    rows = [
-        (done, f"{outcome.n_steps:,} steps in {outcome.taken.seconds:.1f} s ({speed:,.0f} steps/s)")
-    ]
+    text = f"{outcome.n_steps:,} steps in {taken:.1f} s of processor time ({speed:,.0f} steps/s)"
+    rows = [(done, text)]
     if outcome.engine:
         rows.append(("engine", outcome.engine))
     if outcome.pulls is not None:
@@ -145,7 +175,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
         best = f"return {outcome.best_return:.2f}{over}, first at step {outcome.best_timesteps:,}"
         rows.append(("best", best))
     if outcome.final is not None:
-        rows.append(("judged", _describe_evaluations(outcome)))
+        rows.append(("tests", _describe_evaluations(outcome)))
     rows.append(("files", str(outcome.run.path)))
     table = Table.grid(padding=(0, 2))
     for row in rows:
@@ -173,11 +203,11 @@ def _print_advice(console: Console, training: Training, final: Evaluation, n_ste
 
 def _describe_evaluations(outcome: Outcome) -> str:
     """What all evaluations have taken."""
-    taken = f"in {outcome.evaluating.cpu_seconds:.1f} s of processor time"
+    taken = f"{outcome.evaluating.cpu_seconds:.1f} s of processor time"
     if not outcome.evaluation_steps:
-        return f"exactly, {taken}"
+        return f"exact, without playing; {taken}"
     share = outcome.evaluation_steps / max(outcome.n_steps, 1)
-    return f"by {outcome.evaluation_steps:,} steps ({share:.0%} of training's) {taken}"
+    return f"{outcome.evaluation_steps:,} steps beside training ({share:.0%} of it); {taken}"
 
 
 @contextmanager

@@ -192,7 +192,8 @@ def do_missing(
         f"{len(planned)} runs, {len(done)} of them there already; {place.words}, in {root}",
         highlight=False,
     )
-    with StudyProgress(console, planned, done) as progress:
+    begun = [*done, *missing]
+    with StudyProgress(console, begun, done, place.expected) as progress:
         for run in done:
             progress.note_refusal(run)
 

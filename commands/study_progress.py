@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from commands.live_progress import LiveProgress, duration
+from commands.live_progress import LiveProgress
 from experiments.launching import RunFailure
 from experiments.planned_runs import PlannedRun
+from experiments.time_left import TimeLeft
+from pipeline.signs_of_life import duration
 
 
 class StudyProgress(LiveProgress):
@@ -23,12 +25,19 @@ class StudyProgress(LiveProgress):
         console: where to.
         runs: all runs of the study.
         done: those of them that had been done before.
+        expected: seconds of a run, by agent and environment, where something is known of them.
     """
 
     def __init__(
-        self, console: Console, runs: Sequence[PlannedRun], done: Sequence[PlannedRun]
+        self,
+        console: Console,
+        runs: Sequence[PlannedRun],
+        done: Sequence[PlannedRun],
+        expected: Mapping[tuple[str, str], float] | None = None,
     ) -> None:
         super().__init__(console)
+        there = {run.path for run in done}
+        self.left = TimeLeft([run for run in runs if run.path not in there], expected or {})
         self.total = Counter((run.agent, run.environment) for run in runs)
         self.done = Counter((run.agent, run.environment) for run in done)
         self.failed: Counter[tuple[str, str]] = Counter()
@@ -39,6 +48,10 @@ class StudyProgress(LiveProgress):
     def note(self, run: PlannedRun, failure: RunFailure | None) -> None:
         """Count a run that has ended now."""
         self.n_ended += 1
+        now = time.monotonic()
+        self.left.start(self.started if self.n_ended == 1 else now, self.n_workers)
+        self.left.end(run, now)
+        self.left.start(now, self.n_workers)
         key = (run.agent, run.environment)
         if failure is None:
             self.done[key] += 1
@@ -50,6 +63,16 @@ class StudyProgress(LiveProgress):
             self.say(self.figures())
         else:
             self.look()
+
+    def look(self) -> None:
+        """Show how far it is; from the first look on, runs are under way."""
+        self.left.start(time.monotonic(), self.n_workers)
+        super().look()
+
+    @property
+    def n_workers(self) -> int:
+        """How many runs are done at once."""
+        return 1 if self._launcher is None else self._launcher.n_workers
 
     def note_refusal(self, run: PlannedRun) -> None:
         """Say once for each environment why its own model is not used, where that is so."""
@@ -68,8 +91,8 @@ class StudyProgress(LiveProgress):
         seconds = time.monotonic() - self.started
         text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
         if 0 < self.n_ended < self.n_missing:
-            left = seconds / self.n_ended * (self.n_missing - self.n_ended)
-            text += f", about {duration(left)} left"
+            left = self.left.seconds(time.monotonic(), self.n_workers)
+            text += f", about {duration(left)} left by the clock"
         text += self.place_words
         n_failed = self.failed.total()
         return f"{text}, {n_failed} failed" if n_failed else text

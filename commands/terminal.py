@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from io import StringIO
+from shutil import get_terminal_size
 from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
@@ -13,7 +14,6 @@ from rich.text import Text
 
 from pipeline.errors import visible
 
-WIDTH_WITHOUT_TERMINAL = 120
 UNBOUNDED = 10_000  # columns
 
 
@@ -54,11 +54,11 @@ class TextConsole(Console):
 
 
 def table_console(*, highlight: bool = True) -> Console:
-    """A console that is wide enough for tables where no terminal says how wide it is."""
+    """A console as wide as the terminal; of 80 columns, or `COLUMNS`, in a file or a pipe."""
     console = TextConsole(highlight=highlight)
     if console.is_terminal:
         return console
-    return TextConsole(highlight=highlight, width=WIDTH_WITHOUT_TERMINAL)
+    return TextConsole(highlight=highlight, width=get_terminal_size().columns)
 
 
 def print_rows(console: Console, table: Table) -> None:

@@ -11,9 +11,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from commands.live_progress import duration
 from commands.study_output import say
 from pipeline.plain_runs import NETWORKS
+from pipeline.signs_of_life import duration
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome, Retested
 from tuning.trial_queue import FAILURE, figures_of, seconds_of
@@ -61,7 +61,7 @@ def print_search(console: Console, place: OpenTuning) -> None:
     say(
         console,
         f"{len(trials)} trials: {counts}; {n_runs} of {len(trials) * len(tuning.seeds)} runs, "
-        f"{duration(seconds)} of training",
+        f"{duration(seconds)} of processor time",
     )
 
 

@@ -7,7 +7,8 @@ from collections.abc import Callable
 
 from rich.console import Console
 
-from commands.live_progress import LiveProgress, duration
+from commands.live_progress import LiveProgress
+from pipeline.signs_of_life import duration
 
 # To read all trials takes time, where there are many.
 SECONDS_BETWEEN_QUESTIONS = 5.0

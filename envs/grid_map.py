@@ -56,7 +56,7 @@ class GridMap:
         Raises:
             ValueError: if the file cannot be read, rows differ in length, a letter is unknown,
                 there is not exactly one start or no goal, or no way between them. Where there
-                is a place to name, the message names row and column, counted from zero.
+                is a place to name, the message names row and column, counted from one.
         """
         rows, source = _read_rows(desc)
         _check_shape(rows, source)
@@ -169,21 +169,21 @@ def _check_shape(rows: tuple[str, ...], source: str) -> None:
         raise ValueError(
             f"{source} has {len(rows)} rows of {n_columns} cells, more than {MAX_STATES:,} cells"
         )
-    for row, cells in enumerate(rows):
+    for row, cells in enumerate(rows, 1):
         if len(cells) != n_columns:
             where = min(len(cells), n_columns)
             raise ValueError(
-                f"{source}: row {row} has {len(cells)} cells and row 0 has {n_columns}: they "
-                f"differ from column {where} on"
+                f"{source}: row {row} has {len(cells)} cells and row 1 has {n_columns}: they "
+                f"differ from column {where + 1} on"
             )
 
 
 def _check_letters(rows: tuple[str, ...], source: str, known: Collection[str]) -> None:
-    for row, cells in enumerate(rows):
+    for row, cells in enumerate(rows, 1):
         if not set(cells) <= set(known):
             column = next(column for column, letter in enumerate(cells) if letter not in known)
             raise ValueError(
-                f"{source}: unknown letter {cells[column]!r} at row {row}, column {column}; "
+                f"{source}: unknown letter {cells[column]!r} at row {row}, column {column + 1}; "
                 f"known are {' '.join(known)}"
             )
 
@@ -203,4 +203,4 @@ def _only_start(codes: bytes, n_columns: int, source: str) -> int:
 
 def _place(cell: int, n_columns: int) -> str:
     row, column = divmod(cell, n_columns)
-    return f"row {row}, column {column}"
+    return f"row {row + 1}, column {column + 1}"

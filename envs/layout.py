@@ -93,6 +93,11 @@ class GridLayout:
             for row, letters in enumerate(self.rows)
         )
 
+    def place_name(self, cell: int) -> str:
+        """The name of a cell, rows and columns counted from 1 as on all pages and pictures."""
+        row, column = divmod(cell, self.n_columns)
+        return f"row {row + 1}, column {column + 1}"
+
     def collected_in(self, layer: int) -> tuple[int, ...]:
         """The cells of the prizes that are collected in a layer."""
         return tuple(cell for bit, cell in enumerate(self.prizes) if layer >> bit & 1)

@@ -56,7 +56,7 @@ class AgentAnalysis:
         steps_to_stay: when it reached the threshold for good; likewise.
         episodes_to_stay: likewise.
         success_rate: of the final policy; None where the environment does not say.
-        seconds: time that training took.
+        seconds: processor time that training took; nan where older versions did not measure it.
         on_variant: whether it was trained on a variant of the environment, whose returns are not to
             be held against those of evaluations or the optimum.
     """
@@ -271,7 +271,7 @@ def _analyse_agent(
         steps_to_stay=summarise_steps(values("steps_to_stay")) if has_threshold else None,
         episodes_to_stay=summarise_steps(values("episodes_to_stay")) if has_threshold else None,
         success_rate=mean("success_rate") if table["success_rate"].notna().any() else None,
-        seconds=mean("seconds"),
+        seconds=mean("cpu_seconds"),
         on_variant=any(
             trains_on_variant(run.spec)
             for run in results.planned

@@ -21,6 +21,11 @@ def check_algorithm(algo: str) -> None:
         UserError: otherwise.
     """
     entry = ALGORITHMS.get(algo)
+    if entry is None and algo.lower() == "her":
+        raise UserError(
+            "hindsight experience replay is no agent but a replay buffer, for environments with "
+            "goals: --algo sac -params replay_buffer_class:HerReplayBuffer policy:MultiInputPolicy"
+        )
     if entry is None:
         raise unknown("unknown agent", algo, ALGORITHMS)
     if not entry.is_installed:

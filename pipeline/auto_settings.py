@@ -78,8 +78,8 @@ class _Asked:
 def _budget(asked: _Asked) -> Found:
     states, actions = asked.pairs()
     steps, counted = int(asked.amount or STEPS_PER_PAIR), max(states * actions, FEWEST_PAIRS)
-    least = f", counted as {counted}" if counted > states * actions else ""
-    how = f"auto: {steps:,} x {states:,} states x {actions:,} actions{least}"
+    least = f", counted as {counted} pairs" if counted > states * actions else ""
+    how = f"auto: {steps:,} for each pair of {states:,} states and {actions:,} actions{least}"
     return Found(steps * counted, how)
 
 
@@ -98,7 +98,7 @@ def _step_size(asked: _Asked) -> Found:
     if asked.n_timesteps is None:  # counted in episodes
         return Found(f"exp_{FIRST_STEP_SIZE:g}_{high:g}", "auto")
     last = min(max(VISITS_AVERAGED * states * actions / asked.n_timesteps, low), high)
-    how = f"auto: ends at {VISITS_AVERAGED} pairs of state and action by steps, {low} to {high}"
+    how = f"auto: ends at {VISITS_AVERAGED} x states x actions / steps, within {low} and {high}"
     return Found(f"exp_{FIRST_STEP_SIZE:g}_{last:.2g}", how)
 
 

@@ -14,7 +14,6 @@ from rich.progress import (
     SpinnerColumn,
     TaskProgressColumn,
     TextColumn,
-    TimeRemainingColumn,
 )
 
 from agents.common.callback_horizons import BlockCallback
@@ -25,6 +24,7 @@ from pipeline.signs_of_life import (
     CompilationNotice,
     Heartbeat,
     Silence,
+    duration,
 )
 
 SECONDS_BETWEEN_UPDATES = 0.1
@@ -36,7 +36,7 @@ COMPILING = "compiling the training loop"
 
 
 class ProgressDisplay(BlockCallback):
-    """A live bar in a terminal, a few plain lines elsewhere: steps/s, mean return, time left.
+    """A live bar in a terminal, a few plain lines elsewhere: steps, mean return, time left.
 
     A line is printed for every tenth of the training, two seconds after its beginning, and where
     ten seconds have gone by since the last.
@@ -55,10 +55,11 @@ class ProgressDisplay(BlockCallback):
         self.bar: Progress | None = None
         self.live = live
         self.on_variant = on_variant
-        self.started = 0.0
         self.has_begun = False
         self.updated = 0.0
         self.tenths_shown = 0
+        # Moments and the share that was done by then, a thousandth or more apart.
+        self.marks: list[tuple[float, float]] = []
         self.figures = ""
         self.activity = ""
         self.silence = Silence(SECONDS_BEFORE_THE_FIRST_LINE)
@@ -66,17 +67,16 @@ class ProgressDisplay(BlockCallback):
         self.heart = Heartbeat(self.look, SECONDS_BETWEEN_FRAMES if live else SECONDS_BETWEEN_LOOKS)
 
     def _on_training_start(self) -> None:
-        self.started = self.updated = time.monotonic()
+        self.updated = time.monotonic()
         self.silence = Silence(SECONDS_BEFORE_THE_FIRST_LINE)
         self.notice.listen()
-        self.first_step, self.has_begun = self.num_timesteps, False
+        self.has_begun, self.marks = False, [(self.updated, self.share_done)]
         if self.live:
             self.bar = Progress(
                 SpinnerColumn(SPINNER),
                 BarColumn(),
                 TaskProgressColumn(),
                 TextColumn("{task.fields[figures]}"),
-                TimeRemainingColumn(),
                 console=self.console,
                 auto_refresh=False,
             )
@@ -87,7 +87,8 @@ class ProgressDisplay(BlockCallback):
     def _on_rollout_start(self) -> None:
         self.activity = ""
         if not self.has_begun:  # a run that goes on is where it was by now
-            self.first_step, self.has_begun = self.model.num_timesteps, True
+            share = min(self.model.num_timesteps / max(self.model._total_timesteps, 1), 1.0)
+            self.has_begun, self.marks = True, [(time.monotonic(), share)]
 
     def _on_rollout_end(self) -> None:
         self.activity = LEARNING
@@ -167,12 +168,24 @@ class ProgressDisplay(BlockCallback):
             self.console.print(f"{COMPILING} (the first time, some seconds)", highlight=False)
 
     def _figures(self) -> str:
-        seconds = max(time.monotonic() - self.started, 1e-9)
-        speed = (self.num_timesteps - self.first_step) / seconds
-        figures = f"{self.num_timesteps:,} steps  {speed:,.0f} steps/s"
+        figures = f"{self.num_timesteps:,} steps"
         episodes = self.model.ep_info_buffer
         if episodes:
             mean_return = np.mean([episode["r"] for episode in episodes])
-            figures += f"  mean return {mean_return:.2f}"
-            figures += " (training variant)" if self.on_variant else ""
-        return figures
+            where = " (there the environment is changed)" if self.on_variant else ""
+            figures += f"  mean return in training{where} {mean_return:.2f}"
+        left = self._seconds_left()
+        return figures if left is None else f"{figures}  about {duration(left)} left"
+
+    def _seconds_left(self) -> float | None:
+        """By the clock, at the speed of the last half of what is done; None where nobody knows.
+
+        Off-policy agents are faster before they begin to learn, and compiling comes first.
+        """
+        now, share = time.monotonic(), self.share_done
+        if share >= self.marks[-1][1] + 0.001:
+            self.marks.append((now, share))
+        half = (self.marks[0][1] + share) / 2
+        began, before = next(mark for mark in reversed(self.marks) if mark[1] <= half)
+        left = (now - began) * (1 - share) / max(share - before, 1e-9)
+        return left if before < share < 1 and share >= 0.01 and left >= 1 else None

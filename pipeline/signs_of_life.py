@@ -37,6 +37,15 @@ def tell_nobody(detail: str) -> None:
     """A `Tell` where nobody watches."""
 
 
+def duration(seconds: float) -> str:
+    """A time in hours, minutes and seconds, as far as they matter."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
 class Silence:
     """How long nothing has been said, by a clock of its own.
 

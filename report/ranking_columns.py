@@ -117,8 +117,10 @@ def _stays_from(row: Row) -> Cell | None:
     return None if cell is None else replace(cell, aside=crossing(row.agent.steps_to_threshold))
 
 
-def _seconds(row: Row) -> Cell:
+def _seconds(row: Row) -> Cell | None:
     seconds = row.agent.seconds
+    if math.isnan(seconds.point):
+        return None
     return replace(estimate_cell(seconds), in_line=f"{number(seconds.point)} s")
 
 
@@ -178,7 +180,13 @@ COLUMNS: tuple[Column[Row], ...] = (
         cell=lambda row: threshold_cell(row.agent.episodes_to_stay),
     ),
     Column(terminal="solved", best_first="descending", cell=_solved),
-    Column(page="Training", help="seconds", terminal="time", best_first="ascending", cell=_seconds),
+    Column(
+        page="CPU time",
+        help="seconds of training",
+        terminal="CPU time",
+        best_first="ascending",
+        cell=_seconds,
+    ),
     Column(page="Runs", help="finished", best_first="descending", cell=_runs),
 )
 
@@ -192,5 +200,5 @@ BANDIT_COLUMNS: tuple[Column[BanditRow], ...] = (
         terminal="best arm",
         cell=lambda row: Cell(f"{row.pulls.optimal[-1]:.1%}", float(row.pulls.optimal[-1])),
     ),
-    Column(terminal="time", cell=_seconds),
+    Column(terminal="CPU time", cell=_seconds),
 )

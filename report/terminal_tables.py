@@ -30,7 +30,7 @@ AnyRow = TypeVar("AnyRow", bound=Row)
 # Where a table is wider than the terminal it goes without these, in this order; the page has all.
 FIRST_LEFT_OUT = (
     *("training", "IQM", "solved", "stays from"),
-    *("simple regret", "reward", "time", "score", "best arm"),
+    *("simple regret", "reward", "CPU time", "score", "best arm"),
 )
 
 
@@ -110,9 +110,7 @@ def _print_fitting(
     left_out: list[str] = []
     table = _table(title, shown, rows)
     for heading in FIRST_LEFT_OUT:
-        if Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum <= (
-            console.width
-        ):
+        if _width(console, table) <= console.width:
             break
         if heading in [column.terminal for column, _ in shown]:
             shown = [(column, cells) for column, cells in shown if column.terminal != heading]
@@ -183,23 +181,38 @@ def _bandit_caption(study: StudySpec, left_out: Sequence[str]) -> list[str]:
 
 
 def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
-    """Print the table of `episodes_table`, agents side by side."""
+    """Print the table of `episodes_table`, agents side by side, as many as there is room for."""
     for environment, rows in table.groupby("environment", sort=False):
         title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
-        printed = Table(title=title, title_justify="left")
-        printed.add_column("episode", justify="right")
-        agents = list(dict.fromkeys(rows["agent"]))
+        left = list(dict.fromkeys(rows["agent"]))
+        while left:
+            shown = len(left)
+            while shown > 1 and _width(console, _episodes(title, rows, left[:shown])) > (
+                console.width
+            ):
+                shown -= 1
+            console.print()
+            console.print(_episodes(title, rows, left[:shown]))
+            left = left[shown:]
+
+
+def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
+    printed = Table(title=title, title_justify="left")
+    printed.add_column("episode", justify="right")
+    for agent in agents:
+        printed.add_column(str(agent), justify="right", overflow="fold")
+    by_episode = rows.set_index(["episode", "agent"])
+    for episode in sorted(set(rows["episode"])):
+        cells = []
         for agent in agents:
-            printed.add_column(str(agent), justify="right")
-        by_episode = rows.set_index(["episode", "agent"])
-        for episode in sorted(set(rows["episode"])):
-            cells = []
-            for agent in agents:
-                if (episode, agent) not in by_episode.index:
-                    cells.append("-")
-                    continue
-                row = by_episode.loc[(episode, agent)]
-                cells.append("  ".join(number(row[c]) for c in ("average", "minimum", "maximum")))
-            printed.add_row(f"{episode:,}", *cells)
-        console.print()
-        console.print(printed)
+            if (episode, agent) not in by_episode.index:
+                cells.append("-")
+                continue
+            row = by_episode.loc[(episode, agent)]
+            cells.append("  ".join(number(row[c]) for c in ("average", "minimum", "maximum")))
+        printed.add_row(f"{episode:,}", *cells)
+    return printed
+
+
+def _width(console: Console, table: Table) -> int:
+    return Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum

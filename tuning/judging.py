@@ -32,7 +32,7 @@ class RunOutcome:
 
     Attributes:
         figure: what it is judged by.
-        seconds: what it took.
+        seconds: processor time that it took.
         name: of the figure: as asked for, but the final return where no score is known.
     """
 
@@ -59,7 +59,7 @@ def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
         if name == "score" and row.get(name) is None:  # where no optimum is known
             name = "final"
         figure = _figure(row, name)
-    return RunOutcome(figure, float(row["seconds"]), name)
+    return RunOutcome(figure, float(row.get("cpu_seconds") or row["seconds"]), name)
 
 
 def _figure(row: Mapping[str, Any], name: str) -> float:

@@ -126,11 +126,7 @@ def _instead(evaluator: ExactEvaluator, policy: Any, running: Floats) -> str:
 
 
 def _place(layout: GridLayout | None, state: int) -> str:
-    """The name of a state: as pages count, rows and columns from 1."""
-    if layout is None:
-        return f"state {state}"
-    row, column = divmod(int(layout.cells[state]), layout.n_columns)
-    return f"row {row + 1}, column {column + 1}"
+    return f"state {state}" if layout is None else layout.place_name(int(layout.cells[state]))
 
 
 def _try_first(

@@ -85,8 +85,8 @@ def layer_name(layout: GridLayout, layer: int) -> str:
     cells = layout.collected_in(layer)
     if not cells:
         return "nothing collected"
-    places = (f"({row}, {column})" for row, column in (divmod(c, layout.n_columns) for c in cells))
-    return f"{layout.names.get(PRIZE, 'prize')} collected at " + ", ".join(places)
+    places = [layout.place_name(cell) for cell in cells]
+    return f"{layout.names.get(PRIZE, 'prize')} collected at " + "; ".join(places)
 
 
 def cell_inches(layout: GridLayout) -> float:
@@ -127,9 +127,11 @@ def _panels(layout: GridLayout, n_layers: int, cell: float) -> tuple[Figure, lis
             xlim=(-0.5, layout.n_columns - 0.5),
             ylim=(layout.n_rows - 0.5, -0.5),
             aspect="equal",
-            xticks=range(0, layout.n_columns, step),
-            yticks=range(0, layout.n_rows, step) if named else (),
         )
+        # Counted from 1, as everywhere.
+        for axis, length in ((axes.xaxis, layout.n_columns), (axes.yaxis, layout.n_rows)):
+            shown = range(step - 1, length if named or axis is axes.xaxis else 0, step)
+            axis.set_ticks(shown, [str(place + 1) for place in shown])
         axes.tick_params(length=0, labelsize=7, labelcolor=DIM, pad=2)
         axes.spines[:].set_visible(False)
     return figure, panels.reshape(-1, 2).tolist()

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import contextlib
+import shlex
 import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -93,14 +94,28 @@ def parse_assignments(assignments: Iterable[str], where: str = "") -> dict[str, 
     """
     prefix = f"{where}: " if where else ""
     result: dict[str, Any] = {}
-    for assignment in assignments:
+    words = list(assignments)
+    for place, assignment in enumerate(words):
         key, colon, value = assignment.partition(":")
         if not (colon and key.isidentifier() and value.strip()):
-            raise UserError(f"{prefix}{shown(assignment)} does not have the form key:value")
+            raise UserError(
+                f"{prefix}{shown(assignment)} does not have the form key:value"
+                f"{_meant(words[place:])}"
+            )
         if key in result:
             raise UserError(f"{prefix}{shown(key)} is given twice")
         result[key] = _value_or_text(value)
     return result
+
+
+def _meant(words: Sequence[str]) -> str:
+    """A hint at what ``key=value``, ``key value``, ``key = value`` or ``key: value`` should be."""
+    key, *others = [*words[0].split("=", 1), *words[1:3]]
+    key = key.rstrip(":")
+    value = next(filter(None, (other.lstrip("=") for other in others)), "")
+    if not (key.isidentifier() and value) or ":" in value:
+        return ""
+    return f": did you mean {shlex.quote(f'{key}:{value}')}?"
 
 
 def _value_or_text(text: str) -> Any:

@@ -1,4 +1,4 @@
-"""Keeps every step of the first episodes of an agent that learns in tables.
+"""Keeps every step of an agent that learns in tables, while the return of its policy rises.
 
 Which entries have moved is seen by holding the tables before an update against those after it, so
 that a rule may move one entry or many, in any of its tables. Target and TD error are those that the
@@ -17,6 +17,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.common.callback_horizons import BlockCallback, Horizon
 from agents.common.online import true_outcome
 from mdp.array_types import Floats, Ints
+from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.watching.growing_rows import GrowingRows
 
 # All that a page of three megabytes can hold, and what it holds where nobody says how much.
@@ -24,6 +25,13 @@ MOST_MOVES = 20_000
 MOST_CHANGES = 60_000
 MOVES_UNASKED = 5_000
 MOST_ENTRIES = 100_000
+# For the rise of the return so many steps are looked through, and the policy is judged so often.
+MOVES_SEARCHED = 50_000
+CHANGES_SEARCHED = 1_000_000
+STEPS_BETWEEN_RETURNS = 100
+# It has risen where so much of the way to the highest return is behind.
+FIRST_OF_RISE, LAST_OF_RISE = 0.1, 0.9
+STEPS_AROUND = 500  # that are kept before and after it
 
 # What ended with a step.
 GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
@@ -65,10 +73,12 @@ CHANGE = np.dtype(
 
 
 class TableRecorder(BlockCallback):
-    """Records the first episodes of a training; it changes nothing of it.
+    """Records steps of a training; it changes nothing of it.
 
     Args:
-        n_episodes: how many, over all environments; 0 for those of the first 5000 steps.
+        n_episodes: the first so many, over all environments; 0 for the steps in which the return of
+            the greedy policy rises, or the first 5000 where that is not known.
+        exact: computes that return.
 
     Attributes:
         names: of the tables.
@@ -78,9 +88,11 @@ class TableRecorder(BlockCallback):
         is_cut: whether there were more steps in these episodes than are kept.
     """
 
-    def __init__(self, n_episodes: int) -> None:
+    def __init__(self, n_episodes: int, exact: ExactEvaluator | None = None) -> None:
         super().__init__()
         self.n_episodes = n_episodes
+        self.exact = None if n_episodes else exact
+        self._greedy_returns: list[float] = []  # one after each `STEPS_BETWEEN_RETURNS` steps
         self.names: list[str] = []
         self.has_actions = False
         self.initial: dict[str, Floats] = {}
@@ -113,6 +125,7 @@ class TableRecorder(BlockCallback):
             self._tables = [table.copy() for table in self.initial.values()]
             self._returns = np.zeros(self.model.n_envs)
             self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)
+            self._note_return()
         self._obs = np.array(self.model._last_obs)
         told = getattr(self.model, "last_steps", None)
         if told is not None:  # so that no number of an earlier step is taken for one of the next
@@ -154,6 +167,8 @@ class TableRecorder(BlockCallback):
             moved = np.flatnonzero(before != now)
             if len(moved):
                 self._note_changes(number, moved, before, now)
+        if len(self.steps) % STEPS_BETWEEN_RETURNS == 0:
+            self._note_return()
         self._look_whether_full()
 
     def _note_changes(self, number: int, moved: Ints, before: Floats, now: Floats) -> None:
@@ -170,10 +185,58 @@ class TableRecorder(BlockCallback):
         if self.n_episodes and self._episodes.sum() >= self.n_episodes:
             self.is_full = True
             return
+        if self.exact is not None:
+            self.is_full = self._has_risen() or len(self.moves) > MOVES_SEARCHED
+            self.is_full |= len(self.changes) > CHANGES_SEARCHED
+            self.is_cut = self.is_full
+            return
         most = MOST_MOVES if self.n_episodes else MOVES_UNASKED
         has_room = len(self.moves) + self.model.n_envs <= most
         self.is_full = not has_room or len(self.changes) > MOST_CHANGES
         self.is_cut = self.is_full
+
+    def _note_return(self) -> None:
+        if self.exact is not None:
+            self._greedy_returns.append(self.exact(self.model).mean_return)
+
+    def _has_risen(self) -> bool:
+        """Whether there is enough after the policy came near the best that is possible."""
+        assert self.exact is not None
+        first, best = self._greedy_returns[0], self.exact.yardstick.optimum
+        near = first + LAST_OF_RISE * (best - first)
+        risen = next((i for i, one in enumerate(self._greedy_returns) if one >= near), None)
+        if risen is None or len(self.moves) < MOVES_UNASKED:
+            return False
+        return len(self.steps) >= STEPS_BETWEEN_RETURNS * risen + STEPS_AROUND
+
+    def window(self) -> tuple[int, int]:
+        """The steps to show, from the first up to but not including the last, by their numbers.
+
+        They begin with an episode of the first environment, before the return of the greedy policy
+        rises, and end after it has risen; where it rises for longer than there is room, they are
+        the last that there is room for.
+        """
+        n, n_envs = len(self.steps), self.model.n_envs
+        returns = np.array(self._greedy_returns)
+        if self.exact is None or not len(returns):
+            return 0, n
+        fewest, most = MOVES_UNASKED // n_envs, MOST_MOVES // n_envs
+        way = float(returns.max() - returns[0])
+        if way <= 0:
+            return 0, min(n, fewest)
+        behind = (returns - returns[0]) / way
+        last = int(np.argmax(behind >= LAST_OF_RISE))
+        first = int(np.flatnonzero(behind[:last] <= FIRST_OF_RISE)[-1])
+        end = min(n, max(STEPS_BETWEEN_RETURNS * last + STEPS_AROUND, fewest))
+        begin = min(STEPS_BETWEEN_RETURNS * first - STEPS_AROUND, end - fewest)
+        moves = self.moves.rows
+        of_first = moves[moves["env"] == 0]
+        episodes = np.append(0, of_first["step"][of_first["end"] != GOES_ON] + 1)
+        before = int(episodes[episodes <= max(begin, 0)][-1])
+        if end - before > most:
+            later = episodes[(episodes >= end - most) & (episodes < end)]
+            before = int(later[0]) if len(later) else end - most
+        return before, end
 
     def _numbers(self, observations: Any) -> Any:
         is_number = isinstance(self.model.observation_space, spaces.Discrete)

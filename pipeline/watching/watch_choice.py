@@ -41,7 +41,8 @@ def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None
                 f"--watch-learning shows tables of up to {MOST_ENTRIES:,} entries; those of "
                 f"{spec.algo} on {spec.env_id} have {n_entries:,}"
             )
-        return TableRecorder(spec.watch_episodes)
+        is_known = exact is not None and can_be_mapped(exact)
+        return TableRecorder(spec.watch_episodes, exact if is_known else None)
     if exact is None or not can_be_mapped(exact) or best_actions_of(exact, agent) is None:
         raise UserError(
             f"--watch-learning shows tables, or what an agent does in up to 2,500 known states: "

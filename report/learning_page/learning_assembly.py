@@ -72,7 +72,8 @@ def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]
             yield maps_data(recorder, stride)
             stride *= 2
         return
-    n_steps = len(recorder.steps)
+    begin, end = recorder.window()
+    n_steps = end - begin
     while n_steps:
         yield steps_data(recorder, n_steps)
         n_steps = n_steps * 3 // 4

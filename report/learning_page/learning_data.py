@@ -24,24 +24,49 @@ from report.page.sections import layout_data
 
 
 def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
-    """The first steps of an agent that learns in tables.
+    """Steps of an agent that learns in tables.
 
     Args:
         recorder: what was kept of it.
-        most_steps: how many of them.
+        most_steps: how many of them: of the first episodes the first, else the last, since there
+            the return has risen.
     """
-    steps = recorder.steps.rows[:most_steps]
-    n = len(steps)
-    moves, changes = recorder.moves.rows, recorder.changes.rows
+    begin, end = recorder.window()
+    if recorder.n_episodes:
+        end = min(end, begin + most_steps)
+    else:
+        begin = max(begin, end - most_steps)
+    steps = recorder.steps.rows[begin:end]
+    moves, changes = (
+        _between(kept.rows, begin, end) for kept in (recorder.moves, recorder.changes)
+    )
     return {
         "kind": "steps",
-        "tables": [_table(name, recorder.initial[name]) for name in recorder.names],
+        "tables": [_table(name, table) for name, table in _tables_before(recorder, begin).items()],
         "steps": _columns(steps),
-        "moves": _columns(moves[moves["step"] < n]),
-        "changes": _columns(changes[changes["step"] < n]),
-        "is_cut": recorder.is_cut or n < len(recorder.steps),
+        "moves": _columns(moves),
+        "changes": _columns(changes),
+        "begin": begin,
+        "is_cut": recorder.is_cut or end < len(recorder.steps),
         "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
     }
+
+
+def _between(rows: NDArray[np.void], begin: int, end: int) -> NDArray[np.void]:
+    """Those of some steps, of which the first has the number 0."""
+    chosen = rows[(rows["step"] >= begin) & (rows["step"] < end)].copy()
+    chosen["step"] -= begin
+    return chosen
+
+
+def _tables_before(recorder: TableRecorder, step: int) -> dict[str, Floats]:
+    """The tables as they were before a step."""
+    tables = {name: recorder.initial[name].copy() for name in recorder.names}
+    earlier = recorder.changes.rows[recorder.changes.rows["step"] < step]
+    for number, table in enumerate(tables.values()):
+        moved = earlier[earlier["table"] == number]
+        table.reshape(-1)[moved["entry"]] = moved["after"]  # of several the last
+    return tables
 
 
 def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:

@@ -24,6 +24,9 @@ def _words_of_steps(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     if data["is_cut"] and spec.watch_episodes:
         asked = _count(spec.watch_episodes, "episode")
         note = f"a page has room for {n_steps:,} steps, and ends before the first {asked} do"
+    elif data["begin"]:
+        first = int(data["steps"]["timesteps"][0])
+        note = f"from step {first:,} on, as the return of the greedy policy rises"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
     return {

@@ -56,7 +56,7 @@ def cost(trials: Trials) -> list[tuple[str, str]]:
         *((name[0].upper() + name[1:], f"{count:,}") for name, count in sorted(kinds.items())),
         ("Runs", f"{trials.n_runs:,} of at most {whole:,}"),
         ("Runs saved by ending trials early", saved),
-        ("Training, one run after the other", _duration(trials.seconds)),
+        ("Processor time of all runs", _duration(trials.seconds)),
         ("From the first trial to the end of the last", _duration(trials.wall_seconds)),
         ("Runs of the re-test", f"{sum(each['n_runs'] for each in retest):,}"),
     ]

@@ -124,7 +124,7 @@ def test_pulls_in_words(pulls, words):
 
 def test_a_run_with_nothing_to_tell():
     assert printed(outcome_of(), spec_of()) == [
-        "trained  12,345 steps in 2.0 s (6,172 steps/s)",
+        "trained  12,345 steps in 1.5 s of processor time (8,230 steps/s)",
         "files    logs/qlearning/Lake-v1_3",
         "watch    python enjoy.py --algo qlearning --env Lake-v1",
     ]
@@ -144,12 +144,12 @@ def test_a_run_with_everything():
         n_steps=1000,
     )
     assert printed(outcome, spec_of("else where")) == [
-        "interrupted  1,000 steps in 0.0 s (1,000,000,000,000 steps/s)",
+        "interrupted  1,000 steps in 0.0 s of processor time (1,000,000,000,000 steps/s)",
         "engine       compiled",
         "regret       not known: none of 1,500 pulls is in the log",
         "final        return 2.00 ± 1.00 over 2 episodes",
         "best         return 3.25 over 5 episodes, first at step 10,000",
-        "judged       by 700 steps (70% of training's) in 0.5 s of processor time",
+        "tests        700 steps beside training (70% of it); 0.5 s of processor time",
         "files        logs/qlearning/Lake-v1_3",
         "watch        python enjoy.py --algo qlearning --env Lake-v1 -f 'else where'",
     ]
@@ -168,15 +168,54 @@ def test_what_is_about_to_be_trained(entry, budget):
     )
 
 
+@pytest.mark.parametrize(
+    ("algo", "settings", "lines"),
+    [
+        ("qlearning", {"policy": "QTablePolicy"}, ["n_timesteps=9"]),
+        ("dqn", {"policy": "MlpPolicy"}, ["policy=MlpPolicy  n_timesteps=9"]),
+        (
+            "qlearning",
+            {"learning_rate": "exp_0.3_0.05"},
+            [
+                "n_timesteps=9",
+                "learning_rate=exp_0.3_0.05 (falls exponentially from 0.3 to 0.05)",
+            ],
+        ),
+        (
+            "ppo",
+            {"clip_range": "lin_0.2", "ent_coef": "lin_0.01_0.02"},
+            [
+                "n_timesteps=9",
+                "clip_range=lin_0.2 (falls linearly from 0.2 to 0)",
+                "ent_coef=lin_0.01_0.02 (rises linearly from 0.01 to 0.02)",
+            ],
+        ),
+        (
+            "qlearning",
+            {"train_env_kwargs": {"slip": 0.1}},
+            ["n_timesteps=9", "train_env_kwargs={'slip': 0.1} (in training alone)"],
+        ),
+    ],
+)
+def test_settings_that_newcomers_cannot_read_are_explained(algo, settings, lines):
+    console = console_of()
+    print_header(console, replace(spec_of(**settings, n_timesteps=9), algo=algo))
+    assert console.file.getvalue().splitlines()[1:] == lines
+
+
 # --- lists ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def lists(monkeypatch):
     """The lines of both lists, on a wide terminal."""
+    return listed(monkeypatch, 600)
+
+
+def listed(monkeypatch, width):
     file = io.StringIO()
     monkeypatch.setattr(
-        listing, "TextConsole", lambda **more: Console(file=file, width=300, **more)
+        listing, "table_console", lambda **more: Console(file=file, width=width, **more)
     )
     listing.print_lists()
     return [line.rstrip() for line in file.getvalue().splitlines()]
@@ -194,8 +233,10 @@ def test_every_agent_has_a_line(lists):
 
 
 def test_an_environment_names_the_agents_that_are_tuned_for_it_and_those_that_fit(lists):
-    (line,) = (line for line in lists if line.startswith("Warehouse-v0 "))
-    tuned, fitting = line.removeprefix("Warehouse-v0").strip().split("   ", 1)
+    (place,) = (n for n, line in enumerate(lists) if line.startswith("Warehouse-v0 "))
+    tuned = lists[place].removeprefix("Warehouse-v0")
+    also, fitting = lists[place + 1].split(maxsplit=1)
+    assert also == "also:"
     assert {"qlearning", "sarsa", "ppo"} <= set(tuned.split())
     assert not set(tuned.split()) & set(fitting.split())
     assert set(tuned.split()) | set(fitting.split()) <= set(ALGORITHMS)
@@ -272,13 +313,21 @@ def test_redirected_no_sentence_is_broken(is_terminal):
     assert (file.getvalue() == "a line of more than twenty letters\n") is not is_terminal
 
 
-def test_the_lists_have_a_line_for_each_row_where_they_are_redirected(monkeypatch):
-    file = io.StringIO()
-    monkeypatch.setattr(
-        listing, "TextConsole", lambda **more: TextConsole(file=file, width=80, _environ={}, **more)
-    )
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_the_lists_fit_the_terminal_and_keep_every_name(width, monkeypatch):
+    lines, widest = listed(monkeypatch, width), listed(monkeypatch, 2000)
+    n_tables = lines.index("", len(ALGORITHMS) + 2)  # a sentence comes after them
+    assert max(map(len, lines[:n_tables])) <= width
+    assert sorted(" ".join(lines).split()) == sorted(" ".join(widest).split())
+
+
+@pytest.mark.parametrize(("columns", "width"), [(None, 80), ("132", 132)])
+def test_redirected_tables_have_80_columns(columns, width, monkeypatch, capsys):
+    if columns:
+        monkeypatch.setenv("COLUMNS", columns)
+    else:
+        monkeypatch.delenv("COLUMNS", raising=False)
     listing.print_lists()
-    lines = file.getvalue().splitlines()
-    (lake,) = [line for line in lines if line.startswith("FrozenLake-v1 ")]
-    assert " qlearning " in lake
-    assert max(map(len, lines)) > 120
+    lines = capsys.readouterr().out.splitlines()
+    # The last is a sentence, and on one line.
+    assert width - 15 < max(map(len, lines[:-1])) <= width

@@ -62,7 +62,7 @@ def test_where_there_is_no_terminal_a_line_now_and_then(clock):
         assert file.getvalue() == ""
         clock.now += 0.5
         progress.note(runs[4], None)
-        assert file.getvalue() == "3 of 6 runs in 10 s, about 10 s left\n"
+        assert file.getvalue() == "3 of 6 runs in 10 s, about 13 s left by the clock\n"
         # From that line on they are counted anew.
         clock.now += 9.9
         progress.note(runs[5], None)
@@ -72,8 +72,8 @@ def test_where_there_is_no_terminal_a_line_now_and_then(clock):
         # The last run is told of at once.
         progress.note(runs[7], None)
     assert file.getvalue().splitlines() == [
-        "3 of 6 runs in 10 s, about 10 s left",
-        "5 of 6 runs in 1 min 30 s, about 18 s left",
+        "3 of 6 runs in 10 s, about 13 s left by the clock",
+        "5 of 6 runs in 1 min 30 s, about 7 s left by the clock",
         "6 of 6 runs in 1 min 30 s",
     ]
 
@@ -108,7 +108,7 @@ def test_of_a_cluster_the_line_says_how_many_workers_there_are(clock):
     runs = planned_runs()
     file, console = console_of(force_terminal=False)
     with StudyProgress(console, runs, []) as progress:
-        cluster = SimpleNamespace(words="3 workers")
+        cluster = SimpleNamespace(words="3 workers", n_workers=3)
         with progress.watching(lambda: nullcontext(cluster))() as launcher:
             assert launcher is cluster
             progress.note(runs[2], failure_of(runs[2]))
@@ -117,8 +117,8 @@ def test_of_a_cluster_the_line_says_how_many_workers_there_are(clock):
         clock.now += 11
         progress.look()
     assert file.getvalue().splitlines()[1:] == [
-        "1 of 8 runs in 11 s, about 1 min 17 s left, 3 workers, 1 failed",
-        "1 of 8 runs in 22 s, about 2 min 34 s left, 1 failed",
+        "1 of 8 runs in 11 s, about 11 s left by the clock, 3 workers, 1 failed",
+        "1 of 8 runs in 22 s, about 1 min 6 s left by the clock, 1 failed",
     ]
 
 
@@ -126,7 +126,9 @@ def test_so_does_the_line_of_a_search(clock):
     _, console = console_of(force_terminal=False)
     with TuningProgress(console, 10, dict, is_cost=False) as progress:
         assert progress.figures() == "0 of 10 trials, 0 runs in 0 s"
-        launchers = progress.watching(lambda: nullcontext(SimpleNamespace(words="3 workers")))
+        launchers = progress.watching(
+            lambda: nullcontext(SimpleNamespace(words="3 workers", n_workers=3))
+        )
         with launchers():
             progress.run_ended()
             progress.trial_ended(4, 0.5, "")
@@ -149,8 +151,8 @@ def test_a_study_that_is_interrupted_says_how_to_go_on(clock):
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert file.getvalue().splitlines() == [
-        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left",
-        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left; the same command continues",
+        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left by the clock",
+        "1 of 8 runs in 2 h 3 min, about 14 h 22 min left by the clock; the same command continues",
     ]
 
 
@@ -188,7 +190,7 @@ def test_in_a_terminal_one_table_moves(clock):
     last = shown[shown.rindex("agent ") :]
     assert re.search(r"\[b\]one\[/b\] +lake +2/4 .*[^1]\n", last)
     assert re.search(r"two +lake +1/4 .* 1 *\n", last)
-    assert "2 of 6 runs in 1 min 0 s, about 2 min 0 s left" in last
+    assert "2 of 6 runs in 1 min 0 s, about 2 min 0 s left by the clock" in last
 
 
 def plain(text):

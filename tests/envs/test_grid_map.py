@@ -57,20 +57,20 @@ def test_a_file_is_read_by_the_environments(tmp_path: Path) -> None:
         ([], "the map is empty"),
         ([""], "the map is empty"),
         ("\n", "the map is empty"),
-        (["S..", "..", "..G"], "row 1 has 2 cells and row 0 has 3: they differ from column 2 on"),
-        (["S..", "....", "..G"], "row 1 has 4 cells and row 0 has 3: they differ from column 3 on"),
+        (["S..", "..", "..G"], "row 2 has 2 cells and row 1 has 3: they differ from column 3 on"),
+        (["S..", "....", "..G"], "row 2 has 4 cells and row 1 has 3: they differ from column 4 on"),
         (["...", "..G"], "the map has no start: mark it with the letter S"),
         (
             ["..S", "S.G"],
-            "two starts, at row 0, column 2 and at row 1, column 0; there must be one",
+            "two starts, at row 1, column 3 and at row 2, column 1; there must be one",
         ),
         (["S..", "..."], "the map has no goal: mark it with the letter G"),
-        (["S..", ".x.", "..G"], "unknown letter 'x' at row 1, column 1; known are # . S G"),
-        (["S..", ". .", "..G"], "unknown letter ' ' at row 1, column 1"),
-        (["S..", ".é.", "..G"], "unknown letter 'é' at row 1, column 1"),
+        (["S..", ".x.", "..G"], "unknown letter 'x' at row 2, column 2; known are # . S G"),
+        (["S..", ". .", "..G"], "unknown letter ' ' at row 2, column 2"),
+        (["S..", ".é.", "..G"], "unknown letter 'é' at row 2, column 2"),
         (
             ["S#.", "#..", "..G"],
-            "the goal at row 2, column 2 cannot be reached from the start at row 0, column 0",
+            "the goal at row 3, column 3 cannot be reached from the start at row 1, column 1",
         ),
         ("missing.txt", "cannot read the map file missing.txt: No such file or directory"),
         (7, "desc must be a list of rows"),
@@ -87,7 +87,7 @@ def test_a_broken_map_is_refused(desc: Sequence[str], message: str) -> None:
 def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path: Path) -> None:
     path = tmp_path / "map.txt"
     path.write_text("S.\n?G\n")
-    with pytest.raises(ValueError, match=r"map\.txt: unknown letter '\?' at row 1, column 0"):
+    with pytest.raises(ValueError, match=r"map\.txt: unknown letter '\?' at row 2, column 1"):
         WarehouseEnv(desc=path)
     path.write_bytes(b"S.\xff\xfe.G")
     with pytest.raises(ValueError, match=r"map\.txt: it is not a text file"):
@@ -98,13 +98,13 @@ def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path: Path) -> None
 
 def test_the_maze_names_its_own_letters() -> None:
     with pytest.raises(
-        ValueError, match=r"unknown letter '#' at row 0, column 1; known are S \. M P"
+        ValueError, match=r"unknown letter '#' at row 1, column 2; known are S \. M P"
     ):
         MineMazeEnv(desc=["S#G"])
 
 
 def test_mines_block_the_way() -> None:
-    with pytest.raises(ValueError, match="the goal at row 0, column 2 cannot be reached"):
+    with pytest.raises(ValueError, match="the goal at row 1, column 3 cannot be reached"):
         MineMazeEnv(desc=["SMG"])
 
 

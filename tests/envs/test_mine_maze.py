@@ -174,5 +174,5 @@ def test_any_maze_follows_the_rules(desc: list[str], random_start: bool, seed: i
 
 
 def test_an_unsolvable_maze_is_refused() -> None:
-    with pytest.raises(ValueError, match="at row 1, column 1 cannot be reached from the start at"):
+    with pytest.raises(ValueError, match="at row 2, column 2 cannot be reached from the start at"):
         MineMazeEnv(desc=["SM", "MG"])

@@ -62,7 +62,8 @@ def write_run(planned, evaluations, episodes=((10, 1.0),) * 10, known=True, **in
         "best_mean_return": max(v for _, v in evaluations) if evaluations else None,
         "best_timesteps": 50 if evaluations else 0,
         "n_timesteps": 100,
-        "seconds": 2.5,
+        "seconds": 9.5,
+        "cpu_seconds": 2.5,
         "engine": "compiled",
     }
     run.info_path.write_text(json.dumps(record | info))
@@ -110,7 +111,7 @@ def test_a_row_for_each_run(tmp_path):
     # Two trapezoids of width 40, of mean heights 53 and 93.
     assert row["area"] == pytest.approx(73.0)
     assert row["training"] == pytest.approx(11 / 7)
-    assert (row["n_episodes"], row["n_timesteps"], row["seconds"]) == (7, 100, 2.5)
+    assert (row["n_episodes"], row["n_timesteps"], row["cpu_seconds"]) == (7, 100, 2.5)
     assert row["path"] == str(planned.path)
 
 

@@ -198,8 +198,37 @@ def test_values_on_the_command_line(assignment: str, value: Any) -> None:
 
 @pytest.mark.parametrize("assignment", ["gamma", "gamma=0.9", "gamma:", "gamma: ", ":0.9", "a-b:1"])
 def test_an_assignment_of_another_form_is_refused(assignment: str) -> None:
-    with pytest.raises(UserError, match=r"^-params: .* does not have the form key:value$"):
+    with pytest.raises(UserError, match=r"^-params: .* does not have the form key:value"):
         parse_assignments(["size:8", assignment], "-params")
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("learning_rate=0.1 gamma:0.9", "learning_rate:0.1"),
+        ("learning_rate 0.1", "learning_rate:0.1"),
+        ("learning_rate = 0.1", "learning_rate:0.1"),
+        ("learning_rate =0.1", "learning_rate:0.1"),
+        ("learning_rate: 0.1 gamma:0.9", "learning_rate:0.1"),
+        ("ent_coef=-1", "ent_coef:-1"),
+        ("a=b=c", "a:b=c"),
+        ("learning_rate gamma:0.9", ""),
+        ("gamma", ""),
+        ("a-b=1", ""),
+    ],
+)
+def test_an_assignment_in_another_spelling_gets_ours(words: str, meant: str) -> None:
+    with pytest.raises(UserError) as raised:
+        parse_assignments(words.split())
+    hint = str(raised.value).partition("key:value")[2]
+    assert hint == (f": did you mean {meant}?" if meant else "")
+
+
+def test_spaces_in_what_was_meant_are_quoted() -> None:
+    with pytest.raises(
+        UserError, match=r"did you mean 'policy_kwargs:dict\(net_arch=\[64, 64\]\)'"
+    ):
+        parse_assignments(["policy_kwargs=dict(net_arch=[64, 64])"])
 
 
 def test_a_key_given_twice_is_refused() -> None:

@@ -11,6 +11,7 @@ from agents import load_algorithm
 from pipeline.environments import make_training_env
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.value_maps import value_map
+from pipeline.pictures import value_map as drawing
 from pipeline.pictures.map_cells import (
     draw_arrows,
     draw_ground,
@@ -163,19 +164,39 @@ def test_whole_values_need_no_decimals():
 
 
 def test_of_a_maze_the_layers_are_drawn_that_somebody_comes_to():
-    # Always up: the agent stays on the start, and the best way collects the power at (1, 3).
+    # Always up: the agent stays on the start, and the best way collects power.
     found = map_of("MineMaze-v0")
     assert shown_layers(found) == [0, 1]
     names = [layer_name(found.layout, layer) for layer in (0, 1, 5)]
     assert names == [
         "nothing collected",
-        "power collected at (1, 3)",
-        "power collected at (1, 3), (5, 1)",
+        "power collected at row 2, column 4",
+        "power collected at row 2, column 4; row 6, column 2",
     ]
     agent, optimum = policies_in(found, 1)
     assert optimum.visited[9]
     assert agent.matters[9]
     assert not policies_in(found, 0)[0].matters[9]
+
+
+@pytest.mark.parametrize("desc", [["S..", ".#G"], ["S" + "." * 11, "." * 11 + "G"]])
+def test_rows_and_columns_count_from_one_as_pages_and_advice_do(desc, monkeypatch, tmp_path):
+    figures = []
+    monkeypatch.setattr(drawing, "write_png", lambda figure, path: figures.append(figure))
+    found = map_of("Warehouse-v0", desc=desc)
+    draw_value_map(tmp_path / "map.png", "title", found)
+    panel = figures[0].axes[0]
+    goal = len(desc) * len(desc[0]) - 1
+    shown = [
+        dict(zip(axis.get_ticklocs().tolist(), texts, strict=True))
+        for axis, texts in (
+            (panel.yaxis, [text.get_text() for text in panel.get_yticklabels()]),
+            (panel.xaxis, [text.get_text() for text in panel.get_xticklabels()]),
+        )
+    ]
+    row, column = divmod(goal, len(desc[0]))
+    expected = f"row {shown[0][row]}, column {shown[1][column]}"
+    assert found.layout.place_name(goal) == expected == f"row 2, column {len(desc[0])}"
 
 
 def test_no_more_than_four_layers_are_drawn():

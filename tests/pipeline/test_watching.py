@@ -13,7 +13,12 @@ from stable_baselines3.common.env_util import make_vec_env
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
 from agents.common.callback_horizons import BlockCallback
+from pipeline.auto_settings import resolved_spec
+from pipeline.environments import make_training_env
 from pipeline.errors import UserError
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.preparation import algorithm_kwargs, make_model
+from pipeline.settings.hyperparam_entries import read_hyperparams
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
@@ -369,3 +374,32 @@ def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, mo
     with pytest.raises(UserError, match=r"up to 63 entries; those of qlearning on Froz.* have 64"):
         done(spec_of(**page))
     assert not Path(page["log_folder"]).exists()
+
+
+@pytest.mark.parametrize("env_id", ["FrozenLake-v1", "Warehouse-v0", "CliffWalking-v1"])
+def test_what_is_played_covers_the_rise_of_the_greedy_policys_return(env_id):
+    """Replayed from the records: it is low where the window begins, and high where it ends."""
+    settings = read_hyperparams("qlearning", env_id) | {"n_timesteps": 60_000}
+    settings.pop("n_episodes", None)
+    spec = resolved_spec(settings, algo="qlearning", env_id=env_id, seed=0)
+    exact, env = exact_evaluator(spec), make_training_env(spec, None)
+    agent, recorder = make_model(spec, None, env, algorithm_kwargs(spec)), TableRecorder(0, exact)
+    agent.learn(60_000, recorder)
+    begin, end = recorder.window()
+    table = recorder.initial["q_tables"].copy()
+    returns, changes = {}, recorder.changes.rows
+    for step in sorted({*range(0, len(recorder.steps) + 1, 50), begin, end}):
+        now = changes[changes["step"] < step]
+        table.reshape(-1)[now["entry"]] = now["after"]
+        agent.policy.q_tables.copy_(th.from_numpy(table))
+        returns[step] = exact(agent).mean_return
+    low, high = returns[0], max(returns.values())
+    assert high >= 0.9 * exact.yardstick.optimum if high > 0 else high > low
+    assert returns[begin] <= low + 0.35 * (high - low)
+    assert max(value for step, value in returns.items() if begin <= step <= end) >= (
+        low + 0.9 * (high - low)
+    )
+    assert 5000 <= end - begin <= 20_000
+    # It begins with an episode.
+    before = recorder.moves.rows[recorder.moves.rows["step"] == begin - 1]
+    assert begin == 0 or before["end"][0] != 0

@@ -57,7 +57,7 @@ def analysis(made_up):
     return made_up.analysis([place], ["first", "second", "third"])
 
 
-HEADINGS = ["agent", "mean", "IQM", "score", "training", "stays from", "solved", "time"]
+HEADINGS = ["agent", "mean", "IQM", "score", "training", "stays from", "solved", "CPU time"]
 ROWS = [
     [
         "first",
@@ -81,12 +81,12 @@ ROWS = [
     ],
 ]
 TABLE = """\
-┏━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━┳━━━━━━━━┳━━━━━━┓
-┃ agent  ┃            mean ┃             IQM ┃          score ┃        training ┃ stays from ┃ solved ┃ time ┃
-┡━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━╇━━━━━━━━╇━━━━━━┩
-│ first  │ 90 [89.9, 90.2] │ 92 [91.9, 92.2] │ 0.9 [0.8, 1.1] │ 95 [94.9, 95.2] │        100 │    75% │ 99 s │
-│ second │ 40 [39.9, 40.2] │ 42 [41.9, 42.2] │ 0.4 [0.3, 0.6] │ 45 [44.9, 45.2] │         50 │    75% │ 49 s │
-└────────┴─────────────────┴─────────────────┴────────────────┴─────────────────┴────────────┴────────┴──────┘
+┏━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━━━━━━┳━━━━━━━━━━━━┳━━━━━━━━┳━━━━━━━━━━┓
+┃ agent  ┃            mean ┃             IQM ┃          score ┃        training ┃ stays from ┃ solved ┃ CPU time ┃
+┡━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━━━━━━╇━━━━━━━━━━━━╇━━━━━━━━╇━━━━━━━━━━┩
+│ first  │ 90 [89.9, 90.2] │ 92 [91.9, 92.2] │ 0.9 [0.8, 1.1] │ 95 [94.9, 95.2] │        100 │    75% │     99 s │
+│ second │ 40 [39.9, 40.2] │ 42 [41.9, 42.2] │ 0.4 [0.3, 0.6] │ 45 [44.9, 45.2] │         50 │    75% │     49 s │
+└────────┴─────────────────┴─────────────────┴────────────────┴─────────────────┴────────────┴────────┴──────────┘
 """  # noqa: E501  # as wide as it is printed
 CAPTION = (
     "mean, IQM: return of the final policy, with 95 % intervals over 4 seeds; training: return of "
@@ -256,7 +256,7 @@ def test_what_applies_to_no_agent_has_no_column_and_no_explanation(made_up):
         lambda console: print_analysis(console, made_up.analysis([place], ["alone"]))
     )
     assert lines[1] == "lake"
-    assert cells(lines)[0] == ["agent", "mean", "IQM", "training", "time"]
+    assert cells(lines)[0] == ["agent", "mean", "IQM", "training", "CPU time"]
     assert "stays from" not in below(lines)
 
 
@@ -289,7 +289,7 @@ def test_bandits_have_a_table_of_their_own(made_up, width):
     # The sums of regret are .6 and .3, and the last pulls .3 and 0; the last rewards 1 and 0.
     headings = ["agent", "mean regret", "5% to 95% of runs", "simple regret", "reward", "best arm"]
     row = ["first", "7 [6.9, 7.2]", "0.315 to 0.585", "0.15", "0.5", "50.0%", "10 s"]
-    table = [[*headings, "time"], row]
+    table = [[*headings, "CPU time"], row]
     regret = "regret: sum over the pulls of a run, with 95 % intervals over 4 runs; "
     simple = "simple regret: of recommending the arm pulled most; "
     last = "reward, best arm: at the last pulls"
@@ -333,3 +333,21 @@ def test_blocks_of_episodes_agents_side_by_side():
         ["episode", "first"],
         ["1,000", "4  3  8"],
     ]
+
+
+@pytest.mark.parametrize("width", [80, 100, 200])
+def test_agents_for_whom_there_is_no_room_beside_the_others_come_below(width):
+    names = ["qlearning", "expected_sarsa", "dqn, engine: auto", "a name of more than 20 letters"]
+    returns = {"average": -27_427.5, "minimum": -30_000.25, "maximum": -200.25}
+    rows = [
+        {"environment": "lake", "agent": name, "episode": 100, **returns, "maximum": place}
+        for place, name in enumerate(names)
+    ]
+    _, lines = lines_of(
+        lambda console: print_episodes_table(console, pd.DataFrame(rows), 100), width
+    )
+    assert max(map(len, lines)) <= width
+    found = [row for row in cells(lines) if row[0] != "episode"]
+    ends = [int(cell.split()[-1]) for row in found for cell in row[1:]]
+    assert ends == [*range(len(names))]
+    assert all(cell.startswith("-27,428  -30,000  ") for row in found for cell in row[1:])

@@ -83,7 +83,7 @@ def test_the_cost_is_counted(tuning_record):
         ("Judged on all seeds", "3"),
         ("Runs", "8 of at most 12"),
         ("Runs saved by ending trials early", "33%"),
-        ("Training, one run after the other", "16 s"),
+        ("Processor time of all runs", "16 s"),
         ("From the first trial to the end of the last", "66 s"),
         ("Runs of the re-test", "8"),
     ]
