@@ -46,8 +46,29 @@ def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     return override(settings, {**changes, **merged})
 
 
+# What settings are called in labels and on axes: as the field writes them.
+_SYMBOLS = {
+    "learning_rate": "α",  # noqa: RUF001
+    "gamma": "γ",  # noqa: RUF001
+    "exploration_initial_eps": "ε",
+    "trace_decay": "λ",
+    "gae_lambda": "λ",
+    "kappa": "κ",
+    "initial_q": "initial Q",
+}
+# In names of files, on the other hand.
+_SPELT = {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa", " = ": "="}  # noqa: RUF001
+
+
+def symbol(setting: str) -> str:
+    """A setting as labels and axes call it: the field's letter, or else its own name."""
+    return _SYMBOLS.get(setting, setting)
+
+
 def file_name(label: str, longest: int = LONGEST_NAME) -> str:
     """The label as the name of a folder, of ``longest`` bytes at most."""
+    for sign, spelt in _SPELT.items():
+        label = label.replace(sign, spelt)
     return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
 
 

@@ -16,21 +16,22 @@ from report.figures.bandit_figures import (
     draw_rewards,
     draw_simple_regret,
 )
-from report.figures.figure_style import figure
+from report.figures.figure_style import figure, shared_legend
 from report.figures.study_figures import (
     draw_blocks,
+    draw_grid,
     draw_learning_curves,
     draw_profiles,
     draw_runs,
     draw_sweeps,
 )
 from report.series.agent_marks import Mark
-from report.series.posteriors import Belief
-from report.series.pull_series import ArmSeries, PullSeries
+from report.series.pull_series import PullSeries
 from report.series.study_series import EnvironmentSeries, StudySeries
 
 # More agents than this make no readable lines; a study of parameters shows them by parameter.
 MOST_LINES = 14
+MOST_COLUMNS = 3
 
 Marks = Mapping[str, Mark]
 
@@ -74,12 +75,20 @@ def _study_figures(
     name = file_name(environment.environment)
     if one.sweeps:
         with figure(folder / f"{name}_sweep", written) as (axes,):
-            draw_sweeps(axes, one.sweeps, environment.environment, metric)
+            draw_sweeps(axes, one.sweeps, environment, metric)
+    for group, grid in one.grids.items():
+        path = folder / f"{name}_{file_name(group)}_grid"
+        title = (
+            f"{environment.environment}, {group}" if len(one.grids) > 1 else environment.environment
+        )
+        with figure(path, written, height=1.0 + 0.4 * len(grid.down)) as (axes,):
+            draw_grid(axes, grid, title, environment, metric)
     if len(environment.agents) > MOST_LINES or one.curves is None:
         return written
     with figure(folder / f"{name}_learning_curves", written, n_columns=2) as places:
         draw_learning_curves(places, one.curves, environment, marks)
-    with figure(folder / f"{name}_intervals", written) as (axes,):
+    height = 0.9 + 0.32 * max(len(environment.agents), 3)
+    with figure(folder / f"{name}_intervals", written, height=height) as (axes,):
         draw_runs(axes, one.runs, environment, metric, marks)
     if blocks is not None:
         rows = blocks[blocks["environment"] == environment.environment]
@@ -91,9 +100,14 @@ def _block_figure(rows: pd.DataFrame, path: Path, marks: Marks) -> list[Path]:
     agents = list(dict.fromkeys(rows["agent"]))
     written: list[Path] = []
     if agents:
-        with figure(path, written, n_columns=len(agents)) as places:
-            for axes, agent in zip(places, agents, strict=True):
+        n_columns = min(len(agents), MOST_COLUMNS)
+        n_rows = -(-len(agents) // n_columns)
+        with figure(path, written, n_columns, n_rows, height=2.2) as places:
+            for axes, agent in zip(places, agents, strict=False):
                 draw_blocks(axes, rows[rows["agent"] == agent], marks[agent])
+            for axes in places[len(agents) :]:
+                axes.set_visible(False)
+            shared_legend(places[0])
     return written
 
 
@@ -101,34 +115,21 @@ def _bandit_figures(pulls: PullSeries, place: str, folder: Path, marks: Marks) -
     written: list[Path] = []
     name = file_name(place)
     if len(pulls.pulls) <= MOST_LINES:
-        with figure(folder / f"{name}_pulls", written, n_columns=2) as (left, right):
-            draw_rewards(left, right, pulls, place, marks)
-        n_columns = 1 + pulls.has_simple_regret
-        with figure(folder / f"{name}_regret", written, n_columns=n_columns) as (left, *others):
-            draw_regret(left, pulls, place, marks)
+        with figure(folder / f"{name}_pulls", written, n_rows=2) as (upper, lower):
+            draw_rewards(upper, lower, pulls, place, marks)
+        n_rows = 1 + pulls.has_simple_regret
+        with figure(folder / f"{name}_regret", written, n_rows=n_rows) as (upper, *others):
+            draw_regret(upper, pulls, place, marks)
             for axes in others:
                 draw_simple_regret(axes, pulls, marks)
     if pulls.arms is not None and len(pulls.arms.shares) <= MOST_LINES:
-        written += _arm_figure(pulls.arms, folder / f"{name}_arms", marks)
+        with figure(folder / f"{name}_arms", written, n_rows=2) as (upper, lower):
+            draw_arms(upper, lower, pulls.arms, marks)
     for belief in pulls.beliefs:
         path = folder / f"{name}_{file_name(belief.agent)}_posteriors"
-        written += _belief_figure(belief, path)
-    return written
-
-
-def _arm_figure(arms: ArmSeries, path: Path, marks: Marks) -> list[Path]:
-    written: list[Path] = []
-    height = 4.2 * max(arms.n_contexts / 2, 1)
-    with figure(path, written, n_columns=2, height=height) as (left, right):
-        draw_arms(left, right, arms, marks)
-    return written
-
-
-def _belief_figure(belief: Belief, path: Path) -> list[Path]:
-    written: list[Path] = []
-    n_moments, n_contexts = belief.densities.shape[:2]
-    with figure(
-        path, written, n_columns=n_moments, n_rows=n_contexts, height=3.2 * n_contexts
-    ) as panels:
-        draw_belief(panels, belief)
+        n_moments, n_contexts = belief.densities.shape[:2]
+        n_columns = 2 if n_moments % 2 == 0 else 1
+        n_rows = n_moments * n_contexts // n_columns
+        with figure(path, written, n_columns, n_rows, height=2.0) as panels:
+            draw_belief(panels, belief)
     return written

@@ -2,23 +2,44 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import cycle
 from typing import TYPE_CHECKING
 
+import matplotlib as mpl
 import numpy as np
 import pandas as pd
-from matplotlib.ticker import EngFormatter, FixedLocator, FuncFormatter, PercentFormatter
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import (
+    EngFormatter,
+    FixedLocator,
+    FuncFormatter,
+    NullLocator,
+    PercentFormatter,
+)
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.overall_analysis import OverallAnalysis
-from experiments.study_spec import METRIC_WORDS
+from experiments.study_spec import COSTS, METRIC_WORDS
+from mdp.array_types import Floats
 from pipeline.pictures.learning_curve import symlog_ticks
-from report.figures.figure_style import REFERENCE, colour_of, line_style, shared_legend
+from report.figures.figure_style import (
+    LOG,
+    MOST_BANDS,
+    REFERENCE,
+    WIDTH,
+    colour_of,
+    lettering,
+    line_style,
+    shared_legend,
+    wrapped,
+)
 from report.series.agent_marks import COLOURS, Mark
 from report.series.curve_series import Curve, LearningCurves
-from report.series.run_series import RunSeries
-from report.wording import number
+from report.series.run_series import Grid, RunSeries, Sweep
+from report.wording import enumeration, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +48,10 @@ _AXES = {"step": "environment steps", "episode": "episodes"}
 
 ON_VARIANT = "trained on a variant of the environment"
 CIRCLES_APART = 0.12  # of the length of the diagonal
+NAMES = 1.8  # inches of the names of agents beside their runs
+MOST_TICKS = 8  # values of a parameter that the axis names
+FEW = 3  # names in one line of a legend
+FAR = 20  # times the least of some values, the largest makes their axis logarithmic
 
 Marks = Mapping[str, Mark]
 
@@ -49,10 +74,13 @@ def draw_learning_curves(
                 _mark_variant(place, curve, marks[agent])
         if not curves[kind].on_variant:
             _draw_references(place, environment)
-        place.set(xlabel=_AXES[by], ylabel="return")
+        titles = {
+            "evaluation": f"{environment.environment}: evaluations",
+            "training": _training_title(curves["training"].on_variant),
+        }
+        y = f"return{_beyond(curves[kind].linear_up_to)}"
+        lettering(place, title=titles[kind], x=_AXES[by], y=y)
         place.xaxis.set_major_formatter(EngFormatter(sep=""))
-    places[0].set_title(f"{environment.environment}: evaluations", loc="left")
-    places[1].set_title(_training_title(curves["training"].on_variant), loc="left")
     if curves["training"].on_variant:
         # The legend below is of these axes: it tells what the circles on the others are.
         places[0].plot([], [], "o", color=REFERENCE, markerfacecolor="white", label=ON_VARIANT)
@@ -73,16 +101,27 @@ def _training_title(on_variant: Sequence[str]) -> str:
     return f"training episodes ({names}: on a variant of the environment)"
 
 
+def _beyond(linear_up_to: float | None) -> str:
+    """What the name of an axis says of its scale."""
+    return "" if linear_up_to is None else f" (log scale beyond ±{number(linear_up_to)})"
+
+
 def _set_scale(axes: Axes, linear_up_to: float | None) -> None:
     """Make the upright axis logarithmic where early returns dwarf those that matter."""
     if linear_up_to is not None:
         axes.set_yscale("symlog", linthresh=linear_up_to)
         axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: number(value)))
+        axes.yaxis.set_minor_locator(NullLocator())
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _signed(value)))
+
+
+def _signed(value: float) -> str:
+    """A number as Matplotlib's own axes have it."""
+    return number(value).replace("-", "\N{MINUS SIGN}")
 
 
 def _draw_curve(axes: Axes, curve: Curve, mark: Mark, alpha: float = 0.2) -> None:
-    marker = "o" if len(curve.x) == 1 else ""
+    marker = "o" if len(curve.x) == 1 else ""  # which has no length
     style = line_style(mark)
     axes.plot(curve.x, curve.y, label=mark.label, linewidth=1.5, marker=marker, **style)
     axes.fill_between(
@@ -115,8 +154,9 @@ def draw_runs(
         axes.plot(agent.values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
         mean = agent.mean
         axes.plot([mean.low, mean.high], [row, row], color=colour, linewidth=5, alpha=0.35)
-        axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=2.5)
-    axes.set_yticks(range(len(upwards)), [agent.agent for agent in upwards])
+        axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
+    names = [wrapped(agent.agent, NAMES) for agent in upwards]
+    axes.set_yticks(range(len(upwards)), names)
     axes.set_ylim(-0.6, len(upwards) - 0.4)
     title = environment.environment
     if metric in ("final", "best") and environment.optimum is not None:
@@ -126,18 +166,100 @@ def draw_runs(
         else:
             axes.axvline(environment.optimum_at_least, color=REFERENCE, linewidth=1)
             title += "; the optimum lies between the lines"
-    axes.set_title(title, loc="left")
-    axes.set_xlabel(f"{METRIC_WORDS[metric]}; mean, 95 % interval, each seed")
+    x = f"{METRIC_WORDS[metric]}; mean, 95 % interval, each seed"
+    lettering(axes, title=title, x=x, beside=NAMES + 0.3)
 
 
-def draw_sweeps(axes: Axes, sweeps: Mapping[str, Curve], place: str, metric: str) -> None:
-    """What the verdicts are about against the one parameter that an agent was swept over."""
-    for colour, (name, curve) in zip(cycle(COLOURS), sweeps.items(), strict=False):
-        axes.plot(curve.x, curve.y, "o-", color=colour, label=name, markersize=4)
-        axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
-    axes.set(xscale="log", xlabel="value of the parameter", ylabel=METRIC_WORDS[metric])
-    axes.set_title(place, loc="left")
-    axes.legend(frameon=False)
+def draw_sweeps(
+    axes: Axes, sweeps: Mapping[str, Sweep], environment: EnvironmentAnalysis, metric: str
+) -> None:
+    """What the verdicts are about against the one parameter that agents were swept over."""
+    names = list(dict.fromkeys(sweep.parameter for sweep in sweeps.values()))
+    scale = _scale(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
+    axes.set_xscale(scale.name, **scale.options)
+    for colour, (group, sweep) in zip(cycle(COLOURS), sweeps.items(), strict=False):
+        curve = sweep.means
+        label = group if len(names) == 1 else f"{group}, {sweep.parameter}"
+        axes.plot(curve.x, curve.y, "o-", color=colour, label=label, markersize=4)
+        if len(sweeps) <= MOST_BANDS:
+            axes.fill_between(curve.x, curve.low, curve.high, color=colour, alpha=0.2, linewidth=0)
+    best = best_of(environment, [label for sweep in sweeps.values() for label in sweep.labels])
+    rings = [
+        (x, y)
+        for sweep in sweeps.values()
+        for label, x, y in zip(sweep.labels, sweep.means.x, sweep.means.y, strict=True)
+        if label in best
+    ]
+    words = f"best: {enumeration(best)}" if len(best) <= FEW else "best"
+    axes.scatter(*zip(*rings, strict=True), 90, "none", edgecolor="black", label=words, zorder=3)
+    values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
+    if len(values) <= MOST_TICKS:
+        axes.xaxis.set_major_locator(FixedLocator(values.tolist()))
+        axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
+    x = names[0] if len(names) == 1 else "value of the parameter"
+    lettering(axes, title=environment.environment, x=x + scale.words, y=METRIC_WORDS[metric])
+    shared_legend(axes)
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """The scale of an axis: what Matplotlib calls it, its options, and what its name says of it."""
+
+    name: str = "linear"
+    options: Mapping[str, float] = field(default_factory=dict)
+    words: str = ""
+
+
+def _scale(values: Floats) -> _Scale:
+    """Logarithmic where the values go over more than a power of ten."""
+    least = float(values[values > 0].min(initial=np.inf))
+    if values.min() < 0 or values.max() <= FAR * least:
+        return _Scale()
+    if values.min() > 0:
+        return _Scale("log", words=f" {LOG}")
+    return _Scale("symlog", {"linthresh": least}, _beyond(least).replace("±", ""))
+
+
+def best_of(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
+    """Those of these agents that have the best mean."""
+    found = [agent for agent in environment.agents if agent.agent in labels]
+    best = found[0].metric.mean.point
+    return [a.agent for a in found if math.isclose(a.metric.mean.point, best)]
+
+
+def draw_grid(
+    axes: Axes, grid: Grid, title: str, environment: EnvironmentAnalysis, metric: str
+) -> None:
+    """The means over two swept parameters as a heat map, the best in frames."""
+    low, high = np.nanmin(grid.means), np.nanmax(grid.means)
+    shares = (grid.means - low) / ((high - low) or 1.0)
+    shares = 1 - shares if metric in COSTS else shares  # the darker the better
+    colours = mpl.colormaps["Blues"](0.05 + 0.75 * shares)
+    axes.pcolormesh(*map(_edges, grid.means.shape[::-1]), colours, edgecolor="white", linewidth=1)
+    best = best_of(environment, [label for row in grid.labels for label in row])
+    for (row, column), mean in np.ndenumerate(grid.means):
+        if not np.isnan(mean):
+            ink = "white" if shares[row, column] > 0.6 else "black"
+            axes.text(column, row, number(mean), color=ink, ha="center", va="center", size=8)
+        if grid.labels[row][column] in best:
+            frame = Rectangle((column - 0.46, row - 0.44), 0.92, 0.88, fill=False, linewidth=2)
+            frame.set_edgecolor(COLOURS[1])
+            axes.add_patch(frame)
+    axes.invert_yaxis()
+    axes.grid(visible=False)
+    room = WIDTH / len(grid.across) - 0.3
+    axes.set_xticks(range(len(grid.across)), [wrapped(text, room) for text in grid.across])
+    axes.set_yticks(range(len(grid.down)), [wrapped(text, 1.0) for text in grid.down])
+    axes.tick_params(length=0)
+    y, x = grid.parameters
+    title += f": {METRIC_WORDS[metric]}; the best in {'a frame' if len(best) == 1 else 'frames'}"
+    lettering(axes, title=title, x=x, y=y, beside=1.5)
+
+
+def _edges(n: int) -> Floats:
+    """Of cells whose middles are 0, 1, 2 and so on."""
+    return np.arange(n + 1) - 0.5
 
 
 def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark) -> None:
@@ -152,9 +274,7 @@ def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark) -> None:
             label=column,
             color=colour_of(mark),
         )
-    axes.set_title(mark.label, loc="left")
-    axes.set(xlabel="episode", ylabel="return")
-    axes.legend(frameon=False)
+    lettering(axes, title=mark.label, x="episode", y="return")
 
 
 def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
@@ -162,7 +282,8 @@ def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
     for agent, band in overall.profiles.items():
         curve = Curve(overall.thresholds, band.point, band.low, band.high)
         _draw_curve(axes, curve, marks[agent], alpha=0.15)
-    axes.set(xlabel="score", ylabel="share of runs with a higher score", ylim=(0, 1.02))
+    axes.set_ylim(0, 1.02)
     axes.yaxis.set_major_formatter(PercentFormatter(1))
-    axes.set_title("Performance profiles over environments", loc="left")
-    axes.legend(frameon=False)
+    title = "Performance profiles over environments"
+    lettering(axes, title=title, x="score", y="share of runs with a higher score")
+    shared_legend(axes)
