@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import cycle
@@ -38,7 +37,7 @@ from report.figures.figure_style import (
 )
 from report.series.agent_marks import COLOURS, Mark
 from report.series.curve_series import Curve, LearningCurves
-from report.series.run_series import Grid, RunSeries, Sweep
+from report.series.run_series import Grid, RunSeries, Sweep, best_of
 from report.wording import enumeration, number
 
 if TYPE_CHECKING:
@@ -191,14 +190,15 @@ def draw_sweeps(
         if label in best
     ]
     words = f"best: {enumeration(best)}" if len(best) <= FEW else "best"
-    axes.scatter(*zip(*rings, strict=True), 90, "none", edgecolor="black", label=words, zorder=3)
+    x, y = np.transpose(rings)
+    axes.scatter(x, y, 90, "none", edgecolor="black", label=words, zorder=3)
     values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
     if len(values) <= MOST_TICKS:
         axes.xaxis.set_major_locator(FixedLocator(values.tolist()))
         axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.4g}"))
-    x = names[0] if len(names) == 1 else "value of the parameter"
-    lettering(axes, title=environment.environment, x=x + scale.words, y=METRIC_WORDS[metric])
+    across = names[0] if len(names) == 1 else "value of the parameter"
+    lettering(axes, title=environment.environment, x=across + scale.words, y=METRIC_WORDS[metric])
     shared_legend(axes)
 
 
@@ -221,20 +221,11 @@ def _scale(values: Floats) -> _Scale:
     return _Scale("symlog", {"linthresh": least}, _beyond(least).replace("±", ""))
 
 
-def best_of(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
-    """Those of these agents that have the best mean."""
-    found = [agent for agent in environment.agents if agent.agent in labels]
-    best = found[0].metric.mean.point
-    return [a.agent for a in found if math.isclose(a.metric.mean.point, best)]
-
-
 def draw_grid(
     axes: Axes, grid: Grid, title: str, environment: EnvironmentAnalysis, metric: str
 ) -> None:
     """The means over two swept parameters as a heat map, the best in frames."""
-    low, high = np.nanmin(grid.means), np.nanmax(grid.means)
-    shares = (grid.means - low) / ((high - low) or 1.0)
-    shares = 1 - shares if metric in COSTS else shares  # the darker the better
+    shares = grid.shares(is_cost=metric in COSTS)  # the darker the better
     colours = mpl.colormaps["Blues"](0.05 + 0.75 * shares)
     axes.pcolormesh(*map(_edges, grid.means.shape[::-1]), colours, edgecolor="white", linewidth=1)
     best = best_of(environment, [label for row in grid.labels for label in row])
@@ -259,7 +250,7 @@ def draw_grid(
 
 def _edges(n: int) -> Floats:
     """Of cells whose middles are 0, 1, 2 and so on."""
-    return np.arange(n + 1) - 0.5
+    return np.arange(-0.5, n)
 
 
 def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -81,6 +82,12 @@ class Grid:
     means: Floats
     labels: list[list[str]]
 
+    def shares(self, *, is_cost: bool) -> Floats:
+        """How far each mean is on the way from the worst to the best: 0 to 1."""
+        low, high = np.nanmin(self.means), np.nanmax(self.means)
+        shares = (self.means - low) / ((high - low) or 1.0)
+        return 1 - shares if is_cost else shares
+
 
 def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> RunSeries:
     """The runs on an environment, by what the verdicts are about."""
@@ -127,6 +134,15 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
             parameters = symbol(names[0]), symbol(names[1])
             found[group] = Grid(parameters, rows, columns, np.array(points), labels)
     return found
+
+
+def best_of(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
+    """Those of these agents that have the best mean."""
+    found = [agent for agent in environment.agents if agent.agent in labels]
+    means = {agent.agent: agent.metric.mean.point for agent in found}
+    return [
+        label for label, mean in means.items() if math.isclose(mean, found[0].metric.mean.point)
+    ]
 
 
 def _means(environment: EnvironmentAnalysis) -> dict[str, Estimate]:
