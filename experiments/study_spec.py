@@ -48,8 +48,8 @@ def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
 
 # What settings are called in labels and on axes: as the field writes them.
 _SYMBOLS = {
-    "learning_rate": "α",  # noqa: RUF001
-    "gamma": "γ",  # noqa: RUF001
+    "learning_rate": "α",
+    "gamma": "γ",
     "exploration_initial_eps": "ε",
     "trace_decay": "λ",
     "gae_lambda": "λ",
@@ -57,7 +57,7 @@ _SYMBOLS = {
     "initial_q": "initial Q",
 }
 # In names of files, on the other hand.
-_SPELT = {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa", " = ": "="}  # noqa: RUF001
+_SPELT = {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa"}
 
 
 def symbol(setting: str) -> str:
@@ -67,8 +67,7 @@ def symbol(setting: str) -> str:
 
 def file_name(label: str, longest: int = LONGEST_NAME) -> str:
     """The label as the name of a folder, of ``longest`` bytes at most."""
-    for sign, spelt in _SPELT.items():
-        label = label.replace(sign, spelt)
+    label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
     return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
 
 

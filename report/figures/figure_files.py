@@ -16,7 +16,7 @@ from report.figures.bandit_figures import (
     draw_rewards,
     draw_simple_regret,
 )
-from report.figures.figure_style import figure, shared_legend
+from report.figures.figure_style import figure
 from report.figures.study_figures import (
     draw_blocks,
     draw_grid,
@@ -24,6 +24,8 @@ from report.figures.study_figures import (
     draw_profiles,
     draw_runs,
     draw_sweeps,
+    name_blocks,
+    panels,
 )
 from report.series.agent_marks import Mark
 from report.series.pull_series import PullSeries
@@ -81,14 +83,14 @@ def _study_figures(
         title = (
             f"{environment.environment}, {group}" if len(one.grids) > 1 else environment.environment
         )
-        with figure(path, written, height=1.0 + 0.4 * len(grid.down)) as (axes,):
+        with figure(path, written, height=1.6 + 0.4 * len(grid.down)) as (axes,):
             draw_grid(axes, grid, title, environment, metric)
     if len(environment.agents) > MOST_LINES or one.curves is None:
         return written
-    with figure(folder / f"{name}_learning_curves", written, n_columns=2) as places:
-        draw_learning_curves(places, one.curves, environment, marks)
-    height = 0.9 + 0.32 * max(len(environment.agents), 3)
-    with figure(folder / f"{name}_intervals", written, height=height) as (axes,):
+    if n_columns := len(panels(one.curves)):
+        with figure(folder / f"{name}_learning_curves", written, n_columns) as places:
+            draw_learning_curves(places, one.curves, environment, marks)
+    with figure(folder / f"{name}_intervals", written) as (axes,):
         draw_runs(axes, one.runs, environment, metric, marks)
     if blocks is not None:
         rows = blocks[blocks["environment"] == environment.environment]
@@ -107,7 +109,7 @@ def _block_figure(rows: pd.DataFrame, path: Path, marks: Marks) -> list[Path]:
                 draw_blocks(axes, rows[rows["agent"] == agent], marks[agent])
             for axes in places[len(agents) :]:
                 axes.set_visible(False)
-            shared_legend(places[0])
+            name_blocks(places[0])
     return written
 
 
@@ -130,6 +132,6 @@ def _bandit_figures(pulls: PullSeries, place: str, folder: Path, marks: Marks) -
         n_moments, n_contexts = belief.densities.shape[:2]
         n_columns = 2 if n_moments % 2 == 0 else 1
         n_rows = n_moments * n_contexts // n_columns
-        with figure(path, written, n_columns, n_rows, height=2.0) as panels:
-            draw_belief(panels, belief)
+        with figure(path, written, n_columns, n_rows, height=2.2) as places:
+            draw_belief(places, belief)
     return written

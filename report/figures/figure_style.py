@@ -18,6 +18,7 @@ from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.patches import Patch
 from matplotlib.textpath import TextToPath
 
 from pipeline.files import replacing
@@ -49,7 +50,7 @@ _FONTS: Any = {
     "svg.fonttype": "none",
     "pdf.fonttype": 42,  # what publishers take
 }
-_FORMATS: Mapping[str, tuple[Any, Any]] = {
+FORMATS: Mapping[str, tuple[Any, Any]] = {
     "png": (FigureCanvasAgg, {}),
     "svg": (FigureCanvasSVG, {"metadata": {"Date": None}}),
     "pdf": (FigureCanvasPdf, {"metadata": {"CreationDate": None}}),
@@ -81,7 +82,7 @@ def figure(
             place.grid(alpha=0.3)
             place.spines[["top", "right"]].set_visible(False)
         yield axes
-        for suffix, (backend, options) in _FORMATS.items():
+        for suffix, (backend, options) in FORMATS.items():
             target = path.with_name(f"{path.name}.{suffix}")
             # `savefig` would draw twice, the first time to find places alone.
             with replacing(target) as file:
@@ -132,35 +133,49 @@ def _figure_of(axes: Axes) -> Figure:
     return found
 
 
-def shared_legend(axes: Axes) -> None:
-    """Below the whole figure, which becomes higher by it, the names of what these axes show."""
-    handles, names = axes.get_legend_handles_labels()
-    if not handles:
+def band_words(n_curves: int) -> str:
+    """What the bands of so many curves are, the best first."""
+    return "95 % interval" if n_curves <= MOST_BANDS else f"95 % interval, of the best {MOST_BANDS}"
+
+
+def shared_legend(*places: Axes, band: str = "") -> None:
+    """Below the whole figure, which becomes higher by it, the names of what the axes show."""
+    named = [axes.get_legend_handles_labels() for axes in places]
+    found = {name: handle for some in named for handle, name in zip(*some, strict=True)}
+    if not found:
         return
-    figure = _figure_of(axes)
-    names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in names]
+    figure = _figure_of(places[0])
+    found |= {band: Patch(color=REFERENCE, alpha=0.2, linewidth=0)} if band else {}
+    names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in found]
     lines = [name.split("\n") for name in names]
     widest = max(_width(line, _SMALL) for name in lines for line in name) + 0.6
     n_columns = min(len(names), max(int((figure.get_figwidth() - 0.3) / widest), 1))
     n_rows = -(-len(names) // n_columns) * max(map(len, lines))
     figure.set_figheight(figure.get_figheight() + _LINE * (n_rows + 1))
+    handles = list(found.values())
     figure.legend(handles, names, loc="outside lower center", ncols=n_columns, frameon=False)
 
 
+def make_room(axes: Axes, names: Sequence[str]) -> None:
+    """Make a figure of one panel as high as the names beside its axes need."""
+    lines = max(name.count("\n") + 1 for name in names)
+    _figure_of(axes).set_figheight(1.0 + len(names) * max(0.32, _LINE * lines + 0.04))
+
+
 def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
-    """Names beside the ends of lines, below each other where the ends lie closer.
+    """Names beside the ends of lines; an arrow stands after one whose line has left the axes.
 
     Args:
         axes: where all lines have been drawn.
         ends: name, x, y and colour of each.
     """
-    names = [wrapped(name, _END) for name, *_ in ends]
+    low, high = axes.get_ylim()
+    names = [wrapped(f"{name} ↑" if y > high else name, _END) for name, _, y, _ in ends]
     figure, spec = _figure_of(axes), axes.get_subplotspec()
     n_rows = 1 if spec is None else spec.get_gridspec().nrows
     needed = [_LINE * (name.count("\n") + 1) for name in names]
     inches = max(figure.get_figheight() / n_rows - _BELOW, sum(needed))
     figure.set_figheight(max(figure.get_figheight(), (inches + _BELOW) * n_rows))
-    low, high = axes.get_ylim()
     seen = [float(np.clip(y, low, high)) for _, _, y, _ in ends]
     heights = [(y - low) / ((high - low) or 1.0) for y in seen]
     places = _apart(heights, [inch / inches for inch in needed])
@@ -178,7 +193,7 @@ def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> Non
             arrowprops={
                 "arrowstyle": "-",
                 "color": colour,
-                "linewidth": 0.5,
+                "linewidth": 0.5 if y < high else 0,
                 "shrinkA": 0,
                 "shrinkB": 0,
                 "relpos": (0, 0.5),

@@ -84,9 +84,10 @@ class Grid:
 
     def shares(self, *, is_cost: bool) -> Floats:
         """How far each mean is on the way from the worst to the best: 0 to 1."""
-        low, high = np.nanmin(self.means), np.nanmax(self.means)
-        shares = (self.means - low) / ((high - low) or 1.0)
-        return 1 - shares if is_cost else shares
+        known = self.means[np.isfinite(self.means)]
+        low, high = known.min(initial=np.inf), known.max(initial=-np.inf)
+        shares = (self.means - low) / (high - low if high > low else 1.0)
+        return np.asarray(1 - shares if is_cost else shares)
 
 
 def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> RunSeries:

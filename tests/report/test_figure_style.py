@@ -8,11 +8,11 @@ from report.off_policy_table import shown
 from verdicts import Estimate
 
 
-def test_a_figure_has_a_grid_and_two_spines_and_is_written_twice(tmp_path):
+def test_a_figure_has_a_grid_and_two_spines_and_is_written_three_times(tmp_path):
     written = []
     with figure(tmp_path / "two", written, n_columns=2) as axes:
         assert len(axes) == 2
-    assert written == [tmp_path / "two.png", tmp_path / "two.svg"]
+    assert written == [tmp_path / f"two.{suffix}" for suffix in ("png", "svg", "pdf")]
     assert all(path.stat().st_size > 1000 for path in written)
     for place in axes:
         visible = {side for side, spine in place.spines.items() if spine.get_visible()}

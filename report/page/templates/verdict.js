@@ -3,8 +3,9 @@ report.section("verdict", (root, { files, metric, sweeps }) => {
   root.querySelectorAll(".plot").forEach((element) => {
     const curves = Object.entries(sweeps[element.dataset.card]);
     const values = [...new Set(curves.flatMap(([, curve]) => curve.x))].sort((a, b) => a - b);
-    const isLog = values[0] > 0 && values.at(-1) > 20 * values[0];
+    const isLog = values[0] > 0 && values.at(-1) >= 10 * values[0];
     const names = [...new Set(curves.map(([, curve]) => curve.parameter))];
+    const reach = (middle, ends) => middle.map((y, i) => (ends[i] === null ? 0 : Math.abs(ends[i] - y)));
     report.figure(element, () => ({
       traces: [
         ...curves.map(([name, curve], k) => ({
@@ -13,7 +14,7 @@ report.section("verdict", (root, { files, metric, sweeps }) => {
           name: report.text(names.length > 1 ? `${name}, ${curve.parameter}` : name),
           mode: "lines+markers",
           line: { color: report.css(`--agent-${k % 7}`), width: 2 },
-          error_y: { type: "data", symmetric: false, array: curve.y.map((y, i) => curve.high[i] - y), arrayminus: curve.y.map((y, i) => y - curve.low[i]), thickness: 1.5, width: 4 },
+          error_y: { type: "data", symmetric: false, array: reach(curve.y, curve.high), arrayminus: reach(curve.y, curve.low), thickness: 1.5, width: 4 },
           hovertemplate: `${report.text(curve.parameter)} = %{x}: %{y:,.4~r}`,
         })),
         ...curves.map(([, curve]) => ({
