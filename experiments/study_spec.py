@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -156,6 +156,7 @@ class StudySpec:
         render_every: episodes between two that are filmed; 0 for no films.
         learning_pages: whether the page links to others that play the first training of each
             agent.
+        figures: the formats that figures are written in: "png", "svg", "pdf".
         run_timeout: seconds that each run may take; None for no limit.
         run_memory: bytes of memory that each run may take; None for no limit.
         source: the file that it was read from, or None.
@@ -180,6 +181,7 @@ class StudySpec:
     tensorboard: bool = False
     render_every: int = 0
     learning_pages: bool = False
+    figures: Sequence[str] = ("png", "svg")
     run_timeout: float | None = None
     run_memory: int | None = None
     source: Path | None = None

@@ -1,4 +1,4 @@
-"""The look of a study's figures, and how one becomes files: PNG, SVG and PDF.
+"""The look of a study's figures, and how one becomes files.
 
 A figure is as wide as the text of a page, so that it is printed as it is drawn. Words that would be
 wider than what they belong to go over several lines.
@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
-from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.patches import Patch
@@ -50,11 +49,7 @@ _FONTS: Any = {
     "svg.fonttype": "none",
     "pdf.fonttype": 42,  # what publishers take
 }
-FORMATS: Mapping[str, tuple[Any, Any]] = {
-    "png": (FigureCanvasAgg, {}),
-    "svg": (FigureCanvasSVG, {"metadata": {"Date": None}}),
-    "pdf": (FigureCanvasPdf, {"metadata": {"CreationDate": None}}),
-}
+FORMATS = ("png", "svg", "pdf")
 
 LOG = "(log scale)"
 
@@ -69,27 +64,46 @@ def colour_of(mark: Mark) -> str:
     return COLOURS[mark.colour]
 
 
-@contextmanager
-def figure(
-    path: Path, written: list[Path], n_columns: int = 1, n_rows: int = 1, height: float = HEIGHT
-) -> Iterator[Sequence[Axes]]:
-    """Axes row by row, ``height`` inches each, written to ``path`` as PNG, SVG and PDF."""
-    with mpl.rc_context(_FONTS):
-        # The resolution is that of the PNG; the other two have none.
-        canvas = Figure(figsize=(WIDTH, height * n_rows), dpi=300, layout="constrained")
-        axes = list(canvas.subplots(n_rows, n_columns, squeeze=False).flat)
-        for place in axes:
-            place.grid(alpha=0.3)
-            place.spines[["top", "right"]].set_visible(False)
-        yield axes
-        for suffix, (backend, options) in FORMATS.items():
-            target = path.with_name(f"{path.name}.{suffix}")
-            # `savefig` would draw twice, the first time to find places alone.
-            with replacing(target) as file:
-                getattr(backend(canvas), f"print_{suffix}")(file, **options)
-            written.append(target)
-            # The other files look as the first: finding places for all takes longest.
-            canvas.set_layout_engine("none")
+@dataclass(frozen=True)
+class FigureFiles:
+    """The files that figures become.
+
+    Attributes:
+        folder: where.
+        formats: which: "png", "svg", "pdf".
+        written: those that there are by now.
+    """
+
+    folder: Path
+    formats: Sequence[str] = FORMATS[:2]
+    written: list[Path] = field(default_factory=list)
+
+    @contextmanager
+    def figure(
+        self, name: str, n_columns: int = 1, n_rows: int = 1, height: float = HEIGHT
+    ) -> Iterator[Sequence[Axes]]:
+        """Axes row by row, ``height`` inches each, written under that name in the end."""
+        with mpl.rc_context(_FONTS):
+            # The resolution is that of the PNG; the other formats have none.
+            canvas = Figure(figsize=(WIDTH, height * n_rows), dpi=300, layout="constrained")
+            axes = list(canvas.subplots(n_rows, n_columns, squeeze=False).flat)
+            for place in axes:
+                place.grid(alpha=0.3)
+                place.spines[["top", "right"]].set_visible(False)
+            yield axes
+            for form in sorted(set(self.formats), key=FORMATS.index):
+                self.written.append(self.folder / f"{name}.{form}")
+                with replacing(self.written[-1]) as file:
+                    write(canvas, form, file)
+                # The other files look as the first: finding places for all takes longest.
+                canvas.set_layout_engine("none")
+
+
+def write(canvas: Figure, form: str, file: BinaryIO) -> None:
+    """Write a figure by its backend; `savefig` would draw twice, the first time for places."""
+    backend = import_module(f"matplotlib.backends.backend_{'agg' if form == 'png' else form}")
+    undated = {"svg": {"metadata": {"Date": None}}, "pdf": {"metadata": {"CreationDate": None}}}
+    getattr(backend.FigureCanvas(canvas), f"print_{form}")(file, **undated.get(form, {}))
 
 
 def _width(text: str, size: float) -> float:

@@ -188,12 +188,11 @@ def canvases(monkeypatch):
         path.touch()
         yield path
 
-    def keep(self, target, **options):
-        seen[target.name.partition(".")[0]] = self.figure.axes
+    def keep(canvas, form, file):
+        seen[file.name.partition(".")[0]] = canvas.axes
 
     monkeypatch.setattr(style, "replacing", named)
-    for suffix, (backend, _) in style.FORMATS.items():
-        monkeypatch.setattr(backend, f"print_{suffix}", keep)
+    monkeypatch.setattr(style, "write", keep)
     return seen
 
 

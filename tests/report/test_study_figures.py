@@ -418,7 +418,7 @@ def test_every_environment_has_its_figures(series, canvases, tmp_path):
             *(f"island_{kind}" for kind in ("sweep", *kinds)),
             "performance_profiles",
         )
-        for suffix in ("png", "svg", "pdf")
+        for suffix in ("png", "svg")
     ]
     assert {path.parent for path in paths} == {tmp_path / "figures"}
     assert set(canvases) == {path.stem for path in paths}
@@ -472,9 +472,7 @@ def test_too_many_agents_make_no_lines(series, made_up, tmp_path):
     crowded = EnvironmentSeries(many, one.curves, one.runs, None, swept_over)
     analysis = made_up.analysis([many], [agent.agent for agent in agents], tmp_path)
     found = write_figures(StudySeries(analysis, series.marks, (crowded,)), None)
-    assert [path.name for path in found] == [
-        f"island_sweep.{suffix}" for suffix in ("png", "svg", "pdf")
-    ]
+    assert [path.name for path in found] == [f"island_sweep.{suffix}" for suffix in ("png", "svg")]
 
 
 def test_marks_go_through_colours_and_dashes_together(made_up):
