@@ -66,17 +66,18 @@ def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> Non
     """Cumulative regret on a logarithmic axis of pulls, with what theory says of it."""
     axes.set_xscale("log")
     lines: list[Line] = []
-    title = f"{place}: mean of {series.n_runs:,} runs"
+    # The interval of the mean, then the spread of runs, as far as the bands are few.
+    kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
     for agent, pulls in series.pulls.items():
         style = line_style(marks[agent])
-        mean, runs = mean_regret(pulls), regret_of_runs(pulls)
-        lines.append((agent, pulls.pulls, mean.y, style))
-        for curve, alpha in ((mean, 0.3), (runs, 0.08)) if len(series.pulls) <= MOST_BANDS else ():
+        lines.append((agent, pulls.pulls, mean_regret(pulls).y, style))
+        for curve_of, alpha in kinds:
+            band = curve_of(pulls)
             axes.fill_between(
-                curve.x, curve.low, curve.high, color=style["color"], alpha=alpha, linewidth=0
+                band.x, band.low, band.high, color=style["color"], alpha=alpha, linewidth=0
             )
-    if len(series.pulls) <= MOST_BANDS:
-        title += f", its 95 % interval, and {SPREAD} of the runs"
+    words = ("", " with its 95 % interval", f", its 95 % interval, and {SPREAD} of the runs")
+    title = f"{place}: mean of {series.n_runs:,} runs{words[len(kinds)]}"
     highest = max(axes.dataLim.y1, *(np.nanmax(y) for _, _, y, _ in lines))
     if series.bounds is not None:
         # A bound far above is cut; and one that never learns leaves the others some height.

@@ -121,18 +121,23 @@ def test_regret_with_its_interval_and_the_spread_of_runs(axes, drawn):
     assert place.axes.get_xscale() == "log"
 
 
-def test_many_agents_have_no_bands(axes, drawn):
-    pulls = {f"agent {n}": statistics(10 * n) for n in range(5)}
-    marks = {name: Mark(name, 0, "solid") for name in pulls}
-    places = axes(2)
-    for axis, some in zip(places, (4, 5), strict=True):
-        draw_regret(axis, series(pulls=dict(list(pulls.items())[:some])), "coins", marks)
-    few, many = map(drawn, places)
-    assert (len(few.bands), len(many.bands)) == (8, 0)
-    assert many.title == "coins: mean of 4 runs"
-    # The axis ends with what is drawn.
-    assert few.axes.get_ylim() == pytest.approx((0, 1.05 * (30 + 20 + 2 + 12)))
-    assert many.axes.get_ylim() == pytest.approx((0, 1.05 * (40 + 20 + 2)))
+@pytest.mark.parametrize(
+    ("n_agents", "n_bands", "words", "highest"),
+    [
+        (2, 4, ", its 95 % interval, and 90% of the runs", 10 + 20 + 2 + 12),
+        (4, 4, " with its 95 % interval", 30 + 20 + 2 + 2 * 1.96),
+        (5, 0, "", 40 + 20 + 2),
+    ],
+)
+def test_there_are_four_bands_at_most(axes, drawn, n_agents, n_bands, words, highest):
+    pulls = {f"agent {n}": statistics(10 * n) for n in range(n_agents)}
+    (axis,) = axes()
+    draw_regret(
+        axis, series(pulls=pulls), "coins", {name: Mark(name, 0, "solid") for name in pulls}
+    )
+    assert len(drawn(axis).bands) == n_bands
+    assert drawn(axis).title == f"coins: mean of 4 runs{words}"
+    assert axis.get_ylim() == pytest.approx((0, 1.05 * highest))  # which ends with what is drawn
 
 
 def test_bounds_and_the_height_that_they_leave(axes, drawn):
