@@ -162,12 +162,13 @@ def shared_legend(*places: Axes, band: str = "") -> None:
     found |= {band: Patch(color=REFERENCE, alpha=0.2, linewidth=0)} if band else {}
     names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in found]
     lines = [name.split("\n") for name in names]
-    widest = max(_width(line, _SMALL) for name in lines for line in name) + 0.6
+    widest = max(_width(line, _SMALL) for name in lines for line in name) + 0.65
     n_columns = min(len(names), max(int((figure.get_figwidth() - 0.3) / widest), 1))
     n_rows = -(-len(names) // n_columns) * max(map(len, lines))
     figure.set_figheight(figure.get_figheight() + _LINE * (n_rows + 1))
     handles = list(found.values())
-    figure.legend(handles, names, loc="outside lower center", ncols=n_columns, frameon=False)
+    style = {"ncols": n_columns, "frameon": False, "handlelength": 2.5}  # as long as a dash and dot
+    figure.legend(handles, names, loc="outside lower center", **style)
 
 
 def make_room(axes: Axes, names: Sequence[str]) -> None:
