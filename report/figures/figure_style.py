@@ -34,7 +34,7 @@ MOST_BANDS = 4  # of one figure: more lie over each other until none can be told
 
 # Inches.
 WIDTH, HEIGHT = 6.5, 2.7  # of a row of panels
-_BESIDE, _BELOW = 0.8, 0.8  # what numbers and words take of a panel
+_BESIDE, _BELOW = 0.85, 0.8  # what numbers and words take of a panel
 _END = 1.5  # of the names beside the ends of lines
 _LINE = 0.14  # from one line of small print to the next
 
@@ -106,8 +106,8 @@ def write(canvas: Figure, form: str, file: BinaryIO) -> None:
     getattr(backend.FigureCanvas(canvas), f"print_{form}")(file, **undated.get(form, {}))
 
 
-def _width(text: str, size: float) -> float:
-    """Of a line in inches."""
+def width_of(text: str, size: float = _SMALL) -> float:
+    """The width of a line in inches."""
     font = FontProperties(size=size)
     return TextToPath().get_text_width_height_descent(text, font, ismath=False)[0] / 72
 
@@ -117,12 +117,12 @@ def wrapped(text: str, width: float, size: float = _SMALL) -> str:
     lines = [""]
     for word in text.split():
         longer = f"{lines[-1]} {word}".lstrip()
-        if _width(longer, size) <= width:
+        if width_of(longer, size) <= width:
             lines[-1] = longer
             continue
         lines += [""] if lines[-1] else []
         for letter in word:
-            if lines[-1] and _width(lines[-1] + letter, size) > width:
+            if lines[-1] and width_of(lines[-1] + letter, size) > width:
                 lines.append("")
             lines[-1] += letter
     return "\n".join(lines).replace("$", r"\$")
@@ -134,11 +134,12 @@ def lettering(
     """Title and names of the axes; ``beside`` is what stands left of the axes, in inches."""
     figure, spec = _figure_of(axes), axes.get_subplotspec()
     n_rows, n_columns = (1, 1) if spec is None else spec.get_gridspec().get_geometry()
+    y = wrapped(y, max(figure.get_figheight() / n_rows - _BELOW, 1.0), _PLAIN)
+    beside += 0.17 * y.count("\n")
     width = max(figure.get_figwidth() / n_columns - beside, 1.0)
-    height = max(figure.get_figheight() / n_rows - _BELOW, 1.0)
     axes.set_title(wrapped(title, width, _TITLE), loc="left")
     axes.set_xlabel(wrapped(x, width, _PLAIN))
-    axes.set_ylabel(wrapped(y, height, _PLAIN))
+    axes.set_ylabel(y)
 
 
 def _figure_of(axes: Axes) -> Figure:
@@ -162,7 +163,7 @@ def shared_legend(*places: Axes, band: str = "") -> None:
     found |= {band: Patch(color=REFERENCE, alpha=0.2, linewidth=0)} if band else {}
     names = [wrapped(name, figure.get_figwidth() / 2 - 0.8) for name in found]
     lines = [name.split("\n") for name in names]
-    widest = max(_width(line, _SMALL) for name in lines for line in name) + 0.65
+    widest = max(width_of(line, _SMALL) for name in lines for line in name) + 0.65
     n_columns = min(len(names), max(int((figure.get_figwidth() - 0.3) / widest), 1))
     n_rows = -(-len(names) // n_columns) * max(map(len, lines))
     figure.set_figheight(figure.get_figheight() + _LINE * (n_rows + 1))

@@ -32,6 +32,7 @@ from report.figures.figure_style import (
     line_style,
     make_room,
     shared_legend,
+    width_of,
     wrapped,
 )
 from report.series.agent_marks import COLOURS, DASHES, Mark
@@ -47,7 +48,7 @@ _AXES = {"step": "environment steps", "episode": "episodes"}
 
 ON_VARIANT = "trained on a variant of the environment"
 CIRCLES_APART = 0.12  # of the length of the diagonal
-NAMES = 1.8  # inches of the names of agents beside their runs
+NAMES = 2.1  # inches of the names of agents beside their runs
 UPRIGHT = 6  # values across a heat map that have room side by side
 LONGEST = 20  # letters of a value there
 MOST_TICKS = 8  # values of a parameter that the axis names
@@ -176,7 +177,8 @@ def draw_runs(
             axes.axvline(environment.optimum_at_least, color=REFERENCE, linewidth=1)
             title += "; the optimum lies between the lines"
     x = f"{METRIC_WORDS[metric]}; mean, 95 % interval, each seed"
-    lettering(axes, title=title, x=x, beside=NAMES + 0.3)
+    widest = max(width_of(line) for name in names for line in name.split("\n"))
+    lettering(axes, title=title, x=x, beside=widest + 0.3)
 
 
 def draw_sweeps(

@@ -102,7 +102,7 @@ def all_figures(made_up, root, names):
     )
     analysis = made_up.analysis([environment], names, root, overall=overall)
     one = EnvironmentSeries(environment, learning, runs, pulls, sweeps, {place: grid})
-    rows = [(place, name, k, 1.0, 0.0, 2.0) for name in names for k in (5, 10)]
+    rows = [(place, name, k, -20.0, -1000.0, 2.0 * k) for name in names for k in (5, 10)]
     blocks = pd.DataFrame(
         rows, columns=["environment", "agent", "episode", "average", "minimum", "maximum"]
     )
