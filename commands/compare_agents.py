@@ -157,6 +157,13 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         dest="learning_pages",
         help="train the first run of each agent again, and link pages that play how it learns",
     )
+    add(
+        "--figures",
+        nargs="+",
+        choices=("png", "svg", "pdf"),
+        metavar="FORMAT",
+        help="formats of the figures: png, svg, pdf (default: png svg)",
+    )
     add("--no-report", action="store_true", help="only tables: no figures and no page")
 
 

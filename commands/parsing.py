@@ -42,6 +42,7 @@ _COLOURS = re.compile(r"\x1b\[[0-9;]*m")  # Gymnasium's warnings bring their own
 
 # What stands for signs that a terminal's encoding lacks; a question mark for all others.
 PLAIN = {"±": "+-", "…": "...", "∞": "inf", "×": "x", "–": "-", "━": "-"}  # noqa: RUF001
+PLAIN |= {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa"}
 
 
 def called_as(command: str) -> str:

@@ -18,6 +18,7 @@ from experiments.study_spec import (
     QuickSpec,
     StudySpec,
     layered,
+    symbol,
 )
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, shown, unknown
@@ -230,6 +231,8 @@ def _agents(document: _Document, data: Mapping[str, Any], tuned: bool) -> tuple[
                 f"{place}: {n_agents:,} agents up to here; a study has {MOST_AGENTS:,} at most"
             )
         agents += swept(agent, sweep)
+    if len({agent.group for agent in agents}) == 1 and agents[0].swept:
+        agents = [replace(a, label=a.label.removeprefix(f"{a.group} with ")) for a in agents]
     return tuple(agents)
 
 
@@ -256,13 +259,21 @@ def _sweep(document: _Document, data: Mapping[str, Any], *keys: str | int) -> di
     return sweep
 
 
+def _as_texts(values: Sequence[Any]) -> list[str]:
+    """Values as labels have them: numbers with four digits where these tell them apart."""
+    short = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in values]
+    return short if len(set(short)) == len(set(map(str, values))) else [str(v) for v in values]
+
+
 def swept(agent: AgentSpec, sweep: Mapping[str, Sequence[Any]]) -> list[AgentSpec]:
-    """The agent once for each combination of the values that are swept."""
+    """The agent once for each combination of the values that are swept, labelled by these."""
     agents = []
-    for values in product(*sweep.values()):
-        chosen = dict(zip(sweep, values, strict=True))
-        suffix = ", ".join(f"{name}={value}" for name, value in chosen.items())
-        label = f"{agent.label} {suffix}" if suffix else agent.label
+    texts = {name: _as_texts(values) for name, values in sweep.items()}
+    for places in product(*(range(len(values)) for values in sweep.values())):
+        at = dict(zip(sweep, places, strict=True))
+        chosen = {name: sweep[name][place] for name, place in at.items()}
+        each = [f"{symbol(name)} = {texts[name][place]}" for name, place in at.items()]
+        label = " with ".join([agent.label, *each])
         settings = layered(agent.settings, chosen)
         agents.append(
             replace(agent, label=label, settings=settings, group=agent.label, swept=chosen)

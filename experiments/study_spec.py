@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -46,8 +46,28 @@ def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str
     return override(settings, {**changes, **merged})
 
 
+# What settings are called in labels and on axes: as the field writes them.
+_SYMBOLS = {
+    "learning_rate": "α",
+    "gamma": "γ",
+    "exploration_initial_eps": "ε",
+    "trace_decay": "λ",
+    "gae_lambda": "λ",
+    "kappa": "κ",
+    "initial_q": "initial Q",
+}
+# In names of files, on the other hand.
+_SPELT = {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa"}
+
+
+def symbol(setting: str) -> str:
+    """A setting as labels and axes call it: the field's letter, or else its own name."""
+    return _SYMBOLS.get(setting, setting)
+
+
 def file_name(label: str, longest: int = LONGEST_NAME) -> str:
     """The label as the name of a folder, of ``longest`` bytes at most."""
+    label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
     return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
 
 
@@ -136,6 +156,7 @@ class StudySpec:
         render_every: episodes between two that are filmed; 0 for no films.
         learning_pages: whether the page links to others that play the first training of each
             agent.
+        figures: the formats that figures are written in: "png", "svg", "pdf".
         run_timeout: seconds that each run may take; None for no limit.
         run_memory: bytes of memory that each run may take; None for no limit.
         source: the file that it was read from, or None.
@@ -160,6 +181,7 @@ class StudySpec:
     tensorboard: bool = False
     render_every: int = 0
     learning_pages: bool = False
+    figures: Sequence[str] = ("png", "svg")
     run_timeout: float | None = None
     run_memory: int | None = None
     source: Path | None = None

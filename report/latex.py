@@ -7,6 +7,7 @@ import unicodedata
 from collections.abc import Sequence
 
 from pipeline.errors import visible
+from report.markdown import PLAIN_NAME
 from report.markup_language import MarkupLanguage
 
 _PREAMBLE = r"% Taken in by \input; above it: \usepackage{booktabs,graphicx}"
@@ -104,7 +105,9 @@ LATEX = MarkupLanguage(
     command=lambda text: f"{{\\raggedright\\ttfamily {escaped(text)}\\par}}",
     text=escaped,
     items=_items,
-    name=lambda label: f"\\texttt{{{escaped(label)}}}",
+    name=lambda label: (
+        f"\\texttt{{{escaped(label)}}}" if PLAIN_NAME.fullmatch(label) else escaped(label)
+    ),
     figure=escaped,
     bold=lambda text: f"\\textbf{{{escaped(text)}}}",
     table=latex_table,

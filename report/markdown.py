@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pipeline.errors import visible
 from report.markup_language import MarkupLanguage
 
-_PLAIN_NAME = re.compile(r"[\w.=+-]+")
+PLAIN_NAME = re.compile(r"[\w.=+-]+")
 # What would be read as markup: not underscores inside words, nor brackets that are no link.
 _MARKUP = re.compile(r"[\\`*<>|~&]|(?<!\w)_|_(?!\w)|\](?=[(\[:])|^[#+-]")
 
@@ -24,7 +24,7 @@ def markdown_table(
 
 def name_of(label: str) -> str:
     """A label as code where it is a plain name, else as text."""
-    return f"`{label}`" if _PLAIN_NAME.fullmatch(label) else escaped(label)
+    return f"`{label}`" if PLAIN_NAME.fullmatch(label) else escaped(label)
 
 
 def escaped(text: str) -> str:

@@ -19,6 +19,8 @@ from verdicts import Verdict
 # Against the agent whose median run is the highest: shown equivalent or itself, undecided, worse.
 Standing = Literal["best", "open", "behind"]
 
+NOTHING = "-"
+
 _SEEN_BY_THE_LEADER: dict[Verdict, Standing] = {
     "equivalent": "best",
     "worse": "best",
@@ -52,7 +54,7 @@ def headline(analysis: StudyAnalysis, markup: MarkupLanguage = MARKDOWN) -> str:
     study, environments = analysis.study, analysis.environments
     found = [_cells(analysis, environment, markup) for environment in environments]
     rows = [
-        [markup.name(agent.label), *(cells.get(agent.label, "-") for cells in found)]
+        [markup.name(agent.label), *(cells.get(agent.label, NOTHING) for cells in found)]
         for agent in study.agents
     ]
     headings = ["", *(markup.text(one.environment) for one in environments)]
@@ -153,13 +155,16 @@ def ranking(
         figures = [
             interval(agent.metric.median),
             interval(agent.metric.mean),
-            "-" if agent.score is None else number(agent.score.median.point),
-            "-" if count is None else f"{count.n_failed} of {count.n}",
-            "-" if stays is None else number(stays.median.point),
-            "-" if cost is None else duration(cost),
+            NOTHING if agent.score is None else number(agent.score.median.point),
+            NOTHING if count is None else f"{count.n_failed} of {count.n}",
+            NOTHING if stays is None else number(stays.median.point),
+            NOTHING if cost is None else duration(cost),
         ]
         rows.append([markup.name(agent.agent), *map(markup.figure, figures)])
     headings = ["", "median", "mean", "score", "failed", "stays from", "processor time"]
+    # A column in which no agent has a figure is left out.
+    kept = [k for k, of in enumerate(zip(*rows, strict=True)) if not set(of) <= {NOTHING}]
+    rows, headings = [[row[k] for k in kept] for row in rows], [headings[k] for k in kept]
     metric = METRIC_WORDS[results.study.metric]
     caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
     return markup.table(headings, rows, markup.text(caption))

@@ -89,6 +89,7 @@ def _compress_outliers(axes: Axes, returns: Floats) -> None:
         axes.set_yscale("symlog", linthresh=settled)
         axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(settled)))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+        axes.set_ylabel(f"{axes.get_ylabel()}\n(log beyond ±{settled:,.0f})")
 
 
 def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> None:

@@ -16,21 +16,24 @@ from report.figures.bandit_figures import (
     draw_rewards,
     draw_simple_regret,
 )
-from report.figures.figure_style import figure
+from report.figures.figure_style import FigureFiles
 from report.figures.study_figures import (
     draw_blocks,
+    draw_grid,
     draw_learning_curves,
     draw_profiles,
     draw_runs,
     draw_sweeps,
+    name_blocks,
+    panels,
 )
 from report.series.agent_marks import Mark
-from report.series.posteriors import Belief
-from report.series.pull_series import ArmSeries, PullSeries
+from report.series.pull_series import PullSeries
 from report.series.study_series import EnvironmentSeries, StudySeries
 
 # More agents than this make no readable lines; a study of parameters shows them by parameter.
 MOST_LINES = 14
+MOST_COLUMNS = 3
 
 Marks = Mapping[str, Mark]
 
@@ -48,87 +51,77 @@ def write_figures(
     Returns:
         The files.
     """
-    folder = series.analysis.results.root / "figures"
-    folder.mkdir(exist_ok=True)
-    paths: list[Path] = []
+    files = FigureFiles(series.analysis.results.root / "figures", series.analysis.study.figures)
+    files.folder.mkdir(exist_ok=True)
     for one in series.environments:
         if one.pulls is not None:
             name = one.environment.environment
             tell(name)
-            paths += _bandit_figures(one.pulls, name, folder, series.marks)
+            _bandit_figures(files, one.pulls, name, series.marks)
     for one in series.environments:
         tell(one.environment.environment)
-        paths += _study_figures(series, one, episodes_table, folder)
+        _study_figures(files, series, one, episodes_table)
     if series.analysis.overall is not None:
         tell("all environments")
-        with figure(folder / "performance_profiles", paths) as (axes,):
+        with files.figure("performance_profiles") as (axes,):
             draw_profiles(axes, series.analysis.overall, series.marks)
-    return paths
+    return files.written
 
 
 def _study_figures(
-    series: StudySeries, one: EnvironmentSeries, blocks: pd.DataFrame | None, folder: Path
-) -> list[Path]:
-    written: list[Path] = []
+    files: FigureFiles, series: StudySeries, one: EnvironmentSeries, blocks: pd.DataFrame | None
+) -> None:
     environment, metric, marks = one.environment, series.analysis.study.metric, series.marks
     name = file_name(environment.environment)
     if one.sweeps:
-        with figure(folder / f"{name}_sweep", written) as (axes,):
-            draw_sweeps(axes, one.sweeps, environment.environment, metric)
+        with files.figure(f"{name}_sweep") as (axes,):
+            draw_sweeps(axes, one.sweeps, environment, metric)
+    for group, grid in one.grids.items():
+        title = environment.environment + (f", {group}" if len(one.grids) > 1 else "")
+        height = 1.6 + 0.4 * len(grid.down)
+        with files.figure(f"{name}_{file_name(group)}_grid", height=height) as (axes,):
+            draw_grid(axes, grid, title, environment, metric)
     if len(environment.agents) > MOST_LINES or one.curves is None:
-        return written
-    with figure(folder / f"{name}_learning_curves", written, n_columns=2) as places:
-        draw_learning_curves(places, one.curves, environment, marks)
-    with figure(folder / f"{name}_intervals", written) as (axes,):
+        return
+    if n_columns := len(panels(one.curves)):
+        with files.figure(f"{name}_learning_curves", n_columns) as places:
+            draw_learning_curves(places, one.curves, environment, marks)
+    with files.figure(f"{name}_intervals") as (axes,):
         draw_runs(axes, one.runs, environment, metric, marks)
     if blocks is not None:
         rows = blocks[blocks["environment"] == environment.environment]
-        written += _block_figure(rows, folder / f"{name}_episodes", marks)
-    return written
+        _block_figure(files, f"{name}_episodes", rows, marks)
 
 
-def _block_figure(rows: pd.DataFrame, path: Path, marks: Marks) -> list[Path]:
+def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Marks) -> None:
     agents = list(dict.fromkeys(rows["agent"]))
-    written: list[Path] = []
     if agents:
-        with figure(path, written, n_columns=len(agents)) as places:
-            for axes, agent in zip(places, agents, strict=True):
+        n_columns = min(len(agents), MOST_COLUMNS)
+        n_rows = -(-len(agents) // n_columns)
+        with files.figure(name, n_columns, n_rows, height=2.2) as places:
+            for axes, agent in zip(places, agents, strict=False):
                 draw_blocks(axes, rows[rows["agent"] == agent], marks[agent])
-    return written
+            for axes in places[len(agents) :]:
+                axes.set_visible(False)
+            name_blocks(places[0])
 
 
-def _bandit_figures(pulls: PullSeries, place: str, folder: Path, marks: Marks) -> list[Path]:
-    written: list[Path] = []
+def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:
     name = file_name(place)
     if len(pulls.pulls) <= MOST_LINES:
-        with figure(folder / f"{name}_pulls", written, n_columns=2) as (left, right):
-            draw_rewards(left, right, pulls, place, marks)
-        n_columns = 1 + pulls.has_simple_regret
-        with figure(folder / f"{name}_regret", written, n_columns=n_columns) as (left, *others):
-            draw_regret(left, pulls, place, marks)
+        with files.figure(f"{name}_pulls", n_rows=2) as (upper, lower):
+            draw_rewards(upper, lower, pulls, place, marks)
+        with files.figure(f"{name}_regret", n_rows=1 + pulls.has_simple_regret) as (upper, *others):
+            draw_regret(upper, pulls, place, marks)
             for axes in others:
                 draw_simple_regret(axes, pulls, marks)
     if pulls.arms is not None and len(pulls.arms.shares) <= MOST_LINES:
-        written += _arm_figure(pulls.arms, folder / f"{name}_arms", marks)
+        with files.figure(f"{name}_arms", n_rows=2) as (upper, lower):
+            draw_arms(upper, lower, pulls.arms, marks)
     for belief in pulls.beliefs:
-        path = folder / f"{name}_{file_name(belief.agent)}_posteriors"
-        written += _belief_figure(belief, path)
-    return written
-
-
-def _arm_figure(arms: ArmSeries, path: Path, marks: Marks) -> list[Path]:
-    written: list[Path] = []
-    height = 4.2 * max(arms.n_contexts / 2, 1)
-    with figure(path, written, n_columns=2, height=height) as (left, right):
-        draw_arms(left, right, arms, marks)
-    return written
-
-
-def _belief_figure(belief: Belief, path: Path) -> list[Path]:
-    written: list[Path] = []
-    n_moments, n_contexts = belief.densities.shape[:2]
-    with figure(
-        path, written, n_columns=n_moments, n_rows=n_contexts, height=3.2 * n_contexts
-    ) as panels:
-        draw_belief(panels, belief)
-    return written
+        n_moments, n_contexts = belief.densities.shape[:2]
+        n_columns = 2 if n_moments % 2 == 0 else 1
+        n_rows = n_moments * n_contexts // n_columns
+        path = f"{name}_{file_name(belief.agent)}_posteriors"
+        with files.figure(path, n_columns, n_rows, height=2.2) as places:
+            draw_belief(places, belief)

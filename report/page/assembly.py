@@ -93,6 +93,7 @@ def render(report: Report, sections: list[Section]) -> str:
         environments=report.analysis.environments,
         sections=sections,
         bodies=bodies,
+        is_sweep=any(one.sweeps or one.grids for one in report.series.environments),
         data=_data(report, sections),
         **frame(_own_script(sections)),
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import numpy as np
 from experiments.analysis import EnvironmentAnalysis
 from experiments.seed_values import values_over_seeds
 from experiments.study_results import StudyResults
-from experiments.study_spec import AgentSpec
+from experiments.study_spec import AgentSpec, symbol
 from mdp.array_types import Floats, Ints
 from report.series.axis_scale import linear_up_to
 from report.series.curve_series import Curve
@@ -49,6 +50,46 @@ class RunSeries:
     linear_up_to: float | None
 
 
+@dataclass(frozen=True)
+class Sweep:
+    """Means by the one parameter that an agent was swept over.
+
+    Attributes:
+        parameter: what it is called on an axis.
+        means: by its value, with their intervals.
+        labels: of the agents in that order.
+    """
+
+    parameter: str
+    means: Curve
+    labels: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Means by the two parameters that an agent was swept over.
+
+    Attributes:
+        parameters: what they are called on axes: the one that goes down and the one across.
+        down, across: their values.
+        means: shape (down, across), NaN where there is no run.
+        labels: of the agents there; empty where there is none.
+    """
+
+    parameters: tuple[str, str]
+    down: list[str]
+    across: list[str]
+    means: Floats
+    labels: list[list[str]]
+
+    def shares(self, *, is_cost: bool) -> Floats:
+        """How far each mean is on the way from the worst to the best: 0 to 1."""
+        known = self.means[np.isfinite(self.means)]
+        low, high = known.min(initial=np.inf), known.max(initial=-np.inf)
+        shares = (self.means - low) / (high - low if high > low else 1.0)
+        return np.asarray(1 - shares if is_cost else shares)
+
+
 def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> RunSeries:
     """The runs on an environment, by what the verdicts are about."""
     values = values_over_seeds(results, environment.environment, results.study.metric)
@@ -61,28 +102,61 @@ def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> RunSe
     return RunSeries(tuple(agents), scale)
 
 
-def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Curve]:
-    """What the verdicts are about against the one parameter that agents were swept over.
+def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Sweep]:
+    """By agent that was swept over one parameter, the means in the order of its values."""
+    found: dict[str, Sweep] = {}
+    means = _means(environment)
+    for (group, name), members in _groups(agents, environment, 1).items():
+        by_value = {
+            float(one.swept[name]): one.label
+            for one in members
+            if isinstance(one.swept[name], int | float)
+        }
+        if len(by_value) >= LEAST_VALUES:
+            x, labels = zip(*sorted(by_value.items()), strict=True)
+            rows = [(e.point, e.low, e.high) for e in map(means.__getitem__, labels)]
+            found[group] = Sweep(symbol(name), Curve(np.array(x), *np.array(rows).T), labels)
+    return found
 
-    Args:
-        agents: those of the study.
-        environment: where.
 
-    Returns:
-        By agent and parameter, the means in the order of the parameter's values.
-    """
-    means = {agent.agent: agent.metric.mean for agent in environment.agents}
-    groups: dict[str, list[tuple[float, Estimate]]] = {}
+def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Grid]:
+    """By agent that was swept over two parameters, the means over the values of both."""
+    found: dict[str, Grid] = {}
+    means = _means(environment)
+    for (group, *names), members in _groups(agents, environment, 2).items():
+        down, across = ([str(one.swept[name]) for one in members] for name in names)
+        rows, columns = list(dict.fromkeys(down)), list(dict.fromkeys(across))
+        at = {
+            (row, column): one.label for row, column, one in zip(down, across, members, strict=True)
+        }
+        labels = [[at.get((row, column), "") for column in columns] for row in rows]
+        if len(rows) > 1 and len(columns) > 1:
+            points = [[means[at].point if at else np.nan for at in row] for row in labels]
+            parameters = symbol(names[0]), symbol(names[1])
+            found[group] = Grid(parameters, rows, columns, np.array(points), labels)
+    return found
+
+
+def best_of(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
+    """Those of these agents that have the best mean."""
+    found = [agent for agent in environment.agents if agent.agent in labels]
+    means = {agent.agent: agent.metric.mean.point for agent in found}
+    return [
+        label for label, mean in means.items() if math.isclose(mean, found[0].metric.mean.point)
+    ]
+
+
+def _means(environment: EnvironmentAnalysis) -> dict[str, Estimate]:
+    return {agent.agent: agent.metric.mean for agent in environment.agents}
+
+
+def _groups(
+    agents: Sequence[AgentSpec], environment: EnvironmentAnalysis, n_parameters: int
+) -> dict[tuple[str, ...], list[AgentSpec]]:
+    """By label and parameters of each sweep over so many, its agents that have a mean there."""
+    groups: dict[tuple[str, ...], list[AgentSpec]] = {}
+    there = _means(environment)
     for spec in agents:
-        swept = list(spec.swept.items())
-        if spec.label in means and len(swept) == 1 and isinstance(swept[0][1], int | float):
-            ((parameter, value),) = swept
-            group = groups.setdefault(f"{spec.group}: {parameter}", [])
-            group.append((float(value), means[spec.label]))
-    return {name: _by_value(rows) for name, rows in groups.items() if len(rows) >= LEAST_VALUES}
-
-
-def _by_value(rows: list[tuple[float, Estimate]]) -> Curve:
-    rows = sorted(rows, key=lambda row: row[0])
-    columns = zip(*((value, e.point, e.low, e.high) for value, e in rows), strict=True)
-    return Curve(*map(np.array, columns))
+        if len(spec.swept) == n_parameters and spec.label in there:
+            groups.setdefault((spec.group, *spec.swept), []).append(spec)
+    return groups

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.series.agent_marks import Mark, agent_marks
-from report.series.curve_series import Curve, LearningCurves, learning_curves
+from report.series.curve_series import LearningCurves, learning_curves
 from report.series.pull_series import PullSeries, pull_series
-from report.series.run_series import RunSeries, run_series, sweeps
+from report.series.run_series import Grid, RunSeries, Sweep, grids, run_series, sweeps
 
 
 @dataclass(frozen=True)
@@ -22,14 +22,16 @@ class EnvironmentSeries:
         curves: by kind; on bandits None, which have theirs by pull.
         runs: each run, and the means.
         pulls: on bandits; else None.
-        sweeps: by agent and parameter, where one was swept over.
+        sweeps: by agent, where it was swept over one parameter.
+        grids: by agent, where it was swept over two.
     """
 
     environment: EnvironmentAnalysis
     curves: Mapping[str, LearningCurves] | None
     runs: RunSeries
     pulls: PullSeries | None
-    sweeps: Mapping[str, Curve]
+    sweeps: Mapping[str, Sweep]
+    grids: Mapping[str, Grid] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -67,4 +69,5 @@ def _environment_series(
         runs=run_series(results, environment),
         pulls=pulls,
         sweeps=sweeps(analysis.study.agents, environment),
+        grids=grids(analysis.study.agents, environment),
     )

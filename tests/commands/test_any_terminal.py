@@ -18,7 +18,7 @@ ROOT = Path(train.__file__).parent
 ANGLE = ["--algo", "angle", "--env", "CartPole-v1"]
 STUDY = (
     "title: Größer als ∞?\nseeds: 2\nn_episodes: 30\n"
-    "agents: {Ärger 日本: {algo: qlearning}, sarsa: {}}\n"
+    "agents: {Ärger 日本: {algo: qlearning}, sarsa: {sweep: {gamma: [0.5]}}}\n"
     "environments: {'Eis, glatt': {id: FrozenLake-v1}}\n"
 )
 
@@ -56,6 +56,7 @@ def test_comparing(terminal, tmp_path):
     code, out = terminal(compare, "länge.yml", "--no-report", "-f", "studies")
     assert code == 0
     assert "als inf?" in out or "als ∞?" in out
+    assert "gamma = 0.5" in out or "γ = 0.5" in out
     assert (tmp_path / "studies" / "länge" / "runs" / "Ärger_日本" / "Eis,_glatt_2").is_dir()
 
 

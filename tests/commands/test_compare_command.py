@@ -254,11 +254,11 @@ def test_a_study_file(type_command, folder):
     assert "the lake: return per 20 episodes" in out
     study = folder / "studies" / "steps"
     assert set(rows(study)["agent"]) == {
-        "qlearning learning_rate=0.1",
-        "qlearning learning_rate=0.9",
+        "α = 0.1",
+        "α = 0.9",
     }
     assert set(rows(study)["n_episodes"]) == {40}
-    run = study / "runs" / "qlearning_learning_rate=0.9" / "the_lake_2"
+    run = study / "runs" / "alpha=0.9" / "the_lake_2"
     spec = json.loads((run / "run.json").read_text())["spec"]
     assert (spec["seed"], spec["hyperparams"]["learning_rate"]) == (1, 0.9)
 

@@ -83,6 +83,8 @@ def test_without_flags_a_run_is_the_default_one():
         (["--episodes-table", "5"], "episodes_table", 5),
         (["--render-every", "6"], "render_every", 6),
         (["--watch-learning"], "learning_pages", True),
+        ([], "figures", ("png", "svg")),
+        (["--figures", "pdf", "png"], "figures", ["pdf", "png"]),
         (["--name", "mine"], "name", "mine"),
         (["--quick"], "is_quick", True),
         (["--quick"], "n_seeds", 2),

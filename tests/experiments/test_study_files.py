@@ -234,14 +234,40 @@ def test_sweeps_multiply(read):
         "agents:\n  qlearning:\n  sarsa:\n    sweep: {gamma: [0.5]}\n"
     )
     assert [agent.label for agent in study.agents] == [
-        "qlearning gamma=0.9, learning_rate=0.1",
-        "qlearning gamma=0.9, learning_rate=0.5",
-        "qlearning gamma=0.99, learning_rate=0.1",
-        "qlearning gamma=0.99, learning_rate=0.5",
-        "sarsa gamma=0.5, learning_rate=0.1",
-        "sarsa gamma=0.5, learning_rate=0.5",
+        "qlearning with γ = 0.9 with α = 0.1",
+        "qlearning with γ = 0.9 with α = 0.5",
+        "qlearning with γ = 0.99 with α = 0.1",
+        "qlearning with γ = 0.99 with α = 0.5",
+        "sarsa with γ = 0.5 with α = 0.1",
+        "sarsa with γ = 0.5 with α = 0.5",
     ]
     assert study.agents[2].settings == {"gamma": 0.99, "learning_rate": 0.1}
+
+
+@pytest.mark.parametrize(
+    ("sweep", "labels", "folder"),
+    [
+        (
+            {"exploration_initial_eps": [0.2, 1.0]},
+            ["ε = 0.2", "ε = 1"],
+            "epsilon=0.2",
+        ),
+        ({"learning_rate": [0.00006103515625, 0.5]}, ["α = 6.104e-05", "α = 0.5"], ""),
+        ({"gamma": [0.99991, 0.99992]}, ["γ = 0.99991", "γ = 0.99992"], "gamma=0.99991"),
+        ({"n_steps": [1, 4]}, ["n_steps = 1", "n_steps = 4"], "n_steps=1"),
+        (
+            {"learning_rate": [0.1], "kappa": [0.5, 1]},
+            ["α = 0.1 with κ = 0.5", "α = 0.1 with κ = 1"],
+            "alpha=0.1_with_kappa=0.5",
+        ),
+    ],
+)
+def test_alone_an_agent_is_labelled_by_what_is_swept(read, sweep, labels, folder):
+    study = read(
+        f"environments: [Taxi-v4]\nagents: {{as printed: {{algo: sarsa, sweep: {sweep}}}}}\n"
+    )
+    assert [agent.label for agent in study.agents] == labels
+    assert folder in ("", file_name(labels[0]))
 
 
 NAMES = st.text("abcdef_", min_size=1, max_size=6)
@@ -258,7 +284,7 @@ def test_a_sweep_has_each_combination_once(sweep):
     for agent in agents:
         assert agent.settings["kept"] == 1
         assert all(agent.settings[name] in values for name, values in sweep.items())
-        assert all(f"{name}={agent.settings[name]}" in agent.label for name in sweep)
+    assert len({agent.label for agent in agents}) == len({str(a.swept) for a in agents})
 
 
 def test_a_sweep_is_counted_before_it_is_made(read):

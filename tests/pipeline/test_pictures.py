@@ -265,6 +265,7 @@ def scale_of(returns):
 
     axes = Figure().subplots()
     learning_curve._compress_outliers(axes, np.array(returns, dtype=np.float64))
+    assert ("log beyond" in axes.get_ylabel()) == (axes.get_yscale() == "symlog")
     return axes.get_yscale()
 
 

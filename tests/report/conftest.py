@@ -139,8 +139,10 @@ class Drawn:
         ]
         legend = axes.get_legend()
         self.legend = None if legend is None else [text.get_text() for text in legend.get_texts()]
-        self.title = axes.get_title(loc="left")
-        self.labels = (axes.get_xlabel(), axes.get_ylabel())
+        # Long words go over several lines.
+        self.title = axes.get_title(loc="left").replace("\n", " ")
+        self.labels = tuple(x.replace("\n", " ") for x in (axes.get_xlabel(), axes.get_ylabel()))
+        self.ends = [note.get_text() for note in axes.texts]
 
     @staticmethod
     def _ends(vertices):
@@ -166,7 +168,7 @@ class Drawn:
     def shared_legend(self):
         """The names in the legend of the whole figure."""
         (legend,) = self.axes.figure.legends
-        return [text.get_text() for text in legend.get_texts()]
+        return [text.get_text().replace("\n", " ") for text in legend.get_texts()]
 
 
 @pytest.fixture
@@ -186,11 +188,11 @@ def canvases(monkeypatch):
         path.touch()
         yield path
 
-    def keep(self, target, **options):
-        seen[target.name.partition(".")[0]] = self.axes
+    def keep(canvas, form, file):
+        seen[file.name.partition(".")[0]] = canvas.axes
 
     monkeypatch.setattr(style, "replacing", named)
-    monkeypatch.setattr(style.Figure, "savefig", keep)
+    monkeypatch.setattr(style, "write", keep)
     return seen
 
 

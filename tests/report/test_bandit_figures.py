@@ -77,11 +77,12 @@ def series(**changes):
     return PullSeries(**known | changes)
 
 
-def test_rewards_on_the_left_and_best_arms_on_the_right(axes, drawn):
+def test_rewards_above_and_best_arms_below(axes, drawn):
     places = axes(2)
     draw_rewards(*places, series(), "coins", MARKS)
     left, right = map(drawn, places)
-    assert left.names == left.shared_legend == ["first", "second", "best possible"]
+    assert left.names == left.ends == ["first", "second", "best possible"]
+    assert right.names == right.ends == ["first", "second"]
     assert [line["y"] for line in left.lines] == [[10, 11, 12], [50, 51, 52], [75, 75]]
     assert [line["y"] for line in right.lines] == [[0.1, 0.11, 0.12], [0.5, 0.51, 0.52]]
     for place in (left, right):
@@ -106,7 +107,7 @@ def test_regret_with_its_interval_and_the_spread_of_runs(axes, drawn):
     (axis,) = axes()
     draw_regret(axis, series(), "coins", MARKS)
     place = drawn(axis)
-    assert place.names == place.shared_legend == ["first", "second"]
+    assert place.names == place.ends == ["first", "second"]
     assert [line["y"] for line in place.lines] == [[30, 31, 32], [70, 71, 72]]
     assert [line["x"] for line in place.lines] == [[1, 10, 100]] * 2
     assert [band["colour"] for band in place.bands] == [ORANGE, ORANGE, BLUE, BLUE]
@@ -115,36 +116,55 @@ def test_regret_with_its_interval_and_the_spread_of_runs(axes, drawn):
     assert interval[1] == (30, 30)
     assert interval[100] == pytest.approx((32 - 2 * 1.96, 32 + 2 * 1.96))
     assert spread == {1: (21, 42), 10: (22, 43), 100: (23, 44)}
-    assert place.title == "coins: mean, 95 % interval, 90% of runs"
-    assert place.labels == ("pulls", "cumulative regret")
+    assert place.title == "coins: mean of 4 runs, its 95 % interval, and 90% of the runs"
+    assert place.labels == ("pulls (log scale)", "cumulative regret")
     assert place.axes.get_xscale() == "log"
+
+
+@pytest.mark.parametrize(
+    ("n_agents", "n_bands", "words", "highest"),
+    [
+        (2, 4, ", its 95 % interval, and 90% of the runs", 10 + 20 + 2 + 12),
+        (4, 4, " with its 95 % interval", 30 + 20 + 2 + 2 * 1.96),
+        (5, 0, "", 40 + 20 + 2),
+    ],
+)
+def test_there_are_four_bands_at_most(axes, drawn, n_agents, n_bands, words, highest):
+    pulls = {f"agent {n}": statistics(10 * n) for n in range(n_agents)}
+    (axis,) = axes()
+    draw_regret(
+        axis, series(pulls=pulls), "coins", {name: Mark(name, 0, "solid") for name in pulls}
+    )
+    assert len(drawn(axis).bands) == n_bands
+    assert drawn(axis).title == f"coins: mean of 4 runs{words}"
+    assert axis.get_ylim() == pytest.approx((0, 1.05 * highest))  # which ends with what is drawn
 
 
 def test_bounds_and_the_height_that_they_leave(axes, drawn):
     (axis,) = axes()
     draw_regret(axis, series(bounds=BOUNDS), "coins", MARKS)
     place = drawn(axis)
-    assert place.names == ["first", "second", "Auer, for UCB1", "Lai-Robbins slope"]
-    auer, slope = place.line("Auer, for UCB1"), place.line("Lai-Robbins slope")
+    assert place.names == ["first", "second", "Auer's bound for UCB1", "Lai-Robbins slope"]
+    auer, slope = place.line("Auer's bound for UCB1"), place.line("Lai-Robbins slope")
     assert (auer["x"], auer["y"]) == ([1, 10, 100], [10, 30, 90])
     assert (slope["x"], slope["y"]) == ([1, 10, 100], [0, 5, 10])
     assert (auer["style"], slope["style"]) == ("--", ":")
     assert {auer["colour"], slope["colour"]} == {GREY}
     low, high = place.axes.get_ylim()
-    assert low == 0
-    assert 84 < high < 90  # what the agents need, which the bound does not cut off
+    assert (low, high) == pytest.approx((0, 1.05 * 84))  # of the highest run; the bound is cut
+    assert place.ends == ["first", "second", "Auer's bound for UCB1 ↑", "Lai-Robbins slope"]
 
 
 @pytest.mark.parametrize(
     ("last", "n_shown", "highest"),
-    [(1000.0, 2, None), (50.0, 3, 55.0)],  # a bound far above is cut; one far below sets the limit
+    [(1000.0, 2, None), (50.0, 3, 52.5)],  # a bound far above is cut; one far below sets the limit
 )
 def test_a_bound_that_does_not_fit(axes, drawn, last, n_shown, highest):
     (axis,) = axes()
     bounds = RegretBounds(PULLS, np.array([10.0, 30.0, last]), BOUNDS.lai_robbins)
     draw_regret(axis, series(bounds=bounds), "coins", MARKS)
     place = drawn(axis)
-    assert len(place.line("Auer, for UCB1")["x"]) == n_shown
+    assert len(place.line("Auer's bound for UCB1")["x"]) == n_shown
     if highest is not None:
         assert place.axes.get_ylim() == pytest.approx((0, highest))
 
@@ -156,7 +176,7 @@ def test_simple_regret(axes, drawn):
     assert [line["y"] for line in place.lines] == [[40, 41, 42], [80, 81, 82]]
     assert [line["x"] for line in place.lines] == [[1, 10, 100]] * 2
     assert [line["colour"] for line in place.lines] == [ORANGE, BLUE]
-    assert place.labels == ("pulls", "simple regret")
+    assert place.labels == ("pulls (log scale)", "simple regret")
     assert place.title == "of recommending the arm pulled most"
     assert place.axes.get_xscale() == "log"
 
@@ -190,11 +210,13 @@ def test_estimates_beside_the_truth(axes, drawn):
     assert dots.get_color() == BLUE
     lengths = [segment[1, 1] - segment[0, 1] for segment in bars.get_segments()]
     assert lengths == pytest.approx([0.02, 0.04, 0.06, 0.08])
-    truth = drawn(right).lines[-1]
-    assert (truth["x"], truth["y"]) == ([0, 1, 2, 3], [0.1, 0.2, 0.3, 0.4])
-    assert truth["marker"] == "_"
+    truth = right.collections[-1].get_segments()
+    assert [segment[0, 1] for segment in truth] == [0.1, 0.2, 0.3, 0.4]
+    assert np.mean(truth, axis=1)[:, 0] == pytest.approx([0, 1, 2, 3])
     assert drawn(right).labels[1] == "mean reward"
-    assert drawn(right).title == ("final estimates, mean and spread over runs; bars are the truth")
+    assert drawn(right).title == (
+        "final estimates, mean and spread over runs; lines across are the truth"
+    )
 
 
 def test_beliefs_by_context_and_moment(axes, drawn):

@@ -11,7 +11,7 @@ from experiments.study_spec import AgentSpec
 from report.series.axis_scale import linear_up_to
 from report.series.curve_series import learning_curves
 from report.series.pull_series import arm_series, mean_regret, regret_of_runs
-from report.series.run_series import run_series, sweeps
+from report.series.run_series import best_of, grids, run_series, sweeps
 
 
 def curve_rows(agent, kind, seed, values, steps=(10, 20)):
@@ -98,9 +98,11 @@ def swept(label, value, group="sarsa", name="alpha"):
 def test_a_sweep_goes_in_the_order_of_its_values(made_up):
     values = {"a": 0.9, "b": 0.1, "c": 0.5}
     agents = [made_up.agent(label, 10 * value) for label, value in values.items()]
-    found = sweeps([swept(*item) for item in values.items()], made_up.environment(agents))
-    assert list(found) == ["sarsa: alpha"]
-    curve = found["sarsa: alpha"]
+    specs = [swept(*item, name="learning_rate") for item in values.items()]
+    found = sweeps(specs, made_up.environment(agents))
+    assert list(found) == ["sarsa"]
+    assert (found["sarsa"].parameter, found["sarsa"].labels) == ("α", ("b", "c", "a"))
+    curve = found["sarsa"].means
     assert curve.x.tolist() == [0.1, 0.5, 0.9]
     assert curve.y.tolist() == [1, 5, 9]
     assert curve.low == pytest.approx([0.9, 4.9, 8.9])
@@ -127,10 +129,31 @@ def test_each_parameter_has_a_sweep(made_up):
     specs = [swept(f"a{n}", n) for n in range(3)] + [swept(f"g{n}", n, "dqn") for n in range(4)]
     environment = made_up.environment([made_up.agent(spec.label, 1.0) for spec in specs])
     found = sweeps(specs, environment)
-    assert {name: curve.x.tolist() for name, curve in found.items()} == {
-        "sarsa: alpha": [0, 1, 2],
-        "dqn: alpha": [0, 1, 2, 3],
+    assert {name: sweep.means.x.tolist() for name, sweep in found.items()} == {
+        "sarsa": [0, 1, 2],
+        "dqn": [0, 1, 2, 3],
     }
+
+
+def test_two_parameters_make_a_grid(made_up):
+    """One agent has no run, and two are the best."""
+    means = {(0.1, "a"): 10.0, (0.1, "b"): 30.0, (0.5, "a"): 30.0}
+    specs = [
+        AgentSpec(f"{rate} {kind}", "sarsa", group="sarsa", swept={"gamma": rate, "kind": kind})
+        for rate in (0.1, 0.5)
+        for kind in "ab"
+    ]
+    agents = [made_up.agent(f"{rate} {kind}", mean) for (rate, kind), mean in means.items()]
+    environment = made_up.environment(sorted(agents, key=lambda a: -a.metric.mean.point))
+    assert sweeps(specs, environment) == {}
+    (grid,) = grids(specs, environment).values()
+    assert (grid.parameters, grid.down, grid.across) == (("γ", "kind"), ["0.1", "0.5"], ["a", "b"])
+    np.testing.assert_equal(grid.means, [[10, 30], [30, np.nan]])
+    assert grid.labels == [["0.1 a", "0.1 b"], ["0.5 a", ""]]
+    np.testing.assert_equal(grid.shares(is_cost=False), [[0, 1], [1, np.nan]])
+    np.testing.assert_equal(grid.shares(is_cost=True), [[1, 0], [0, np.nan]])
+    assert best_of(environment, [spec.label for spec in specs]) == ["0.1 b", "0.5 a"]
+    assert grids(specs[:2], environment) == {}  # a single row is none
 
 
 # Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.

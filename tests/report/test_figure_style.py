@@ -1,19 +1,26 @@
 """The look of every figure, and the ticks of a logarithmic axis."""
 
 import pytest
+from PIL import Image
 
 from pipeline.pictures.learning_curve import symlog_ticks
-from report.figures.figure_style import figure
+from report.figures.figure_style import FigureFiles
 from report.off_policy_table import shown
 from verdicts import Estimate
 
 
-def test_a_figure_has_a_grid_and_two_spines_and_is_written_twice(tmp_path):
-    written = []
-    with figure(tmp_path / "two", written, n_columns=2) as axes:
+def test_a_figure_has_a_grid_and_two_spines_and_is_written_in_each_format(tmp_path):
+    files = FigureFiles(tmp_path, ["pdf", "png", "svg", "png"])
+    with files.figure("two", n_columns=2) as axes:
         assert len(axes) == 2
-    assert written == [tmp_path / "two.png", tmp_path / "two.svg"]
-    assert all(path.stat().st_size > 1000 for path in written)
+    assert files.written == [tmp_path / f"two.{form}" for form in ("png", "svg", "pdf")]
+    png, svg, pdf = (path.read_bytes() for path in files.written)
+    assert png.startswith(b"\x89PNG")
+    with Image.open(files.written[0]) as picture:
+        assert picture.width == 6.5 * 300
+        assert picture.info["dpi"] == pytest.approx((300, 300), abs=0.01)
+    assert b"<svg" in svg
+    assert pdf.startswith(b"%PDF")
     for place in axes:
         visible = {side for side, spine in place.spines.items() if spine.get_visible()}
         assert visible == {"left", "bottom"}

@@ -65,7 +65,8 @@ def test_whatever_labels_say_every_group_and_environment_is_closed(hostile):
     assert sorted(begun) == sorted(ended)
     assert begun.count("table") == 2  # the headline, and one environment
     for rows in re.findall(r"\\midrule\n(.*?)\\bottomrule", plain, re.DOTALL):
-        assert {line.count("&") for line in rows.splitlines()} <= {1, 6}
+        # What no agent has is left out: runs that failed, and the processor time.
+        assert {line.count("&") for line in rows.splitlines()} <= {1, 4}
         assert all(line.endswith(r"\\") for line in rows.splitlines())
     # Comments stand at the top alone, and say what the text needs.
     lines = text.splitlines()

@@ -7,6 +7,7 @@ import json
 import math
 import platform
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -22,14 +23,17 @@ from report.page import (
     overview_section,
     policy_section,
     settings_section,
+    verdict_section,
     write_report,
 )
-from report.page.assembly import SECTIONS
+from report.page.assembly import SECTIONS, render
 from report.page.comparison_section import improvement_matrix
 from report.page.markup import breakable, inline_script, p_value, packed, plain, setting
 from report.page.sections import Report
 from report.series.agent_marks import COLOURS, agent_marks
-from report.series.study_series import study_series
+from report.series.curve_series import Curve
+from report.series.run_series import Grid, RunSeries, Sweep
+from report.series.study_series import EnvironmentSeries, StudySeries, study_series
 from report.wording import interval_alone
 from verdicts import Estimate
 
@@ -442,3 +446,51 @@ def test_labels_break_where_their_words_end():
     assert breakable("FrozenLake8x8-v1") == "Frozen<wbr>Lake8x8-<wbr>v1"
     assert breakable("ALE/Pong-v5") == "ALE/<wbr>Pong-<wbr>v5"
     assert breakable("<b>-x") == "&lt;b&gt;-<wbr>x"
+
+
+# --- sweeps --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def sweep_page(made_up, tmp_path):
+    """The verdicts of a sweep as a page: one parameter on the lake, two on the island."""
+    labels = ["a = 1", "a = 2", "a = 3", "other"]
+    agents = [made_up.agent(label, 90.0 - 10 * n) for n, label in enumerate(labels)]
+    places = [made_up.environment(agents, label) for label in ("lake", "island")]
+    analysis = made_up.analysis(places, labels, tmp_path)
+    analysis = replace(
+        analysis,
+        results=replace(analysis.results, study=replace(analysis.study, description="Why?")),
+    )
+    x, means = np.array([1.0, 2, 3]), np.array([[90.0, 80], [70, np.nan]])
+    sweep = Sweep("a", Curve(x, np.array([90.0, 80, 70]), x, x), tuple(labels[:3]))
+    grid = Grid(("a", "e"), ["1", "2"], ["3", "4"], means, [labels[:2], [labels[2], ""]])
+    series = [
+        EnvironmentSeries(places[0], None, RunSeries((), None), None, {"swept": sweep}),
+        EnvironmentSeries(places[1], None, RunSeries((), None), None, {}, {"swept": grid}),
+    ]
+    report = Report(StudySeries(analysis, agent_marks(analysis.study), tuple(series)), "compare")
+    return Page(render(report, [verdict_section.section(report)]))
+
+
+def test_a_sweep_has_its_answer_on_top(sweep_page):
+    assert [text for _, text in sweep_page.all("summary")] == ["What is asked"]
+    (plot,) = [a for a, _ in sweep_page.all("div") if "data-card" in a]
+    sweeps = data_of(sweep_page, "data-verdict")["sweeps"]
+    assert list(sweeps[int(plot["data-card"])]) == ["swept"]
+    found = sweeps[0]["swept"]
+    assert (found["parameter"], found["x"], found["y"]) == ("a", [1, 2, 3], [90, 80, 70])
+    assert found["best"] == [True, False, False]
+    assert sweeps[1] == {}
+
+
+def test_a_heat_map_stands_on_the_page_with_its_best_value(sweep_page):
+    cells = [(a, text) for a, text in sweep_page.all("td") if "best" in a.get("class", "")]
+    assert [text for _, text in cells] == ["90 best"]
+    shaded = {
+        text: a["style"] for a, text in sweep_page.all("td") if "--strength" in a.get("style", "")
+    }
+    assert shaded == {"90 best": "--strength: 90%", "80": "--strength: 45%", "70": "--strength: 0%"}
+    assert "by a (down) and e (across)" in " ".join(
+        text for _, text in sweep_page.all("figcaption")
+    )

@@ -431,7 +431,7 @@ def test_a_phone_has_nothing_beyond_its_edge(page, width):
 
 def test_curves_by_pull_change_with_their_toggles(bandit_page):
     regret = figure(bandit_page, "#pull-regret")
-    assert (regret["xTitle"], regret["xType"]) == ("pulls", "log")
+    assert (regret["xTitle"], regret["xType"]) == ("pulls (log scale)", "log")
     assert "Auer, for UCB1" in regret["names"]
     choose(bandit_page, "pull-axis", "linear")
     assert figure(bandit_page, "#pull-regret")["xType"] == "linear"

@@ -1,6 +1,7 @@
 """What the figures of a study show, asked of Matplotlib's axes."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,6 +12,7 @@ from report.figures.figure_files import write_figures
 from report.figures.figure_style import line_style
 from report.figures.study_figures import (
     draw_blocks,
+    draw_grid,
     draw_learning_curves,
     draw_profiles,
     draw_runs,
@@ -18,7 +20,7 @@ from report.figures.study_figures import (
 )
 from report.series.agent_marks import COLOURS, DASHES, Mark, agent_marks
 from report.series.curve_series import Curve, LearningCurves
-from report.series.run_series import AgentRuns, RunSeries
+from report.series.run_series import AgentRuns, Grid, RunSeries, Sweep
 from report.series.study_series import EnvironmentSeries, StudySeries
 from verdicts import Band
 
@@ -100,7 +102,8 @@ def test_no_optimum_stands_beside_training_on_a_variant(curves_drawn, on_variant
     assert right.title == f"training episodes ({words}: on a variant of the environment)"
     circles = "trained on a variant of the environment"
     names = ["first", "second", "optimum", "best random or constant policy", circles]
-    assert left.names == left.shared_legend == names
+    assert left.names == names
+    assert left.shared_legend == [*names, "95 % interval"]
     # Circles lie on their curves and on no other.
     marked = [line for line in right.lines if line["label"] is None]
     assert [(line["x"], line["y"]) for line in marked] == [
@@ -151,7 +154,7 @@ def test_both_ends_of_a_bracket_are_lines_across(curves_drawn):
 def test_where_the_optimum_is_not_known_no_line_stands_for_it(curves_drawn):
     left, right = curves_drawn(optimum=None, baseline=None)
     assert left.names == right.names == ["first", "second"]
-    assert left.shared_legend == ["first", "second"]
+    assert left.shared_legend == ["first", "second", "95 % interval"]
 
 
 def test_words_around_the_curves(curves_drawn):
@@ -160,7 +163,8 @@ def test_words_around_the_curves(curves_drawn):
     assert right.title == "training episodes"
     assert left.labels == ("environment steps", "return")
     assert right.labels == ("episodes", "return")
-    assert left.shared_legend == ["first", "second", "optimum", "best random or constant policy"]
+    references = ["optimum", "best random or constant policy"]
+    assert left.shared_legend == ["first", "second", *references, "95 % interval"]
     assert left.axes.xaxis.get_major_formatter()(20_000) == "20k"
 
 
@@ -172,7 +176,11 @@ def test_an_axis_is_logarithmic_where_some_returns_dwarf_the_others(curves_drawn
     assert [tick for tick in ticks if abs(tick) < 2000] == [
         *(-1000, -300, -100, -50, 0, 50, 100, 300, 1000)
     ]
-    assert left.axes.yaxis.get_major_formatter()(-1000.0) == "-1,000"
+    assert [place.labels[1] for place in (left, right)] == [
+        "return (log scale beyond ±79)",
+        "return",
+    ]
+    assert left.axes.yaxis.get_major_formatter()(-1000.0) == "\N{MINUS SIGN}1,000"
     # Nothing stands beyond the limits, and little room is left outside.
     low, high = left.axes.get_ylim()
     assert -10 < low < 3
@@ -252,25 +260,79 @@ def test_runs_without_a_known_optimum(runs_drawn):
 # --- sweeps, blocks, profiles --------------------------------------------------------------------
 
 
-def test_a_line_for_each_swept_parameter(axes, drawn):
+def sweep(parameter, x, y):
+    return Sweep(parameter, curve(x, y), tuple(f"{parameter} = {value}" for value in x))
+
+
+def ranked(made_up, *sweeps):
+    """An environment where the agents of these sweeps have their means."""
+    means = {k: v for one in sweeps for k, v in zip(one.labels, one.means.y, strict=True)}
+    labels = sorted(means, key=lambda label: -means[label])
+    return made_up.environment([made_up.agent(label, means[label]) for label in labels])
+
+
+def test_a_line_for_each_swept_parameter(axes, drawn, made_up):
     (axis,) = axes()
     sweeps = {
-        "sarsa: alpha": curve([0.1, 0.3, 0.9], [10, 30, 20]),
-        "dqn: gamma": curve([0.9, 0.95, 1], [1, 2, 3]),
+        "sarsa": sweep("a", [0.01, 0.1, 0.9], [10, 30, 20]),
+        "dqn": sweep("g", [0.9, 0.95, 1], [1, 2, 3]),
     }
-    draw_sweeps(axis, sweeps, "lake", "final")
+    draw_sweeps(axis, sweeps, ranked(made_up, *sweeps.values()), "final")
     place = drawn(axis)
-    assert place.names == place.legend == ["sarsa: alpha", "dqn: gamma"]
+    assert place.names == ["sarsa, a", "dqn, g"]
+    assert place.shared_legend == ["sarsa, a", "dqn, g", "best: a = 0.1", "95 % interval"]
     first, second = place.lines
-    assert (first["x"], first["y"]) == ([0.1, 0.3, 0.9], [10, 30, 20])
+    assert (first["x"], first["y"]) == ([0.01, 0.1, 0.9], [10, 30, 20])
     assert (second["x"], second["y"]) == ([0.9, 0.95, 1], [1, 2, 3])
     assert [line["colour"] for line in place.lines] == [BLUE, ORANGE]
     assert {line["marker"] for line in place.lines} == {"o"}
     assert [band["colour"] for band in place.bands] == [BLUE, ORANGE]
-    assert place.bands[0]["ends"] == {0.1: (9, 12), 0.3: (29, 32), 0.9: (19, 22)}
+    assert place.bands[0]["ends"] == {0.01: (9, 12), 0.1: (29, 32), 0.9: (19, 22)}
+    assert axis.collections[-1].get_offsets().tolist() == [[0.1, 30]]  # the ring
     assert place.title == "lake"
-    assert place.labels == ("value of the parameter", "return of the final policy")
-    assert place.axes.get_xscale() == "log"
+    assert place.labels == ("value of the parameter (log scale)", "return of the final policy")
+    assert axis.get_xscale() == "log"
+    assert axis.get_xticks().tolist() == [0.01, 0.1, 0.9, 0.95, 1]
+
+
+@pytest.mark.parametrize(
+    ("values", "scale", "words"),
+    [
+        ([0.1, 0.5, 0.9], "linear", "n"),
+        ([0, 5, 49], "linear", "n"),
+        ([0, 1, 50], "symlog", "n (log scale beyond 1)"),
+        ([1, 10, 100], "log", "n (log scale)"),
+        ([-1, 0, 100], "linear", "n"),
+        ([0, 0, 0], "linear", "n"),
+    ],
+)
+def test_an_axis_of_values_says_what_scale_it_has(axes, made_up, values, scale, words):
+    (axis,) = axes()
+    one = sweep("n", values, [1, 2, 3])
+    draw_sweeps(axis, {"alone": one}, ranked(made_up, one), "final")
+    assert (axis.get_xscale(), axis.get_xlabel()) == (scale, words)
+
+
+@pytest.mark.parametrize(("metric", "dark"), [("final", "30"), ("regret", "10")])
+def test_a_heat_map_has_its_values_in_its_cells(axes, made_up, metric, dark):
+    (axis,) = axes()
+    means = np.array([[10.0, 30.0], [20.0, np.nan]])
+    grid = Grid(("a", "e"), ["1", "2"], ["3", "4"], means, [["p", "q"], ["r", ""]])
+    known = zip("pqr", means.ravel(), strict=False)
+    found = sorted([made_up.agent(*one) for one in known], key=lambda a: a.agent != "q")
+    draw_grid(axis, grid, "lake", made_up.environment(found), metric)
+    texts = {text.get_text(): (text.get_position(), text.get_color()) for text in axis.texts}
+    assert {text: place for text, (place, _) in texts.items()} == {
+        "10": (0, 0),
+        "30": (1, 0),
+        "20": (0, 1),
+    }
+    assert [text for text, (_, colour) in texts.items() if colour == "white"] == [dark]
+    (frame,) = axis.patches
+    assert frame.get_center().tolist() == pytest.approx([1, 0])
+    assert [tick.get_text() for tick in axis.get_xticklabels()] == ["3", "4"]
+    assert (axis.get_ylabel(), axis.get_xlabel()) == ("a", "e")
+    assert axis.get_ylim() == (1.5, -0.5)  # the first row on top
 
 
 def test_blocks_have_an_average_a_minimum_and_a_maximum(axes, drawn):
@@ -280,7 +342,6 @@ def test_blocks_have_an_average_a_minimum_and_a_maximum(axes, drawn):
     )
     draw_blocks(axis, rows, MARKS["first"])
     place = drawn(axis)
-    assert place.names == place.legend == ["average", "minimum", "maximum"]
     assert [line["y"] for line in place.lines] == [[2, 3], [0, 1], [8, 9]]
     assert {tuple(line["x"]) for line in place.lines} == {(5, 10)}
     assert [line["style"] for line in place.lines] == ["-", ":", "--"]
@@ -301,7 +362,8 @@ def test_a_profile_for_each_agent(axes, drawn):
     (axis,) = axes()
     draw_profiles(axis, OVERALL, MARKS)
     place = drawn(axis)
-    assert place.names == place.legend == ["second", "first"]
+    assert place.names == ["second", "first"]
+    assert place.shared_legend == ["second", "first", "95 % interval"]
     assert {tuple(line["x"]) for line in place.lines} == {(0, 0.5, 1)}
     assert [line["y"] for line in place.lines] == [[1, 0.8, 0.25], [0.5, 0.25, 0]]
     assert [line["colour"] for line in place.lines] == [BLUE, ORANGE]
@@ -323,13 +385,13 @@ def series(made_up, tmp_path):
     agents = (made_up.agent("first", 90.0), made_up.agent("second", 40.0))
     places = [made_up.environment(agents, label) for label in ("lake", "island")]
     analysis = made_up.analysis(places, ["second", "first"], tmp_path, overall=OVERALL)
-    sweep = {"first: gamma": curve([0.1, 0.2, 0.3], [1, 2, 3])}
+    swept_over = {"swept": Sweep("γ", curve([0.1, 0.2, 0.3], [1, 2, 3]), ("second", "first", "-"))}
     return StudySeries(
         analysis,
         agent_marks(analysis.study),
         tuple(
             EnvironmentSeries(place, learning_curves(), run_series(made_up), None, swept)
-            for place, swept in zip(places, ({}, sweep), strict=True)
+            for place, swept in zip(places, ({}, swept_over), strict=True)
         ),
     )
 
@@ -375,13 +437,15 @@ def test_files_hold_what_their_names_say(series, drawn, canvases):
         (runs,) = shown(f"{place}_intervals")
         assert runs.title == f"{place}; the line is the optimum"
         assert len(runs.lines) == 7
-    first, second = shown("lake_episodes")
+    first, second = shown("lake_episodes")[:2]
     assert (first.title, second.title) == ("first", "second")
-    assert (first.line("average")["y"], second.line("average")["y"]) == ([1, 2], [3])
+    assert (first.lines[0]["y"], second.lines[0]["y"]) == ([1, 2], [3])
+    assert first.shared_legend == ["average", "minimum", "maximum"]
     (alone,) = shown("island_episodes")
-    assert alone.line("average")["y"] == [4]
-    (sweep,) = shown("island_sweep")
-    assert (sweep.title, sweep.names) == ("island", ["first: gamma"])
+    assert alone.lines[0]["y"] == [4]
+    (swept_over,) = shown("island_sweep")
+    assert (swept_over.title, swept_over.names) == ("island", ["swept"])
+    assert swept_over.labels[0] == "γ"
     (profiles,) = shown("performance_profiles")
     assert profiles.names == ["second", "first"]
 
@@ -404,10 +468,11 @@ def test_too_many_agents_make_no_lines(series, made_up, tmp_path):
     agents = [made_up.agent(f"agent {n}", float(-n)) for n in range(15)]
     one = series.environments[1]
     many = made_up.environment(agents, "island")
-    crowded = EnvironmentSeries(many, one.curves, one.runs, None, one.sweeps)
+    swept_over = {"swept": replace(one.sweeps["swept"], labels=tuple(a.agent for a in agents[:3]))}
+    crowded = EnvironmentSeries(many, one.curves, one.runs, None, swept_over)
     analysis = made_up.analysis([many], [agent.agent for agent in agents], tmp_path)
     found = write_figures(StudySeries(analysis, series.marks, (crowded,)), None)
-    assert [path.name for path in found] == ["island_sweep.png", "island_sweep.svg"]
+    assert [path.name for path in found] == [f"island_sweep.{suffix}" for suffix in ("png", "svg")]
 
 
 def test_marks_go_through_colours_and_dashes_together(made_up):

@@ -13,7 +13,7 @@ report.section("bandits", (root, _, current) => {
   };
 
   const xaxis = (type = chosen("pull-axis")) => ({
-    title: { text: "pulls" },
+    title: { text: type === "log" ? "pulls (log scale)" : "pulls" },
     type,
     hoverformat: ",",
     exponentformat: "SI",
@@ -60,12 +60,14 @@ report.section("bandits", (root, _, current) => {
   };
   figure("pull-regret", () => true, ({ curves, bounds }) => {
     const shown = agents(curves).map(([label, curve]) => [label, { x: curve.x, ...curve.regret[chosen("pull-spread")] }]);
-    const highest = Math.max(1, ...shown.flatMap(([, curve]) => curve.high));
+    // More bands than these lie over each other until none can be told apart.
+    const isFew = shown.length <= 4;
+    const highest = Math.max(1, ...shown.flatMap(([, curve]) => (isFew ? curve.high : curve.y)));
     // An agent that never learns would leave no height for the others.
     const top = bounds === null ? Infinity : 1.1 * bounds.auer.at(-1);
     return {
       traces: [
-        ...shown.flatMap(([label, curve]) => report.band(label, curve, same)),
+        ...shown.flatMap(([label, curve]) => report.band(label, isFew ? curve : plain(curve.x, curve.y), same)),
         ...(bounds === null ? [] : theory(bounds, 1.5 * highest)),
       ],
       layout: layout({

@@ -14,7 +14,7 @@ report.section("comparison", (root, data, chosen) => {
         height: pixels,
         hovermode: "closest",
         shapes: report.references(report.page.environments[report.environment], height, middle),
-        xaxis: { title: { text: data.metric }, ...symlog?.ticks(Math.min(...values), Math.max(...values, linear)) },
+        xaxis: { title: { text: data.metric + (symlog ? ` (log scale beyond ±${report.number(linear)})` : "") }, ...symlog?.ticks(Math.min(...values), Math.max(...values, linear)) },
         yaxis,
       },
     };

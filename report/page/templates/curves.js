@@ -24,18 +24,18 @@ report.section("curves", (root, _, place) => {
     const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
     const height = symlog?.height ?? ((value) => value);
     const curves = Object.entries(place()[kind][by]).filter(([label]) => isShown(label));
-    const words = symlog ? [`The vertical axis is linear up to ±${report.number(linear)} and logarithmic beyond.`] : [];
-    if (onVariant.length) words.push(`Circles: trained on a variant of the environment, so that the optimum is none of theirs: ${onVariant.join(", ")}.`);
-    detail.textContent = words.join(" ");
+    detail.textContent = onVariant.length
+      ? `Circles: trained on a variant of the environment, so that the optimum is none of theirs: ${onVariant.join(", ")}.`
+      : "";
     return {
       traces: curves.flatMap(([label, curve]) => report.band(label, curve, height, {}, noteOf(label))),
       layout: {
         hovermode: "x unified",
         uirevision: [report.environment, kind, by, across, chosen("scale")].join(),
         shapes: report.references(environment, height),
-        xaxis: { title: { text: TITLES[by] }, type: across, hoverformat: ",.4~r", exponentformat: "SI", rangemode: "tozero" },
+        xaxis: { title: { text: TITLES[by] + (across === "log" ? " (log scale)" : "") }, type: across, hoverformat: ",.4~r", exponentformat: "SI", rangemode: "tozero" },
         yaxis: {
-          title: { text: kind === "evaluation" ? "return of evaluations" : "return of training episodes" },
+          title: { text: (kind === "evaluation" ? "return of evaluations" : "return of training episodes") + (symlog ? ` (log scale beyond ±${report.number(linear)})` : "") },
           ...symlog?.ticks(...extent(curves.map(([, curve]) => curve), environment)),
         },
       },
