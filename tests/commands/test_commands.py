@@ -484,12 +484,9 @@ def test_the_head_says_what_auto_stands_for_and_what_a_discount_costs(type_comma
 
 
 def test_typed_arguments_of_the_environment_win_over_what_an_entry_trains_on():
-    words = ["--algo", "ppo", "--env", "Warehouse-v0", "--env-kwargs", "shelf_reward:-1"]
+    words = ["--algo", "ppo", "--env", "MineMaze-v0", "--env-kwargs", "mine_reward:-1"]
     spec = train_spec(build_parser().parse_args(words))
-    assert training_kwargs(spec) == {
-        "shelf_reward": -1,
-        "random_start": True,
-        "max_episode_steps": 100,
-    }
-    assert "without shelf_reward: -10" in spec.origins["train_env_kwargs"]
-    assert training_kwargs(train_spec(build_parser().parse_args(words[:4])))["shelf_reward"] == -10
+    variant = {"random_start": True, "goal_reward": 20, "power_reward": 3}
+    assert training_kwargs(spec) == {**variant, "mine_reward": -1}
+    assert "without mine_reward: -20" in spec.origins["train_env_kwargs"]
+    assert training_kwargs(train_spec(build_parser().parse_args(words[:4])))["mine_reward"] == -20

@@ -1,0 +1,132 @@
+"""The commands that the project's own text recommends, and what the agents reach that they train.
+
+Found in README, in the pages and in the docstrings and help texts of the code. A
+training is what ``train.py`` does with such arguments: the agents of a comparison are some, and so
+are the settings that a search begins with.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "documented-commands.md"
+PACKAGES = ("agents", "commands", "envs", "experiments", "pipeline", "report", "tuning")
+# Where a command ends: a backtick, a comment, a cell of a table or the line.
+COMMAND = re.compile(
+    r"(?:python (?:~/yardstick/)?(train|compare|tune)\.py|\byardstick (train|compare|tune)"
+    r"|\bpython (train)\.py|\b(make train)\b)"
+    r"((?:[^\S\n]+(?!#)[^\s`|#]+)*)"
+)
+TRAIN = "make train"
+# Flags with so many values, or -1 for those up to the next flag, that are no matter of the training:
+# of its output, and of its engine, since trainings are done with ``--engine auto``; of searches; and
+# of comparisons.
+OUTPUT = {"--seed": 1, "--engine": 1, "--watch-learning": -1, "--resume-or-start": 0}
+SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--objective": 1}
+SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
+STUDY = {"--env": -1, "--algos": -1, "--seeds": 1, "--first-seed": 1}
+STUDY |= {"--episodes-table": 1, "--render-every": 1}
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command as the text has it.
+
+    Attributes:
+        script: ``"train"``, ``"compare"`` or ``"tune"``.
+        words: what follows.
+        places: the files that have it.
+    """
+
+    script: str
+    words: tuple[str, ...]
+    places: list[str] = field(default_factory=list, compare=False)
+
+    @property
+    def trainings(self) -> list[str]:
+        """The trainings that it stands for, as arguments of ``train.py``; none for other commands.
+
+        Commands that need the reader's modules or files of runs are carried out by the tests of
+        their pages, and study files by the tests of studies.
+        """
+        words = list(self.words)
+        needs = {"--list", "--resume", "-i", "--gym-packages", "--conf-file", "--logged"}
+        if needs & set(words) or "--env" not in words:
+            return []
+        rest = _without(words, {**OUTPUT, **SEARCH, **STUDY, "--algo": 1})
+        agents = _values(words, "--algo") + _values(words, "--algos")
+        pairs = product(_values(words, "--env"), agents)
+        return [shlex.join(["--env", env, "--algo", algo, *rest]) for env, algo in pairs]
+
+
+def _values(words: list[str], flag: str) -> list[str]:
+    """What follows a flag, up to the next one."""
+    if flag not in words:
+        return []
+    rest = words[words.index(flag) + 1 :]
+    end = next((i for i, word in enumerate(rest) if word.startswith("-")), len(rest))
+    return rest[:end]
+
+
+def _without(words: list[str], flags: dict[str, int]) -> list[str]:
+    """The words without some flags and their values."""
+    kept = list(words)
+    for flag, n in flags.items():
+        while flag in kept:
+            at = kept.index(flag)
+            del kept[at : at + 1 + (len(_values(kept, flag)) if n < 0 else n)]
+    return kept
+
+
+@cache
+def documented() -> tuple[Command, ...]:
+    """All commands of the text, in the order in which they are found; each once."""
+    pages = [
+        p for p in sorted(ROOT.glob("docs/**/*.md")) if p != PAGE and "decisions" not in p.parts
+    ]
+    code = [path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))]
+    found: dict[Command, Command] = {}
+    for path in (ROOT / "README.md", *pages, *sorted(ROOT.glob("*.py")), *code):
+        for one in commands_in(path.read_text(encoding="utf-8")):
+            place = str(path.relative_to(ROOT))
+            same = found.setdefault(one, one)
+            same.places.extend([place] * (place not in same.places))
+    return tuple(found.values())
+
+
+def commands_in(text: str) -> list[Command]:
+    """The commands of a text that have arguments, or need none."""
+    found = []
+    for match in COMMAND.finditer(text):
+        script = next(filter(None, match.groups()[:4]))
+        if script == TRAIN:
+            given = re.match(r' ARGS="([^"]+)"', text[match.end(4) :])
+            rest = given[1] if given else "--env Warehouse-v0 --algo ppo"
+            script = "train"
+        else:
+            rest = match[5]
+        words = tuple(shlex.split(rest.rstrip(".,;:)")))
+        if words:
+            found.append(Command(script, words))
+    return found
+
+
+def trainings() -> dict[str, list[str]]:
+    """By training, the files that recommend it."""
+    found: dict[str, list[str]] = {}
+    for command in documented():
+        for training in command.trainings:
+            places = found.setdefault(training, [])
+            places.extend(place for place in command.places if place not in places)
+    return found
+
+
+if __name__ == "__main__":
+    for line, where in trainings().items():
+        print(line, "   ", *where)
