@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
 import shlex
 import statistics
@@ -96,12 +97,10 @@ def measure(training: str, limit: float, folder: Path) -> list[dict[str, Any]]:
 def cells(training: str, runs: list[dict[str, Any]]) -> list[str]:
     """Solved, what the median run reaches, and its processor time."""
     solved = n_solved(training, runs)
-    kinds = [kind for kind in ("score", "return") if all(r[kind] is not None for r in runs)]
-    if kinds:
-        reached = f"{statistics.median(run[kinds[0]] for run in runs):.3g}"
-        reached = f"{reached}{'' if kinds[0] == 'score' else ' (return)'}"
-    else:
-        reached = f"{statistics.median(run['regret'] for run in runs):.3g} (regret)"
+    names = ("score", "return", "regret")
+    kind = next((name for name in names if all(run[name] is not None for run in runs)), None)
+    reached = f"{statistics.median(run[kind] for run in runs):.3g}" if kind else ""
+    reached += "" if kind in ("score", None) else f" ({kind})"
     return [
         "" if solved is None else f"{solved} of {len(runs)}",
         reached,
@@ -161,8 +160,6 @@ def main() -> None:
         return
     results = args.results.resolve()
     with tempfile.TemporaryDirectory() as name:
-        import os
-
         os.chdir(name)
         prepared_folder(Path(name))
         for training in trainings():

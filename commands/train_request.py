@@ -86,8 +86,9 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     """The file's entry for the environment, changed as the command line says; and what gave way."""
     asked = parse_assignments(args.hyperparams, "--hyperparams")
     changes = with_engine(args.algo, asked, args.engine)
+    kwargs = parse_assignments(args.env_kwargs, "--env-kwargs") or changes.get("env_kwargs")
     try:
-        entry = read_hyperparams(args.algo, args.env, args.conf_file)
+        entry = read_hyperparams(args.algo, args.env, args.conf_file, kwargs)
     except NoEntryError:
         if not changes:
             raise

@@ -211,13 +211,14 @@ def _raw_hyperparams(
 ) -> tuple[dict[str, Any], dict[str, str] | None]:
     """The agent's file, changed by the environment's settings, and these by the agent's own."""
     raw: dict[str, Any] = {}
+    own = layered(environment.settings, agent.settings)
     if agent.tuned or agent.conf_file is not None:
         try:
-            raw = read_hyperparams(agent.algo, environment.env_id, agent.conf_file)
+            kwargs = own.get("env_kwargs")
+            raw = read_hyperparams(agent.algo, environment.env_id, agent.conf_file, kwargs)
         except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
-    own = layered(environment.settings, agent.settings)
     return training_follows(layered(raw, own), own)
 
 

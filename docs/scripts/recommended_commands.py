@@ -24,9 +24,8 @@ COMMAND = re.compile(
     r"((?:[^\S\n]+(?!#)[^\s`|#]+)*)"
 )
 TRAIN = "make train"
-# Flags with so many values, or -1 for those up to the next flag, that are no matter of the training:
-# of its output, and of its engine, since trainings are done with ``--engine auto``; of searches; and
-# of comparisons.
+# Flags that are no matter of the training, with how many values they have, or -1 for those up to the
+# next flag: of output, of the engine, of searches, of comparisons.
 OUTPUT = {"--seed": 1, "--engine": 1, "--watch-learning": -1, "--resume-or-start": 0}
 SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--objective": 1}
 SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
