@@ -94,6 +94,12 @@ def build_parser() -> argparse.ArgumentParser:
     )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
     add(
+        "--as-it-comes",
+        action="store_true",
+        help="train every agent on the environment as it comes, without what settings change in "
+        "training alone (train_env_kwargs, train_env_wrapper)",
+    )
+    add(
         "--gym-packages",
         nargs="+",
         type=filled,

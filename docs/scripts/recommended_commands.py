@@ -24,8 +24,7 @@ COMMAND = re.compile(
     r"((?:[^\S\n]+(?!#)[^\s`|#]+)*)"
 )
 TRAIN = "make train"
-# Flags that are no matter of the training, with how many values they have, or -1 for those up to the
-# next flag: of output, of the engine, of searches, of comparisons.
+# Flags that are no matter of the training, and how many values they have; -1: up to the next flag.
 OUTPUT = {"--seed": 1, "--engine": 1, "--watch-learning": -1, "--resume-or-start": 0}
 SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--objective": 1}
 SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
