@@ -219,7 +219,11 @@ def _raw_hyperparams(
         except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
-    return training_follows(layered(raw, own), own)
+    # What the environment's settings take away is gone before the agent's own come.
+    kept = {
+        key: value for key, value in raw.items() if environment.settings.get(key, key) is not None
+    }
+    return training_follows(layered(kept, own), own)
 
 
 def _shortened(raw: Mapping[str, Any], share: float) -> dict[str, Any]:
