@@ -30,6 +30,8 @@ SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--obj
 SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
 STUDY = {"--env": -1, "--algos": -1, "--seeds": 1, "--first-seed": 1}
 STUDY |= {"--episodes-table": 1, "--render-every": 1}
+ROW = re.compile(r"^\| `(--env [^`]*)` \| ([^|]*) \| [^|]* \| ([^|]*) \| ([^|]*) \|$", re.MULTILINE)
+LINE = re.compile(r"^(python (?:train|compare)\.py [^#\n]*?)(?: +#[^\n]*)?$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,53 @@ def trainings() -> dict[str, list[str]]:
             places = found.setdefault(training, [])
             places.extend(place for place in command.places if place not in places)
     return found
+
+
+@dataclass(frozen=True)
+class Reached:
+    """A row of the table: how many of how many runs solve it, and what the median run reaches."""
+
+    n_solved: int | None
+    n_runs: int
+    median: str
+    seconds: float
+
+
+def reached() -> dict[str, Reached]:
+    """The table of the page by training."""
+    found = {}
+    for training, solved, median, seconds in ROW.findall(PAGE.read_text(encoding="utf-8")):
+        n_solved, _, n_runs = solved.partition(" of ")
+        counts = (int(n_solved), int(n_runs)) if solved else (None, 0)
+        found[training] = Reached(*counts, median, float(seconds))
+    return found
+
+
+def with_outcomes(text: str) -> str:
+    """A page in which each command in a block says beside it what it reaches, as a comment."""
+    table = reached()
+
+    def line(found: re.Match[str]) -> str:
+        command = commands_in(found[1])[0]
+        rows = [table.get(one) for one in command.trainings]
+        told = _outcome([row for row in rows if row], command) if all(rows) else ""
+        return f"{found[1]}  # {told}" if told else found[0]
+
+    return LINE.sub(line, text)
+
+
+def _outcome(rows: list[Reached], command: Command) -> str:
+    if not rows or any(row.n_solved is None for row in rows):
+        return ""
+    first = rows[0]
+    if first.n_runs == 1:
+        return f"score {first.median}"
+    of = f"of {first.n_runs} seeds"
+    if len({(row.n_solved, row.n_runs) for row in rows}) == 1:
+        return f"{'each ' * (len(rows) > 1)}solves {first.n_solved} {of}"
+    agents = _values(list(command.words), "--algos")
+    told = [f"{row.n_solved} with {agent}" for agent, row in zip(agents, rows, strict=True)]
+    return f"solves, {of}: {', '.join(told)}"
 
 
 if __name__ == "__main__":
