@@ -99,7 +99,9 @@ def measure(training: str, limit: float, folder: Path) -> list[dict[str, Any]]:
 def cells(training: str, runs: list[dict[str, Any]]) -> list[str]:
     """Solved, what the median run reaches, and its processor time."""
     solved = n_solved(training, runs)
-    names = ("score", "return", "regret")
+    # Beside a constant policy that is optimal too, scores have no size.
+    no_score = any(abs(r["score"] or 0) > 10 or (_is_optimal(r) and r["score"] <= 0) for r in runs)
+    names = ("return", "regret") if no_score else ("score", "return", "regret")
     kind = next((name for name in names if all(run[name] is not None for run in runs)), None)
     reached = f"{statistics.median(run[kind] for run in runs):.3g}" if kind else ""
     reached += "" if kind in ("score", None) else f" ({kind})"

@@ -38,7 +38,7 @@ FIRST_SEED = whole_number(0, 2**31)
 EPILOG = """\
 examples:
   python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
-  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --n-episodes 500
+  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --engine auto
   python compare.py studies/warehouse-learning-rate.yml
   python compare.py studies/warehouse-learning-rate.yml --quick
   python compare.py studies/warehouse-learning-rate.yml --until-decided

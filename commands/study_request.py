@@ -118,7 +118,8 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     files = _conf_files(study, args.conf_file)
     changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
     if args.env_kwargs:
-        changes["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
+        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
+        changes = layered(changes, named)
     if args.as_it_comes:
         changes = {**AS_IT_COMES, **changes}
     for key in ("n_timesteps", "n_episodes"):

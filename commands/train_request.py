@@ -97,6 +97,8 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
         if given:
             named = parse_assignments(given, f"--{key.replace('_', '-')}")
+            in_params = changes.get(key)
+            named = {**(in_params if isinstance(in_params, dict) else {}), **named}
             typed[key], changes[key] = named, {**(entry.get(key) or {}), **named}
     for key, budget in (("n_timesteps", args.n_timesteps), ("n_episodes", args.n_episodes)):
         if budget > 0:

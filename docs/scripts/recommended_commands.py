@@ -142,8 +142,8 @@ def reached() -> dict[str, Reached]:
     found = {}
     for training, solved, median, seconds in ROW.findall(PAGE.read_text(encoding="utf-8")):
         n_solved, _, n_runs = solved.partition(" of ")
-        counts = (int(n_solved), int(n_runs)) if solved else (None, 0)
-        found[training] = Reached(*counts, median, float(seconds))
+        count, n = (int(n_solved), int(n_runs)) if solved else (None, 0)
+        found[training] = Reached(count, n, median, float(seconds))
     return found
 
 
