@@ -38,7 +38,7 @@ FIRST_SEED = whole_number(0, 2**31)
 EPILOG = """\
 examples:
   python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
-  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --n-episodes 500
+  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --engine auto
   python compare.py studies/warehouse-learning-rate.yml
   python compare.py studies/warehouse-learning-rate.yml --quick
   python compare.py studies/warehouse-learning-rate.yml --until-decided
@@ -93,6 +93,12 @@ def build_parser() -> argparse.ArgumentParser:
         help="hyperparameters from another file; with several agents, for which: dqn:mine.yml",
     )
     add("--env-kwargs", nargs="+", default=[], metavar="KEY:VALUE", help="environment arguments")
+    add(
+        "--as-it-comes",
+        action="store_true",
+        help="train every agent on the environment as it comes, without what settings change in "
+        "training alone (train_env_kwargs, train_env_wrapper)",
+    )
     add(
         "--gym-packages",
         nargs="+",

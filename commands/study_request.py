@@ -13,6 +13,7 @@ from commands.flag_values import LONGEST_FOLDER_NAME
 from commands.parsing import check_tensorboard
 from experiments.study_files import find_study, read_study
 from experiments.study_spec import (
+    AS_IT_COMES,
     METRICS,
     AgentSpec,
     EnvironmentSpec,
@@ -117,7 +118,10 @@ def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     files = _conf_files(study, args.conf_file)
     changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
     if args.env_kwargs:
-        changes["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
+        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
+        changes = layered(changes, named)
+    if args.as_it_comes:
+        changes = {**AS_IT_COMES, **changes}
     for key in ("n_timesteps", "n_episodes"):
         if getattr(args, key) is not None:
             changes[key] = getattr(args, key)

@@ -86,8 +86,9 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     """The file's entry for the environment, changed as the command line says; and what gave way."""
     asked = parse_assignments(args.hyperparams, "--hyperparams")
     changes = with_engine(args.algo, asked, args.engine)
+    kwargs = parse_assignments(args.env_kwargs, "--env-kwargs") or changes.get("env_kwargs")
     try:
-        entry = read_hyperparams(args.algo, args.env, args.conf_file)
+        entry = read_hyperparams(args.algo, args.env, args.conf_file, kwargs)
     except NoEntryError:
         if not changes:
             raise
@@ -96,6 +97,8 @@ def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str
     for key, given in (("env_kwargs", args.env_kwargs), ("eval_env_kwargs", args.eval_env_kwargs)):
         if given:
             named = parse_assignments(given, f"--{key.replace('_', '-')}")
+            in_params = changes.get(key)
+            named = {**(in_params if isinstance(in_params, dict) else {}), **named}
             typed[key], changes[key] = named, {**(entry.get(key) or {}), **named}
     for key, budget in (("n_timesteps", args.n_timesteps), ("n_episodes", args.n_episodes)):
         if budget > 0:

@@ -9,7 +9,7 @@ from typing import Any
 
 from agents import ALGORITHMS
 from commands.flag_values import LONGEST_FOLDER_NAME
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name
+from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from pipeline.agent_checks import with_engine
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
@@ -87,7 +87,8 @@ def _agent(args: argparse.Namespace) -> AgentSpec:
     """The agent with the settings that the command line fixes."""
     settings: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
     if args.env_kwargs:
-        settings["env_kwargs"] = parse_assignments(args.env_kwargs, "--env-kwargs")
+        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
+        settings = layered(settings, named)
     if args.n_timesteps is not None and args.n_episodes is not None:
         raise UserError("how long to train? give -n or --n-episodes, not both")
     for key in ("n_timesteps", "n_episodes"):

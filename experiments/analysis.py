@@ -16,8 +16,9 @@ from experiments.seed_values import RESAMPLING_SEED
 from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, StudySpec
 from mdp.array_types import Floats
-from pipeline.environments import trains_on_variant
+from pipeline.environments import training_changes, trains_on_variant
 from pipeline.signs_of_life import Tell, tell_nobody
+from pipeline.train_spec import TrainSpec
 from verdicts import (
     FEWEST_SEEDS,
     Estimate,
@@ -34,6 +35,9 @@ from verdicts import (
     summarise,
     summarise_steps,
 )
+
+# Of agents that were trained on a changed environment.
+MARK = "†"
 
 
 @dataclass(frozen=True)
@@ -59,6 +63,7 @@ class AgentAnalysis:
         seconds: processor time that training took; nan where older versions did not measure it.
         on_variant: whether it was trained on a variant of the environment, whose returns are not to
             be held against those of evaluations or the optimum.
+        changes: what training changed in the environment, as the runs recorded it, in words.
     """
 
     agent: str
@@ -76,6 +81,13 @@ class AgentAnalysis:
     success_rate: Estimate | None
     seconds: Estimate
     on_variant: bool = False
+    changes: tuple[str, ...] = ()
+
+    @property
+    def marked(self) -> str:
+        """The label, with a mark where the training was on a changed environment."""
+        return f"{self.agent} {MARK}" if self.changes else self.agent
+
     steps_to_stay: ThresholdSummary | None = None
 
 
@@ -277,4 +289,12 @@ def _analyse_agent(
             for run in results.planned
             if (run.agent, run.environment, run.seed) == (agent, environment, study.first_seed)
         ),
+        changes=_recorded_changes(results, agent, environment),
     )
+
+
+def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tuple[str, ...]:
+    """By the first of its runs: its seeds share their settings."""
+    of_agent = (r for r in results.finished if (r.agent, r.environment) == (agent, environment))
+    run = next(of_agent, None)
+    return () if run is None else training_changes(TrainSpec.of_data(run.run.read_info()["spec"]))

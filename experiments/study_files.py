@@ -12,6 +12,7 @@ from typing import Any
 from agents import ALGORITHMS
 from experiments import run_limits
 from experiments.study_spec import (
+    AS_IT_COMES,
     AgentSpec,
     EnvironmentSpec,
     Metric,
@@ -294,6 +295,9 @@ def _environments(
         except UserError as error:
             place = document.at(*keys, "id") if "id" in entry else document.at(*keys)
             raise UserError(f"{place}: {error}") from error
-        own = {key: value for key, value in entry.items() if key != "id"}
+        own = {key: value for key, value in entry.items() if key not in ("id", "as_it_comes")}
+        values = document.values(entry, {"as_it_comes": bool}, *keys)
+        if values.get("as_it_comes"):
+            own = {**AS_IT_COMES, **own}
         environments.append(EnvironmentSpec(label, env_id, layered(shared, own)))
     return tuple(environments)

@@ -211,14 +211,19 @@ def _raw_hyperparams(
 ) -> tuple[dict[str, Any], dict[str, str] | None]:
     """The agent's file, changed by the environment's settings, and these by the agent's own."""
     raw: dict[str, Any] = {}
+    own = layered(environment.settings, agent.settings)
     if agent.tuned or agent.conf_file is not None:
         try:
-            raw = read_hyperparams(agent.algo, environment.env_id, agent.conf_file)
+            kwargs = own.get("env_kwargs")
+            raw = read_hyperparams(agent.algo, environment.env_id, agent.conf_file, kwargs)
         except NoEntryError:
             if not (agent.settings or environment.settings):
                 raise
-    own = layered(environment.settings, agent.settings)
-    return training_follows(layered(raw, own), own)
+    # What the environment's settings take away is gone before the agent's own come.
+    kept = {
+        key: value for key, value in raw.items() if environment.settings.get(key, key) is not None
+    }
+    return training_follows(layered(kept, own), own)
 
 
 def _shortened(raw: Mapping[str, Any], share: float) -> dict[str, Any]:

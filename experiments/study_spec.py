@@ -36,6 +36,10 @@ OF_TRAINING = ("training", "last_episodes")
 MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 
 
+# What settings change in the environment for training alone; with these it is as it comes.
+AS_IT_COMES: dict[str, Any] = {"train_env_kwargs": None, "train_env_wrapper": None}
+
+
 def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """The settings with ``changes`` made to them."""
     merged = {

@@ -6,8 +6,17 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
-from experiments.study_spec import MERGED, AgentSpec, EnvironmentSpec, StudySpec, layered
+from experiments.study_spec import (
+    AS_IT_COMES,
+    MERGED,
+    AgentSpec,
+    EnvironmentSpec,
+    StudySpec,
+    layered,
+)
+from pipeline.environments import usual_kwargs
 from pipeline.errors import UserError
 from pipeline.settings.hyperparam_entries import read_hyperparams, seeds_tuned_on
 
@@ -45,7 +54,9 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
     for agent, environment in _pairs(study):
         tuned_on = known(agent.algo, environment.env_id, agent.conf_file)
         begins_with_defaults = not (agent.tuned or agent.conf_file)
-        if {*agent.settings, *environment.settings} - _NO_TUNING or tuned_on is None:
+        own = layered(environment.settings, agent.settings)
+        as_it_comes = {key for key in AS_IT_COMES if own.get(key) is None}
+        if {*own} - _NO_TUNING - as_it_comes or tuned_on is None:
             unknown[agent.group or agent.label] = None
         if tuned_on is None:
             continue
@@ -62,9 +73,19 @@ def tuning_seeds(study: StudySpec) -> TuningSeeds:
 def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
     """Whether the study has arguments of the environment that the entry does not have."""
     own = layered(environment.settings, agent.settings)
-    entry = read_hyperparams(agent.algo, environment.env_id, agent.conf_file)
+    places = agent.algo, environment.env_id, agent.conf_file
+    entry = read_hyperparams(*places, own.get("env_kwargs"))
+    if entry != read_hyperparams(*places):  # that of the same environment by another name
+        del own["env_kwargs"]
     merged = layered(entry, own)
-    return any((merged.get(key) or {}) != (entry.get(key) or {}) for key in MERGED if own.get(key))
+    usual = usual_kwargs(environment.env_id)
+
+    def meant(settings: Mapping[str, Any], key: str) -> Any:
+        value = settings.get(key) or {}
+        return {**usual, **value} if key in MERGED else value
+
+    keys = [key for key in (*MERGED, "train_env_wrapper") if key in own]
+    return any(meant(merged, key) != meant(entry, key) for key in keys)
 
 
 def _said(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:

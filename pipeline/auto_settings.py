@@ -15,6 +15,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from envs.known_models import time_limit, transition_model
 from pipeline.agent_checks import check_fit
@@ -124,26 +125,48 @@ _RULES: Mapping[str, Callable[[_Asked], Found]] = {
 }
 
 
-def _scale(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
-    """The wrappers of training with a number in place of ``scale: auto``; empty without the word.
+def _scale(rewards: NDArray[np.floating[Any]]) -> Found:
+    largest = float(np.abs(rewards).max())
+    return Found(1 / largest if largest else 1.0, f"1 / the largest reward, {largest:g}")
 
-    What lies inside of the wrapper counts: it scales the rewards that it is handed.
+
+def _lowest_reward(rewards: NDArray[np.floating[Any]]) -> Found:
+    """A network that meets dear mistakes long before its goal learns to stand still."""
+    highest, lowest = float(rewards.max()), float(rewards.min())
+    if highest <= 0 or -highest / 10 < lowest:
+        return Found(lowest, f"{lowest:g}, the lowest reward")
+    return Found(-highest / 10, f"{-highest / 10:g}, a tenth of the highest reward below zero")
+
+
+_REWARD_RULES: Mapping[str, Callable[[NDArray[np.floating[Any]]], Found]] = {
+    "scale": _scale,
+    "min_reward": _lowest_reward,
+}
+
+
+def _wrappers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
+    """The wrappers of training with numbers in place of ``auto``; empty without the word.
+
+    What lies inside of a wrapper counts: it changes the rewards that it is handed.
     """
-    wrappers = component_specs(raw.get("train_env_wrapper"), f"{where}: train_env_wrapper")
-    place = next((i for i, one in enumerate(wrappers) if one.kwargs.get("scale") == AUTO), None)
-    if place is None:
+    wrappers = list(component_specs(raw.get("train_env_wrapper"), f"{where}: train_env_wrapper"))
+    told = []
+    for place, one in enumerate(wrappers):
+        for key in [key for key in _REWARD_RULES if one.kwargs.get(key) == AUTO]:
+            inner = replace(spec.hyperparams, train_env_wrapper=tuple(wrappers[:place]))
+            env = make_single_env(replace(spec, hyperparams=inner), training=True)
+            model = transition_model(env)
+            env.close()
+            if model is None:
+                raise UserError(f"{where}: {key}: auto needs an environment whose model is known")
+            found = _REWARD_RULES[key](model.reward[model.prob > 0])
+            wrappers[place] = replace(one, kwargs={**one.kwargs, key: found.value})
+            told.append(f"{key} auto: {found.how}")
+    if not told:
         return {}
-    inner = replace(spec.hyperparams, train_env_wrapper=wrappers[:place])
-    env = make_single_env(replace(spec, hyperparams=inner), training=True)
-    model = transition_model(env)
-    env.close()
-    if model is None:
-        raise UserError(f"{where}: scale: auto needs an environment whose model is known")
-    largest = float(np.abs(model.reward[model.prob > 0]).max())
-    scaled = replace(wrappers[place], kwargs={"scale": 1 / largest if largest else 1.0})
-    listed = [{one.name: one.kwargs} for one in (*wrappers[:place], scaled, *wrappers[place + 1 :])]
+    listed = [{one.name: one.kwargs} for one in wrappers]
     spelt = listed if len(listed) > 1 else listed[0]
-    return {"train_env_wrapper": Found(spelt, f"scale auto: 1 / the largest reward, {largest:g}")}
+    return {"train_env_wrapper": Found(spelt, "; ".join(told))}
 
 
 def without_auto(entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -191,7 +214,7 @@ def resolved_spec(
     - ``learning_rate: auto`` falls from 0.3 to ten pairs by the steps, within 0.003 and 0.05.
     - ``initial_q: auto`` and ``value_bound: auto`` are the highest reward that ends an episode.
     - ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1 by the largest reward of training,
-      its sign aside.
+      its sign aside; ``min_reward: auto`` a tenth of the highest reward, below zero.
 
     In other settings the word is what it was, such as ``engine: auto``.
 
@@ -206,7 +229,7 @@ def resolved_spec(
     """
     rest = without_auto(raw)
     spec = TrainSpec(hyperparams=split(rest, where), saved_hyperparams=rest, **fields)
-    found = _scale(raw, spec, where)
+    found = _wrappers(raw, spec, where)
     if len(rest) < len(raw):
         check_fit(spec)
         found |= _answers(raw, spec, where)

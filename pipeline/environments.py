@@ -106,12 +106,39 @@ def trains_on_variant(spec: TrainSpec) -> bool:
     changes = special.train_env_kwargs, special.eval_env_kwargs
     if not any(changes):
         return False
-    usual = {**_usual_kwargs(spec.env_id), **special.env_kwargs}
+    usual = {**usual_kwargs(spec.env_id), **special.env_kwargs}
     training, evaluation = ({**usual, **changed} for changed in changes)
     return training != evaluation
 
 
-def _usual_kwargs(env_id: str) -> dict[str, Any]:
+def training_changes(spec: TrainSpec) -> tuple[str, ...]:
+    """What the settings change in the environment for training alone, in words; empty for nothing.
+
+    Beside the arguments these are the wrappers of training, which change rewards for the most part.
+    `normalize` is not among them: it is told of as a setting of the agent.
+    """
+    special = spec.hyperparams
+    usual = {**usual_kwargs(spec.env_id), **special.env_kwargs}
+    told = []
+    for key, value in special.train_env_kwargs.items():
+        if usual.get(key) != value:
+            words = {"max_episode_steps": f"episodes of {value} steps"}
+            words |= {"random_start": "random starts"} if value is True else {}
+            told.append(words.get(key, f"{key} {value}"))
+    for wrapper in special.train_env_wrapper:
+        given = (wrapper.kwargs.get(key) for key in ("min_reward", "max_reward"))
+        bounds = [f"{bound:g}" for bound in given if bound is not None]
+        name = wrapper.name.rpartition(".")[2]
+        if name == "ScaleReward" and "scale" in wrapper.kwargs:
+            told.append(f"rewards x {wrapper.kwargs['scale']:g}")
+        elif name == "ClipReward" and bounds:
+            told.append(f"rewards clipped at {' and '.join(bounds)}")
+        else:
+            told.append(name)
+    return tuple(told)
+
+
+def usual_kwargs(env_id: str) -> dict[str, Any]:
     """The arguments that an environment has where none are given, as far as they are known."""
     registered = gym.spec(env_id.rpartition(":")[2])
     entry = registered.entry_point

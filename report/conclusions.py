@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from experiments.analysis import MARK, AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.reliability import ON_THE_SCALE
 from experiments.study_spec import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
 from report.pair_sentences import (
@@ -59,6 +59,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
             *speed_sentences(environment),
             *_on_the_impossible(study, environment),
             *_on_variants(study, environment),
+            *on_changes([environment]),
             *_on_missing(study, environment),
             *_on_looks(environment),
         ),
@@ -242,6 +243,21 @@ def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable
             f"{enumeration(names)} {verb} trained on a variant of the environment, with returns of "
             "its own."
         )
+
+
+def on_changes(environments: Sequence[EnvironmentAnalysis]) -> list[str]:
+    """Which agents were trained on a changed environment, and what was changed: one sentence.
+
+    Of several environments it says which; those with the same changes stand together.
+    """
+    found: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for environment in environments:
+        place = f" on {environment.environment}" if len(environments) > 1 else ""
+        for agent in environment.agents:
+            if agent.changes:
+                found.setdefault((place, agent.changes), []).append(agent.agent)
+    told = [f"{enumeration(a)}{place} ({', '.join(what)})" for (place, what), a in found.items()]
+    return [f"{MARK}: trained on a changed environment: {'; '.join(told)}."] if told else []
 
 
 def _on_looks(environment: EnvironmentAnalysis) -> Iterable[str]:

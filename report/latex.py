@@ -35,6 +35,7 @@ _SIGNS = {
     "∞": r"$\infty$",
     _MINUS: "$-$",
     "…": r"\ldots{}",
+    "†": r"$\dagger$",
 }
 _NOT_IN_OT1 = "ÐÞðþ«»"  # of Latin-1, all of which pdfLaTeX has with other fonts alone
 

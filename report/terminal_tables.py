@@ -124,7 +124,7 @@ def _table(
     title: str, shown: Sequence[tuple[Column[AnyRow], list[Cell]]], rows: Sequence[AnyRow]
 ) -> Table:
     table = Table(title=title, title_justify="left")
-    names = [row.agent.agent for row in rows]
+    names = [row.agent.marked for row in rows]
     # Longer names go over several lines.
     width = min(max(map(len, names)), MOST_AGENT_WIDTH)
     table.add_column("agent", overflow="fold", min_width=width, max_width=MOST_AGENT_WIDTH)

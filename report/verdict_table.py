@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from experiments.analysis import MARK, AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.study_results import StudyResults
 from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
 from experiments.tuning_seeds import tuning_seeds
-from report.conclusions import conclusion, none_has_learnt
+from report.conclusions import conclusion, none_has_learnt, on_changes
 from report.markdown import MARKDOWN
 from report.markup_language import MarkupLanguage
 from report.seed_sentence import seed_sentence
@@ -53,12 +53,20 @@ def headline(analysis: StudyAnalysis, markup: MarkupLanguage = MARKDOWN) -> str:
     """A table of agents by environments, and what its marks mean."""
     study, environments = analysis.study, analysis.environments
     found = [_cells(analysis, environment, markup) for environment in environments]
+    changed = {a.agent for one in environments for a in one.agents if a.changes}
     rows = [
-        [markup.name(agent.label), *(cells.get(agent.label, NOTHING) for cells in found)]
+        [
+            _name(markup, agent.label, agent.label in changed),
+            *(cells.get(agent.label, NOTHING) for cells in found),
+        ]
         for agent in study.agents
     ]
     headings = ["", *(markup.text(one.environment) for one in environments)]
     return markup.table(headings, rows, markup.text(_legend(study, analysis)))
+
+
+def _name(markup: MarkupLanguage, label: str, changed: bool) -> str:
+    return f"{markup.name(label)} {markup.text(MARK)}" if changed else markup.name(label)
 
 
 def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
@@ -75,7 +83,7 @@ def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
     )
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
-    return text
+    return " ".join([text, *on_changes(analysis.environments)])
 
 
 def _on_brackets(analysis: StudyAnalysis) -> str:
@@ -160,7 +168,8 @@ def ranking(
             NOTHING if stays is None else number(stays.median.point),
             NOTHING if cost is None else duration(cost),
         ]
-        rows.append([markup.name(agent.agent), *map(markup.figure, figures)])
+        name = _name(markup, agent.agent, bool(agent.changes))
+        rows.append([name, *map(markup.figure, figures)])
     headings = ["", "median", "mean", "score", "failed", "stays from", "processor time"]
     # A column in which no agent has a figure is left out.
     kept = [k for k, of in enumerate(zip(*rows, strict=True)) if not set(of) <= {NOTHING}]

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import sys
 from pathlib import Path
 
 import pytest
@@ -12,6 +13,18 @@ from commands.train_request import train_spec
 from commands.tune_request import tuning_spec
 
 ROOT = Path(__file__).parent.parent
+sys.path += [str(ROOT / "benchmarks"), str(ROOT / "docs" / "scripts")]
+
+from documented_commands import SEEDS, n_solved, outcome, prepared_folder  # noqa: E402
+
+from recommended_commands import (  # noqa: E402
+    PAGE,
+    commands_in,
+    reached,
+    trainings,
+    with_outcomes,
+)
+
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 COMMAND = re.compile(r"python ((?:train|enjoy|compare|tune)\.py [^`\n)#]*)")
 
@@ -98,3 +111,51 @@ def test_make_targets_of_the_readme_exist():
     assert targets == {"train", "test", "docs", "bench"}
     makefile = (ROOT / "Makefile").read_text()
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
+
+
+# --- what the commands reach ---------------------------------------------------------------------
+
+ENOUGH = 0.25  # seconds of processor time: trainings that take less are done as they stand
+TASTE = 300  # steps of the others
+
+
+def test_every_training_that_the_text_recommends_has_its_row():
+    assert set(trainings()) == set(reached())
+    assert len(trainings()) > 70
+    pages = [path for path in sorted(ROOT.glob("docs/**/*.md")) if path != PAGE]
+    told = [path.name for path in pages if "seeds\n" in with_outcomes(path.read_text())]
+    assert len(told) > 30
+    assert [p.name for p in pages if with_outcomes(p.read_text()) != p.read_text()] == []
+
+
+@pytest.mark.parametrize("training", trainings())
+def test_each_training_does_what_the_page_says(tmp_path, monkeypatch, training):
+    """Those that are cheap and always succeed, with the first seed; a taste of the others."""
+    monkeypatch.chdir(tmp_path)
+    prepared_folder(tmp_path)
+    row = reached()[training]
+    if row.seconds <= ENOUGH and row.n_solved == row.n_runs:
+        assert n_solved(training, [outcome(training, SEEDS[0], tmp_path / "logs")]) == 1
+    else:
+        words = re.sub(r" (-n|--n-episodes|--eval-freq) \S+", "", training)
+        taste = f"{words} -n {TASTE} --eval-freq -1"
+        assert outcome(taste, SEEDS[0], tmp_path / "logs")["seconds"] >= 0
+
+
+def test_the_collector_reads_commands_wherever_they_stand():
+    text = """
+    | row | `python train.py --env A-v0 --algo x --seed 3 -params gamma:0.9` | more |
+    ``make train ARGS="--env B-v0 --algo y --engine auto"`` and `make train`
+    python train.py --list
+    python compare.py --env A-v0 B-v0 --algos x y --seeds 5 --env-kwargs slip:0.1   # a comment
+    python tune.py --env A-v0 --algo x --trials 9
+    python compare.py studies/some.yml
+    """
+    found = [one for command in commands_in(text) for one in command.trainings]
+    assert found == [
+        "--env A-v0 --algo x -params gamma:0.9",
+        "--env B-v0 --algo y",
+        "--env Warehouse-v0 --algo ppo",
+        *(f"--env {e} --algo {a} --env-kwargs slip:0.1" for e in ("A-v0", "B-v0") for a in "xy"),
+        "--env A-v0 --algo x",
+    ]

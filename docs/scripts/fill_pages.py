@@ -9,8 +9,9 @@ read on a code host too::
 There are blocks of these kinds: ``code``, with a file and names in it; ``environment``, with an id
 and arguments, for the picture, the facts and the docstring; ``facts``, likewise, without the
 docstring; ``docstring``, with an id, for that alone; ``optima`` and ``variants``, with several ids,
-for tables of optima; ``agents`` and ``agents-by-spaces``, with nothing. With ``--check`` nothing is
-written, and it fails where a page is not as it should be.
+for tables of optima; ``agents`` and ``agents-by-spaces``, with nothing. Commands that train say in
+a comment what they reach, see docs/documented-commands.md. With ``--check`` nothing is written, and
+it fails where a page is not as it should be.
 """
 
 from __future__ import annotations
@@ -33,6 +34,7 @@ from environment_facts import (  # noqa: E402
     optima_block,
     variants_block,
 )
+from recommended_commands import with_outcomes  # noqa: E402
 
 BLOCK = re.compile(r"(<!-- ([\w-]+)(?:: ([^\n]*?))? -->\n)(.*?)(<!-- end -->)", re.DOTALL)
 KINDS: dict[str, Callable[..., str]] = {
@@ -77,7 +79,7 @@ def filled(text: str) -> str:
             return block[0]
         return f"{head}{KINDS[kind](*(arguments or '').split())}{end}"
 
-    return BLOCK.sub(fill, text)
+    return with_outcomes(BLOCK.sub(fill, text))
 
 
 def pictured_environments() -> dict[str, dict[str, object]]:

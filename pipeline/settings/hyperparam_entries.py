@@ -11,6 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
+
 from pipeline.errors import UserError, did_you_mean, shown
 from pipeline.settings.strict_yaml import read_settings_text, read_yaml
 from pipeline.settings.tuned_seeds import KEY as TUNED_ON
@@ -26,7 +28,12 @@ class NoEntryError(UserError):
     """A file of hyperparameters says nothing about the environment."""
 
 
-def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> dict[str, Any]:
+def read_hyperparams(
+    algo: str,
+    env_id: str,
+    path: Path | str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
     """Read the entry of an environment.
 
     Args:
@@ -34,6 +41,9 @@ def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> 
         env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts. The entry
             ``atari`` stands in for Atari games without their own, ``default`` for all others.
         path: another file to read.
+        env_kwargs: arguments of the environment. Where they make it the one that another id stands
+            for, and the file has an entry for that id, it is this: for CliffWalking-v1 with
+            ``is_slippery: True`` that of CliffWalkingSlippery-v1.
 
     Returns:
         The entry as it stands there, see `pipeline.settings.hyperparams.split`; an empty one for an
@@ -47,7 +57,7 @@ def read_hyperparams(algo: str, env_id: str, path: Path | str | None = None) -> 
         return {}
     path = _path(algo, path)
     entries, _ = _read(path)
-    key = _find_entry(entries, env_id)
+    key = _same_environment(entries, env_id, env_kwargs) or _find_entry(entries, env_id)
     if key is None:
         hint = did_you_mean(env_id, [name for name in entries if name not in _STAND_INS], n=3)
         raise NoEntryError(
@@ -94,6 +104,22 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, tuple[range, ...]] | No
         raise UserError(f"{path}: must map environment ids to hyperparameters")
     tuned_on = read_tuned_on(entries, str(path))
     return {key: entry for key, entry in entries.items() if key != TUNED_ON}, tuned_on
+
+
+def _same_environment(
+    entries: Mapping[str, Any], env_id: str, env_kwargs: Mapping[str, Any] | None
+) -> str | None:
+    """An entry's id that is registered as this environment with these arguments, and no others."""
+    own = gym.registry.get(env_id.partition(":")[2] or env_id) if env_kwargs else None
+    if own is None:
+        return None
+    given = {**own.kwargs, **(env_kwargs or {})}
+    meant = own.entry_point, given, own.max_episode_steps
+    named = (gym.registry[name] for name in entries if name in gym.registry)
+    return next(
+        (one.id for one in named if (one.entry_point, one.kwargs, one.max_episode_steps) == meant),
+        None,
+    )
 
 
 def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:

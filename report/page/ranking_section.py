@@ -6,6 +6,7 @@ from typing import Any
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.study_spec import METRIC_WORDS, StudySpec
+from report.conclusions import on_changes
 from report.page.sections import Report, Section
 from report.ranking_columns import COLUMNS, Row, filled
 from report.wording import number
@@ -36,7 +37,7 @@ def _table(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Any]
             for column, _ in columns
         ],
         "rows": [
-            (row.agent.agent, [cells[place] for _, cells in columns])
-            for place, row in enumerate(rows)
+            (row.agent, [cells[place] for _, cells in columns]) for place, row in enumerate(rows)
         ],
+        "changes": on_changes([environment]),
     }

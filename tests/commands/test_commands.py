@@ -16,6 +16,8 @@ import pytest
 import yaml
 
 import train
+from commands import compare_agents
+from commands.study_request import study_spec
 from commands.train_flags import build_parser
 from commands.train_request import train_spec
 from experiments.study_plan import plan
@@ -484,12 +486,15 @@ def test_the_head_says_what_auto_stands_for_and_what_a_discount_costs(type_comma
 
 
 def test_typed_arguments_of_the_environment_win_over_what_an_entry_trains_on():
-    words = ["--algo", "ppo", "--env", "Warehouse-v0", "--env-kwargs", "shelf_reward:-1"]
+    words = ["--algo", "ppo", "--env", "MineMaze-v0", "--env-kwargs", "mine_reward:-1"]
     spec = train_spec(build_parser().parse_args(words))
-    assert training_kwargs(spec) == {
-        "shelf_reward": -1,
-        "random_start": True,
-        "max_episode_steps": 100,
-    }
-    assert "without shelf_reward: -10" in spec.origins["train_env_kwargs"]
-    assert training_kwargs(train_spec(build_parser().parse_args(words[:4])))["shelf_reward"] == -10
+    variant = {"random_start": True, "goal_reward": 20, "power_reward": 3}
+    both = [*words[:4], "-params", "env_kwargs:{'mine_reward': -1}", "--env-kwargs", "slip:0.1"]
+    asked = {**variant, "mine_reward": -1, "slip": 0.1}
+    assert training_kwargs(train_spec(build_parser().parse_args(both))) == asked
+    compared = ["--env", "MineMaze-v0", "--algos", "ppo", *both[4:]]
+    study = study_spec(compare_agents.build_parser().parse_args(compared))
+    assert training_kwargs(plan(study, Path("nowhere"))[0].spec) == asked
+    assert training_kwargs(spec) == {**variant, "mine_reward": -1}
+    assert "without mine_reward: -20" in spec.origins["train_env_kwargs"]
+    assert training_kwargs(train_spec(build_parser().parse_args(words[:4])))["mine_reward"] == -20

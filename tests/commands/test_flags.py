@@ -11,6 +11,7 @@ from commands.study_request import study_spec
 from commands.train_request import train_spec
 from experiments.study_plan import plan
 from experiments.study_spec import StudySpec
+from pipeline.environments import training_changes
 from pipeline.errors import UserError
 from pipeline.train_spec import TrainSpec
 
@@ -96,6 +97,14 @@ def test_without_flags_a_run_is_the_default_one():
 def test_a_flag_of_compare_reaches_the_study(words, name, value):
     study = study_spec(compare_agents.build_parser().parse_args([*COMPARE, *words]))
     assert getattr(study, name) == value
+
+
+def test_everybody_is_trained_on_the_environment_as_it_comes(tmp_path):
+    words = ["--env", "Warehouse-v0", "--algos", "ppo", "qlearning"]
+    for flags, changed in ((), {"ppo"}), (["--as-it-comes"], set()):
+        study = study_spec(compare_agents.build_parser().parse_args([*words, *flags]))
+        planned = plan(study, tmp_path)
+        assert {one.agent for one in planned if training_changes(one.spec)} == changed
 
 
 def test_what_a_study_says_of_its_runs_reaches_them(tmp_path):

@@ -652,6 +652,7 @@ def test_agents_that_were_trained_on_a_variant_are_known_and_told_of(tmp_path, f
         "plain": False,
         "shaped": True,
     }
+    assert [a.marked for a in analysis.environments[0].agents] == ["plain", "shaped †"]
     told_of = "shaped was trained on a variant of the environment"
     assert told_of in everything_said(analysis)
     curves = study_series(analysis, told.append).environments[0].curves

@@ -13,6 +13,7 @@ from experiments import study_files
 from experiments.study_files import find_study, read_study, swept
 from experiments.study_plan import plan
 from experiments.study_spec import METRICS, AgentSpec, QuickSpec, file_name, layered
+from pipeline.environments import training_changes
 from pipeline.errors import UserError
 from pipeline.files import portable_name
 
@@ -224,6 +225,24 @@ def test_settings_of_an_environment_go_over_those_of_the_file(read):
         "n_episodes": 7,
         "gamma": 0.8,
         "env_kwargs": {"is_slippery": False, "map_name": "8x8"},
+    }
+
+
+def test_an_environment_as_it_comes_is_trained_on_as_it_is_judged_on(read, tmp_path):
+    study = read(
+        "agents: {ppo: {}, own: {algo: ppo, train_env_kwargs: {slip: 0.1}}}\n"
+        "environments:\n"
+        "  usual: {id: Warehouse-v0}\n"
+        "  as it comes: {id: Warehouse-v0, as_it_comes: true, env_kwargs: {slip: 0.2}}\n"
+    )
+    starts = ("random starts", "episodes of 100 steps")
+    rewards = ("rewards clipped at -10", "rewards x 0.01")
+    found = {(p.agent, p.environment): training_changes(p.spec) for p in plan(study, tmp_path)}
+    assert found == {
+        ("ppo", "usual"): (*starts, *rewards),
+        ("ppo", "as it comes"): (),
+        ("own", "usual"): (*starts, "slip 0.1", *rewards),
+        ("own", "as it comes"): ("slip 0.1",),  # an agent's own entry goes over all others
     }
 
 

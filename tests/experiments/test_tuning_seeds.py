@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study_spec import AS_IT_COMES, AgentSpec, EnvironmentSpec, StudySpec
 from experiments.tuning_seeds import TuningSeeds, tuning_seeds
 from report.seed_sentence import seed_sentence, spans
 
@@ -112,3 +112,18 @@ def test_nobody_tuned_on_other_arguments_of_the_environment():
     assert both == f"Seeds 0 to 9: the shipped settings of dqn were tuned on these; {elsewhere}."
     own = replace(DQN, settings={"env_kwargs": {"is_slippery": False}})
     assert said(own) == f"Seeds 0 to 9: {elsewhere}."
+    for env_id, kwargs in (("Warehouse-v0", {"slip": 0.0}), ("RandomWarehouse-v0", {"size": 10})):
+        usual = EnvironmentSpec("usual", env_id, {"env_kwargs": kwargs})
+        assert "the shipped settings of dqn were tuned on these" in said(DQN, places=(usual,))
+    as_it_comes = EnvironmentSpec("as it comes", "Warehouse-v0", AS_IT_COMES)
+    assert said(DQN, places=(as_it_comes,)) == f"Seeds 0 to 9: {elsewhere}."
+    table = AgentSpec("sarsa", "sarsa")  # which has no such changes in its settings
+    assert "of sarsa were tuned on these" in said(table, places=(as_it_comes,))
+
+
+def test_the_same_environment_by_another_name_was_tuned_on():
+    slippery = EnvironmentSpec("ice", "CliffWalking-v1", {"env_kwargs": {"is_slippery": True}})
+    table = AgentSpec("sarsa", "sarsa")
+    assert said(table, places=(slippery,)) == (
+        "Seeds 0 to 9: the shipped settings of sarsa were tuned on these."
+    )

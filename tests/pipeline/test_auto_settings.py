@@ -1,8 +1,10 @@
 """What ``auto`` stands for in an entry, what wins over an entry, and what a discount costs."""
 
 import gymnasium as gym
+import numpy as np
 import pytest
 
+from envs.known_models import transition_model
 from envs.wrappers import ScaleReward
 from pipeline.auto_settings import resolved_spec, training_follows
 from pipeline.environments import make_single_env
@@ -12,6 +14,7 @@ from pipeline.settings.hyperparam_entries import read_hyperparams
 from pipeline.settings.hyperparams import split
 
 SCALED = {"train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": "auto"}}}
+CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}
 POOR = {"shelf_reward": -1, "step_reward": -0.01, "goal_reward": 1}
 
 
@@ -78,6 +81,25 @@ def test_the_word_becomes_a_number_of_the_environment(env_id, raw, key, value):
     assert list(entry) == list(raw)
 
 
+@pytest.mark.parametrize(
+    ("env_id", "env_kwargs", "rewards"),
+    [
+        ("Warehouse-v0", {}, (-0.1, -0.01, 1)),
+        ("Warehouse-v0", POOR, (-0.1, -0.01, 1)),
+        ("Warehouse-v0", {"shelf_reward": -5}, (-0.05, -0.01, 1)),
+        ("Warehouse-v0", {"goal_reward": 400}, (-0.1, -0.0025, 1)),
+        ("CliffWalking-v1", {}, (-1, -0.01)),  # nothing there earns anything
+    ],
+)
+def test_the_dearest_step_of_training_costs_a_tenth_of_the_goal(env_id, env_kwargs, rewards):
+    wrappers = [CLIP, SCALED["train_env_wrapper"]]
+    spec = resolved(env_id, {"train_env_wrapper": wrappers, "env_kwargs": env_kwargs})
+    model = transition_model(make_single_env(spec, training=True))
+    possible = model.reward[model.prob > 0]
+    assert np.unique(possible[possible != 0]) == pytest.approx(rewards)
+    assert set(spec.origins) == {"train_env_wrapper"}
+
+
 def test_other_settings_and_other_words_stay():
     raw = {"n_timesteps": 5, "gamma": 0.5, "engine": "auto", "learning_rate": "lin_0.1"}
     spec = resolved("Warehouse-v0", raw)
@@ -106,6 +128,7 @@ class Unknown(gym.Env):
         ),
         ("Unknown-v0", {"initial_q": "auto"}, "initial_q: auto needs an environment whose model"),
         ("Unknown-v0", SCALED, "scale: auto needs an environment whose model is known"),
+        ("Unknown-v0", {"train_env_wrapper": CLIP}, "min_reward: auto needs an environment whose"),
         ("CartPole-v1", {"n_timesteps": "auto"}, "qlearning does not fit CartPole-v1"),
     ],
 )

@@ -16,6 +16,7 @@ from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
+    training_changes,
     training_kwargs,
     trains_on_variant,
 )
@@ -116,6 +117,36 @@ SCALED = {"envs.wrappers.ScaleReward": {"scale": 0.01}}
 )
 def test_what_makes_training_returns_those_of_a_variant(entry, is_variant):
     assert trains_on_variant(spec_of("Warehouse-v0", entry)) is is_variant
+
+
+CLIPPED = {"gymnasium.wrappers.ClipReward": {"min_reward": -10, "max_reward": 0}}
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({}, ()),
+        # What training and evaluation share is the environment that was asked for.
+        ({"env_kwargs": SHAPED, "env_wrapper": SCALED, "eval_env_kwargs": {"slip": 0.1}}, ()),
+        ({"env_kwargs": SHAPED, "train_env_kwargs": {**SHAPED, "random_start": False}}, ()),
+        ({"train_env_kwargs": {"max_episode_steps": 1000, "slip": 0.0}}, ()),
+        ({"normalize": {"norm_reward": True}}, ()),
+        (
+            {"train_env_kwargs": {"random_start": True, "max_episode_steps": 100, **SHAPED}},
+            ("random starts", "episodes of 100 steps", "shelf_reward -10"),
+        ),
+        (
+            {"train_env_wrapper": [CLIPPED, SCALED, "envs.wrappers.ActionMasks"]},
+            ("rewards clipped at -10 and 0", "rewards x 0.01", "ActionMasks"),
+        ),
+        (
+            {"train_env_wrapper": {"gymnasium.wrappers.ClipReward": {"max_reward": 1}}},
+            ("rewards clipped at 1",),
+        ),
+    ],
+)
+def test_what_settings_change_for_training_in_words(entry, words):
+    assert training_changes(spec_of("Warehouse-v0", entry)) == words
 
 
 def test_arguments_of_a_registration_are_usual_too():

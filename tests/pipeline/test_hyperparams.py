@@ -159,6 +159,27 @@ def test_which_entry_is_taken(tmp_path: Path, env_id: str, gamma: float) -> None
     assert read_hyperparams("ppo", env_id, write(tmp_path, ENTRIES)) == {"gamma": gamma}
 
 
+@pytest.mark.parametrize(
+    ("env_id", "kwargs", "gamma"),
+    [
+        ("CliffWalking-v1", {"is_slippery": True}, 0.2),
+        ("gymnasium:CliffWalking-v1", {"is_slippery": True}, 0.2),
+        ("CliffWalking-v1", {"is_slippery": False}, 0.1),
+        ("CliffWalking-v1", None, 0.1),
+        ("CliffWalking-v1", {"is_slippery": True, "render_mode": None}, 0.1),
+        ("FrozenLake-v1", {"map_name": "8x8"}, 0.3),  # FrozenLake8x8-v1 has another time limit
+        ("Nowhere-v0", {"is_slippery": True}, 0.5),
+    ],
+)
+def test_an_environment_has_its_entry_by_whichever_of_its_names(
+    tmp_path: Path, env_id: str, kwargs: dict[str, Any] | None, gamma: float
+) -> None:
+    ids = ("CliffWalking-v1", "CliffWalkingSlippery-v1", "FrozenLake-v1", "FrozenLake8x8-v1")
+    lines = [f"{name}: {{gamma: 0.{i}}}" for i, name in enumerate((*ids, "default"), start=1)]
+    path = write(tmp_path, "\n".join(lines))
+    assert read_hyperparams("sarsa", env_id, path, kwargs) == {"gamma": gamma}
+
+
 def test_no_entry_names_the_nearest_ids_and_the_ways_out(tmp_path: Path) -> None:
     path = write(tmp_path, "CartPole-v1: {}\nCartPole-v0: {}\natari: {}\nTaxi-v4: {}\n")
     with pytest.raises(NoEntryError) as caught:

@@ -204,6 +204,14 @@ def test_three_agents_have_their_verdicts_in_a_matrix(made_up):
     assert not any("is undecided against" in line for line in lines)
 
 
+def test_agents_that_were_trained_on_a_changed_environment_are_marked(made_up):
+    agents = made_up.agent("first", 90.0), made_up.agent("second", 40.0, changes=("slip 0.1",))
+    found = made_up.analysis([made_up.environment(agents)], ["first", "second"])
+    _, lines = lines_of(lambda console: print_analysis(console, found), width=200)
+    assert [row[0] for row in cells(lines)[1:]] == ["first", "second †"]
+    assert "†: trained on a changed environment: second (slip 0.1)." in lines
+
+
 def test_returns_of_a_training_variant_are_marked(made_up):
     agents = made_up.agent("first", 90.0), made_up.agent("second", 40.0, on_variant=True)
     found = made_up.analysis([made_up.environment(agents)], ["first", "second"])

@@ -6,6 +6,8 @@ from dataclasses import replace
 import pandas as pd
 import pytest
 
+from report.conclusions import conclusion
+from report.latex import LATEX
 from report.markdown import escaped, markdown_table, name_of
 from report.result_files import write_verdicts
 from report.verdict_table import duration, headline, processor_seconds, ranking, standings
@@ -63,6 +65,30 @@ def test_the_headline_marks_who_is_best_and_counts_failures_and_cost(made_up, pl
         "?: not told apart from it by 4 seeds. Plain: shown to be worse. In brackets: processor "
         "time of the median run."
     )
+
+
+def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_footnote(made_up):
+    names, changes = ["plain", "changed", "too"], ("random starts", "rewards x 0.01")
+    agents = [made_up.agent(n, 90, changes=() if n == "plain" else changes) for n in names]
+    lake, other = made_up.environment(agents), made_up.environment(agents[:1], "other")
+    analysis = made_up.analysis([lake, other], names)
+    what = "(random starts, rewards x 0.01)."
+    told = f"†: trained on a changed environment: changed and too on lake {what}"
+    text = headline(analysis)
+    assert [line.split(" | ")[0] for line in text.splitlines()[2:5]] == [
+        "| `plain`",
+        "| `changed` †",
+        "| `too` †",
+    ]
+    assert text.endswith(told)
+    latex = headline(analysis, LATEX)
+    assert r"\texttt{changed} $\dagger$ &" in latex
+    assert told.replace("†", r"$\dagger$") in latex
+    assert "| `too` † |" in ranking(analysis.results, lake)
+    note = f"†: trained on a changed environment: changed and too {what}"
+    assert note in conclusion(analysis.study, lake).notes
+    assert not any("†" in said for said in conclusion(analysis.study, other).everything)
+    assert "†" not in headline(made_up.analysis([other], names))
 
 
 def test_other_metrics_show_their_own_figures_and_of_costs_the_lowest_leads(made_up, place):

@@ -1,0 +1,185 @@
+"""Does what every documented command trains work? Each one over seeds that nothing was tuned on.
+
+    python benchmarks/documented_commands.py --results found.json     # about an hour on one core
+    python benchmarks/documented_commands.py --results found.json --only cliff --again
+    python benchmarks/documented_commands.py --results found.json --before older.json --fill
+
+Trainings are collected from the text, see docs/scripts/recommended_commands.py, and done one after
+another in this process, with ``--engine auto`` and the seeds 1000 to 1019; fewer where that many
+take longer than ``--limit`` seconds, and one where an agent plans and draws no numbers. What is
+found is kept in the file at once, and what is in it is not done again. ``--fill`` writes the table
+into docs/documented-commands.md; ``docs/scripts/fill_pages.py`` then says it beside the commands.
+
+With ``PYTHONPATH=OLDER_CHECKOUT`` the same trainings are done with an older version.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import re
+import shlex
+import statistics
+import sys
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.append(str(ROOT / "docs" / "scripts"))
+
+from recommended_commands import PAGE, trainings  # noqa: E402
+
+SEEDS = range(1000, 1020)
+FEWEST = 5
+REACHED = 0.9
+OPTIMAL = 0.01
+PLANNERS = {"optimal", "value_iteration", "policy_iteration"}
+BLOCK = re.compile(r"(<!-- trainings -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def prepared_folder(folder: Path) -> None:
+    """The files that pages tell their readers to make."""
+    from envs.bandits import log_uniformly
+
+    page = (ROOT / "docs" / "own-map.md").read_text(encoding="utf-8")
+    found = re.search(r"```\n(S.*?)```", page, re.DOTALL)
+    assert found is not None
+    (folder / "map.txt").write_text(found[1], encoding="utf-8")
+    import gymnasium as gym
+
+    with gym.make("SegmentBandit-v0") as env:
+        log_uniformly(env, 5000, seed=0, path=str(folder / "train.csv"))
+
+
+def outcome(training: str, seed: int, folder: Path) -> dict[str, Any]:
+    """What one run reaches: its return, its score if there is one, and its processor time."""
+    from rich.console import Console
+
+    from commands.train_flags import build_parser
+    from commands.train_request import train_spec
+    from pipeline.training import train
+
+    words = [*shlex.split(training), "--seed", str(seed), "--verbose", "0", "-f", str(folder)]
+    parser = build_parser()
+    args = parser.parse_args(words)
+    if "engine" in args:
+        args.engine = "auto"
+    spec = replace(train_spec(args), pictures=False)
+    before = time.process_time()
+    done = train(spec, Console(quiet=True), {}, "a benchmark")
+    spent = time.process_time() - before
+    info = json.loads((done.run.path / "run.json").read_text())
+    final = info["final"] or {}
+    return {
+        "return": final.get("mean_return"),
+        "score": final.get("score"),
+        "bracketed": "optimum_at_least" in final,
+        "gap": final.get("gap"),
+        "regret": info.get("regret"),
+        "seconds": info["cpu_seconds"],
+        "whole": spent,
+    }
+
+
+def measure(training: str, limit: float, folder: Path) -> list[dict[str, Any]]:
+    """One run after another, until all seeds are done or they have taken too long."""
+    agent = training.split()[3]
+    runs: list[dict[str, Any]] = []
+    for seed in SEEDS[:1] if agent in PLANNERS else SEEDS:
+        runs.append({"seed": seed, **outcome(training, seed, folder)})
+        if len(runs) >= FEWEST and sum(run["whole"] for run in runs) > limit:
+            break
+    return runs
+
+
+def cells(training: str, runs: list[dict[str, Any]]) -> list[str]:
+    """Solved, what the median run reaches, and its processor time."""
+    solved = n_solved(training, runs)
+    # Beside a constant policy that is optimal too, scores have no size.
+    no_score = any(abs(r["score"] or 0) > 10 or (_is_optimal(r) and r["score"] <= 0) for r in runs)
+    names = ("return", "regret") if no_score else ("score", "return", "regret")
+    kind = next((name for name in names if all(run[name] is not None for run in runs)), None)
+    reached = f"{statistics.median(run[kind] for run in runs):.3g}" if kind else ""
+    reached += "" if kind in ("score", None) else f" ({kind})"
+    return [
+        "" if solved is None else f"{solved} of {len(runs)}",
+        reached,
+        f"{statistics.median(run['seconds'] for run in runs):.2g}",
+    ]
+
+
+def _is_optimal(run: dict[str, Any]) -> bool:
+    gap = run.get("gap")
+    return gap is not None and gap <= OPTIMAL * abs(run["return"] + gap)
+
+
+def n_solved(training: str, runs: list[dict[str, Any]]) -> int | None:
+    """How many reach 0.9 of the score, or where the optimum is not known, the threshold."""
+    import gymnasium as gym
+
+    import envs  # noqa: F401
+
+    if all(run["score"] is not None and not run["bracketed"] for run in runs):
+        # Where the best constant policy is the optimum, the score says nothing.
+        return len([r for r in runs if r["score"] >= REACHED or _is_optimal(r)])
+    threshold = gym.spec(training.split()[1]).reward_threshold
+    if threshold is None or any(run["return"] is None for run in runs):
+        return None
+    return len([run for run in runs if run["return"] >= threshold])
+
+
+def table(found: dict[str, Any], before: dict[str, Any]) -> str:
+    """Of all trainings that were measured and are recommended still."""
+    rows = [
+        "| `train.py` with | solved | before | median score | seconds |",
+        "|---|---|---|---|---|",
+    ]
+    for training in trainings():
+        if training in found:
+            solved, reached, seconds = cells(training, found[training])
+            old = cells(training, before[training])[0] if training in before else ""
+            rows.append(f"| `{training}` | {solved} | {old} | {reached} | {seconds} |")
+    return "\n".join(rows) + "\n"
+
+
+def main() -> None:
+    """Do what is missing, keep it, and fill the page."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument("--results", type=Path, required=True, metavar="FILE")
+    parser.add_argument("--before", type=Path, metavar="FILE", help="found with an older version")
+    parser.add_argument("--only", default="", metavar="REGEX", help="trainings that match")
+    parser.add_argument("--again", action="store_true", help="also those that are in the file")
+    parser.add_argument(
+        "--limit", type=float, default=120, metavar="S", help="for one training (120)"
+    )
+    parser.add_argument("--fill", action="store_true", help="write the page; nothing is run")
+    args = parser.parse_args()
+    found = json.loads(args.results.read_text()) if args.results.exists() else {}
+    if args.fill:
+        before = json.loads(args.before.read_text()) if args.before else {}
+        text = PAGE.read_text(encoding="utf-8")
+        PAGE.write_text(
+            BLOCK.sub(lambda b: f"{b[1]}{table(found, before)}{b[2]}", text), encoding="utf-8"
+        )
+        return
+    results = args.results.resolve()
+    with tempfile.TemporaryDirectory() as name:
+        os.chdir(name)
+        prepared_folder(Path(name))
+        for training in trainings():
+            if re.search(args.only, training) and (args.again or training not in found):
+                runs = measure(training, args.limit, Path(name) / "logs")
+                # The file may have grown by another process.
+                found = json.loads(results.read_text()) if results.exists() else {}
+                results.write_text(json.dumps({**found, training: runs}, indent=1))
+                print(training, *cells(training, runs), sep=" | ", flush=True)
+
+
+if __name__ == "__main__":
+    main()
