@@ -204,16 +204,15 @@ def write_study(root: Path, study: StudySpec) -> None:
         for environment in study.environments
     }
     data["agents"] = agents
-    known = {key: value for key, value in data.items() if value is not None}
+    known = {key: value for key, value in data.items() if value not in (None, "")}
     text = yaml.safe_dump(plain(known), sort_keys=False, allow_unicode=True)
     write_text(root / "study.yml", text)
 
 
 def _agent_entry(agent: AgentSpec, settings: Mapping[str, Any]) -> dict[str, Any]:
-    special = {"algo": agent.algo, "tuned": agent.tuned, "summary": agent.summary}
-    if agent.conf_file is not None:
-        del special["tuned"]
-    return {**special, **settings}
+    tuned = {} if agent.tuned or agent.conf_file is not None else {"tuned": False}
+    summary = {"summary": agent.summary} if agent.summary else {}
+    return {"algo": agent.algo, **tuned, **summary, **settings}
 
 
 def _swept_entry(members: Sequence[AgentSpec]) -> dict[str, Any] | None:

@@ -139,7 +139,12 @@ def _packed_anew(packed: bytes, run: Run) -> bytes:
 
 
 def _unpacked(packed: bytes) -> bytes:
-    return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(base64.b64decode(packed), _LARGEST)
+    """The text of packed numbers; nothing where it is none."""
+    try:
+        content = base64.b64decode(packed)
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(content, _LARGEST)
+    except (ValueError, zlib.error):
+        return b""
 
 
 def _without_paths(text: bytes, run: Run) -> bytes:

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import IO, Any
 
-from pipeline.errors import UserError, visible
+from pipeline.errors import UserError, one_line, visible
 from pipeline.file_digests import RECORD
 from pipeline.files import replacing
 from pipeline.folder_lock import folder_lock
@@ -71,7 +71,8 @@ class StudyPack:
 
 def is_study(folder: Path) -> bool:
     """Whether a folder is that of a study."""
-    return (folder / RUNS).is_dir() and not os.path.lexists(folder / RECORD)
+    has_parts = (folder / RUNS).is_dir() or (folder / SETTINGS).is_file()
+    return has_parts and not os.path.lexists(folder / RECORD)
 
 
 def pack_study(root: Path, target: Path, say: Callable[[str], object]) -> StudyPack:
@@ -155,12 +156,15 @@ def _files(root: Path, folders: list[Path], made: StudyPack) -> Iterator[tuple[s
 
 def _without_folders(summary: bytes) -> bytes:
     """The table of all runs, with their packs in place of their folders."""
-    rows = list(csv.reader(io.StringIO(summary.decode())))
-    for row in rows[1:]:
-        place = rows[0].index("path")
-        row[place] = "/".join((RUNS, *PurePath(row[place]).parts[-2:])) + ".zip"
+    try:
+        head, *rows = list(csv.reader(io.StringIO(summary.decode())))
+        place = head.index("path")
+        for row in rows:
+            row[place] = "/".join((RUNS, *PurePath(row[place]).parts[-2:])) + ".zip"
+    except (ValueError, IndexError, csv.Error) as error:
+        raise UserError(f"summary.csv is damaged: {one_line(error)}") from error
     told = io.StringIO()
-    csv.writer(told, lineterminator="\n").writerows(rows)
+    csv.writer(told, lineterminator="\n").writerows([head, *rows])
     return told.getvalue().encode()
 
 
