@@ -213,11 +213,9 @@ def _do_study(
 ) -> int:
     """Do a study with the seeds that it has, once it is known how often it was looked at."""
     from experiments.looks_file import read_looks
-    from experiments.study_files import write_study
 
     read_looks(root)
     _prepare(args, study, planned, root, console, place)
-    write_study(root, study)
     from commands.study_output import run_study
 
     page = not args.no_report
@@ -233,14 +231,12 @@ def _grow_study(
 ) -> int:
     """Do a study with more and more seeds, as was settled before the first look."""
     from experiments.growing import counts_of, grown, settle, settled_looks
-    from experiments.study_files import write_study
     from experiments.study_plan import plan
 
     looks = settled_looks(study, root, args.max_seeds)
     counts = counts_of(study, looks)
     planned = plan(grown(study, counts), root, counts)
     _prepare(args, grown(study, counts), planned, root, console, place)
-    write_study(root, study)
     settle(root, looks)
     from commands.growing_output import grow_study
 

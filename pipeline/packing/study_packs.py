@@ -19,7 +19,7 @@ from pathlib import Path, PurePath
 from typing import IO, Any
 
 from pipeline.errors import UserError, one_line, visible
-from pipeline.file_digests import RECORD
+from pipeline.file_digests import LOCK, RECORD
 from pipeline.files import replacing
 from pipeline.folder_lock import folder_lock
 from pipeline.json_text import json_text
@@ -71,7 +71,7 @@ class StudyPack:
 
 def is_study(folder: Path) -> bool:
     """Whether a folder is that of a study."""
-    has_parts = (folder / RUNS).is_dir() or (folder / SETTINGS).is_file()
+    has_parts = any((folder / name).exists() for name in (RUNS, SETTINGS, LOCK))
     return has_parts and not os.path.lexists(folder / RECORD)
 
 
