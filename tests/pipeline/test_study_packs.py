@@ -61,8 +61,15 @@ def study(trained, tmp_path):
     )
     (root / "summary.csv").write_text(f"agent,path\nq,{HOME}/a/runs/qlearning/FrozenLake-v1_1\n")
     (root / "study.yml").write_text("agents: [qlearning]\n")
-    for name in ("figures/a.png", "figures/notes.txt", "failures/a.txt", "mine.html", "looks.json"):
-        (root / name).parent.mkdir(exist_ok=True)
+    for name in (
+        "figures/a.png",
+        "learning/a/b.html",
+        "figures/notes.txt",
+        "failures/a.txt",
+        "mine.html",
+        "looks.json",
+    ):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).write_bytes(b"x")
     return root
 
@@ -81,7 +88,7 @@ def members(path):
 def test_it_holds_what_others_need_and_nothing_of_this_machine(study, packed, tmp_path):
     files = members(packed)
     runs = [RUN, RUN.replace("_2", "_1"), "runs/sarsa/FrozenLake-v1_1.zip"]
-    names = "README.md report.html summary.csv study.yml figures/a.png study.json"
+    names = "README.md report.html summary.csv study.yml figures/a.png learning/a/b.html study.json"
     assert files.keys() == {*runs, *names.split()}
     page = files["report.html"].decode()
     told = "python compare.py --env-kwargs desc:map.txt"
