@@ -69,6 +69,7 @@ def main() -> int:
 def _pack(path: Path, target: Path | None, say: Callable[[str], object]) -> None:
     """Pack a run or a study, and say how it is played on any machine."""
     from pipeline.models.recorded_runs import run_in
+    from pipeline.module_records import COPIES
     from pipeline.packing.model_card import to_type
     from pipeline.packing.pack_files import default_target, pack
     from pipeline.packing.study_packs import is_study, pack_study
@@ -78,19 +79,22 @@ def _pack(path: Path, target: Path | None, say: Callable[[str], object]) -> None
         made = pack_study(path, target, say)
         runs = "1 run" if made.n_runs == 1 else f"{made.n_runs:,} runs"
         say(f"pack  {target} ({runs}, {target.stat().st_size / 1e6:.1f} MB)")
-        modules, place, inside = made.modules, f"{target.name}/{made.first}", made.first
+        modules, names = made.modules, list(made.digests)
+        place, inside = f"{target.name}/{made.first}", made.first
     else:
         target = pack(path, target or default_target(path))
         say(f"pack  {target}")
         info = run_in(path).read_info()
-        modules, place, inside = to_type(info["spec"], info["files"]), target.name, "."
-    if modules:
-        say(f"modules of yours are in it: {' '.join(modules)}")
+        modules, names = to_type(info["spec"], info["files"]), list(info["files"])
+        place, inside = target.name, "."
+    flag = f" --gym-packages {shlex.join(modules)}" if modules else ""
+    code = [name for name in names if name.startswith(f"{COPIES}/")]
+    if code:
+        say(f"code of yours is in it: {' '.join(sorted(code))}")
         how = f"unzip {target.name}, and in its folder" if target.suffix == ".zip" else "in it"
-        flag = f" --gym-packages {shlex.join(modules)}"
         say(f"play  {how}: {NAME} enjoy {shlex.quote(inside)}{flag}")
     else:
-        say(f"play  {NAME} enjoy {shlex.quote(place)}")
+        say(f"play  {NAME} enjoy {shlex.quote(place)}{flag}")
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ import re
 import shlex
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 from pipeline.errors import UserError, shown
@@ -88,11 +88,11 @@ def _named_in(path: Path) -> Iterator[str]:
 def changed_since(modules: Iterable[UserModule], folder: Path) -> list[Path]:
     """The files of modules that are no more what a run folder has copies of."""
     files = {name: path for module in modules for name, path in _sources(module).items()}
-    copies = {path: folder / COPIES / name for name, path in files.items()}
     return [
         path
-        for path, copy in copies.items()
-        if copy.is_file() and path.read_bytes() != read_file(copy, NO_LIMIT)
+        for name, path in files.items()
+        if (copy := folder / COPIES / name).is_file()
+        and path.read_bytes() != read_file(copy, NO_LIMIT)
     ]
 
 
@@ -128,12 +128,13 @@ def check_recorded(
         words = [_to_type(name, known, folder) for name in missing]
         whose, how = f"{folder} was made with modules of yours ({told})", "add"
     else:
-        copies = {name: _copy_near(zipped_in, name) for name in missing}
+        near = {name: copy for name in missing if (copy := _copy_near(zipped_in, name))}
+        inside = {name: copy for name in missing if (copy := _copy_in(folder, name))}
+        words = [{**inside, **near}.get(name, _printable(name)) for name in missing]
         whose = f"{zipped_in} was made with modules of its maker ({told})"
-        words = [copies[name] or _copy_in(folder, name) or _printable(name) for name in missing]
-        is_inside = any(copies[name] is None and _copy_in(folder, name) for name in missing)
-        how = "read them, and if you trust them add" if any(copies.values()) else "add"
-        how = "unzip it, read them, and if you trust them add, there," if is_inside else how
+        how = "read them, and if you trust them add" if near else "add"
+        if inside.keys() - near.keys():
+            how = "unzip it, read them, and if you trust them add, there,"
     raise UserError(
         f"{whose}, and no module is imported because a file asks: {how} --gym-packages "
         f"{' '.join(words)}"
@@ -151,11 +152,8 @@ def _copy_in(folder: Path, name: str) -> str | None:
 
 def _copy_near(pack: Path, name: str) -> str | None:
     """What to type for the copy of a module that lies beside a pack, or in a folder above it."""
-    for above in list(pack.absolute().parents)[:_FOLDERS_ABOVE]:
-        copy = _copy_in(above, name)
-        if copy is not None:
-            return _near(above / PurePosixPath(copy))
-    return None
+    folders = list(pack.absolute().parents)[:_FOLDERS_ABOVE]
+    return next((_near(f / copy) for f in folders if (copy := _copy_in(f, name))), None)
 
 
 def _to_type(name: str, known: Sequence[Mapping[str, Any]], folder: Path) -> str:

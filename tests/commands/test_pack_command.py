@@ -108,7 +108,7 @@ def test_a_study_with_a_module_of_ones_own_is_played_elsewhere(
     assert (code, err) == (0, "")
     code, out, err = type_command("pack", "logs/studies/mine", "mine.zip")
     assert (code, err) == (0, "")
-    assert "modules of yours are in it: modules/my_corridor.py\n" in out
+    assert "code of yours is in it: modules/my_cells.py modules/my_corridor.py\n" in out
     told = shlex.split(out.partition("in its folder: ")[2])
     elsewhere = tmp_path / "elsewhere"
     with zipfile.ZipFile("mine.zip") as archive:
