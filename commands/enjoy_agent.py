@@ -170,7 +170,8 @@ def _play(args: argparse.Namespace) -> int:
     wanted = model_request(args)
     with ExitStack() as stack:
         if wanted.path is not None:
-            wanted = replace(wanted, path=stack.enter_context(unpacked(wanted.path)))
+            path, zipped_in = stack.enter_context(unpacked(wanted.path))
+            wanted = replace(wanted, path=path, zipped_in=zipped_in)
         return _play_found(args, wanted, film)
 
 
@@ -180,8 +181,7 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest, film: Path | Non
     from pipeline.signs_of_life import doing
 
     console = TextConsole(highlight=False, quiet=args.verbose < 1)
-    is_moved = wanted.path is not None and wanted.path != Path(args.model)
-    place = args.model if is_moved else found.path  # of a pack's zip, the zip
+    place = args.model if wanted.zipped_in is not None else found.path
     about = f"{found.spec.algo} on {found.spec.env_id}: {place}"
     console.print(about, soft_wrap=True)
     with doing(console, "loading the libraries"), loading_libraries():

@@ -223,10 +223,12 @@ def _judge(
     print_analysis(console, analysis)
     width = results.study.episodes_table
     with doing(console, "writing the tables") as activity:
+        from experiments.study_files import write_study
         from report.result_files import write_tables, write_verdicts
         from report.series.episode_blocks import episodes_table
 
         files = [*write_tables(results), *write_verdicts(analysis, command)]
+        write_study(results.root, results.study)
         blocks = episodes_table(results, width) if width else None
         if blocks is not None:
             print_episodes_table(console, blocks, width)

@@ -9,6 +9,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import yaml
+
 from agents import ALGORITHMS
 from experiments import run_limits
 from experiments.study_spec import (
@@ -18,11 +20,15 @@ from experiments.study_spec import (
     Metric,
     QuickSpec,
     StudySpec,
+    file_name,
     layered,
     symbol,
 )
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, shown, unknown
+from pipeline.files import write_text
+from pipeline.json_text import plain
+from pipeline.map_contents import with_maps_read
 from pipeline.settings.coercion import coerce
 from pipeline.settings.strict_yaml import key_lines, read_yaml
 
@@ -162,6 +168,67 @@ def read_study(path: Path) -> StudySpec:
         source=path,
         **values,
     )
+
+
+def write_study(root: Path, study: StudySpec) -> None:
+    """Write what a study was asked for as a study file in its folder, so that others can do it.
+
+    What flags changed is in it, the rows of maps are too, and agents' own files of hyperparameters
+    are copied beside it. Of a quick look there is none.
+    """
+    if study.is_quick:
+        return
+    groups: dict[str, list[AgentSpec]] = {}
+    for agent in study.agents:
+        groups.setdefault(agent.group or agent.label, []).append(agent)
+    agents: dict[str, Any] = {}
+    for label, members in groups.items():
+        entry = _swept_entry(members)
+        entries = {member.label: _agent_entry(member, member.settings) for member in members}
+        entries = entries if entry is None else {label: entry}
+        for environment in study.environments:
+            entries = {key: with_maps_read(environment.env_id, e) for key, e in entries.items()}
+        if (conf_file := members[0].conf_file) is not None:
+            copied = Path("settings", f"{file_name(label)}.yml")
+            (root / copied).parent.mkdir(exist_ok=True)
+            write_text(root / copied, conf_file.read_text(encoding="utf-8"))
+            entries = {label: {**e, "conf_file": copied.as_posix()} for label, e in entries.items()}
+        agents |= entries
+    data = {key: getattr(study, key) for key in _STUDY_VALUES if hasattr(study, key)}
+    limits = {key: str(limit) for key in _LIMITS if (limit := getattr(study, key)) is not None}
+    data |= {"seeds": {key: getattr(study, name) for key, name in _SEEDS.items()}, **limits}
+    data["quick"] = vars(study.quick)
+    data["environments"] = {
+        environment.label: {
+            "id": environment.env_id,
+            **with_maps_read(environment.env_id, environment.settings),
+        }
+        for environment in study.environments
+    }
+    data["agents"] = agents
+    known = {key: value for key, value in data.items() if value not in (None, "")}
+    text = yaml.safe_dump(plain(known), sort_keys=False, allow_unicode=True)
+    write_text(root / "study.yml", text)
+
+
+def _agent_entry(agent: AgentSpec, settings: Mapping[str, Any]) -> dict[str, Any]:
+    tuned = {} if agent.tuned or agent.conf_file is not None else {"tuned": False}
+    summary = {"summary": agent.summary} if agent.summary else {}
+    return {"algo": agent.algo, **tuned, **summary, **settings}
+
+
+def _swept_entry(members: Sequence[AgentSpec]) -> dict[str, Any] | None:
+    """One entry for the members of a sweep; None if there is none that means just them."""
+    first = members[0]
+    kept = {key: value for key, value in first.settings.items() if key not in first.swept}
+    agent = replace(first, label=first.group or first.label, settings=kept, swept={}, group="")
+    sweep = {
+        key: list({repr(m.swept[key]): m.swept[key] for m in members}.values())
+        for key in first.swept
+    }
+    if swept(agent, sweep) != [replace(member, group=agent.label) for member in members]:
+        return None
+    return {**_agent_entry(agent, kept), **({"sweep": sweep} if sweep else {})}
 
 
 def _seeds(document: _Document, given: Any) -> dict[str, int]:

@@ -56,9 +56,12 @@ def _is_mere_set_up(run: Run) -> bool:
     own_files = "|".join(map(re.escape, (RECORD, LOCK, ROOM)))
     own = re.compile(
         rf"{own_files}|\d+\.monitor\.csv|{re.escape(run.env_name)}(/(config|args)\.yml|/command\.txt)?"
-        rf"|{COPIES}(/[^/]+\.py)?|([^/]+/)?\.[^/]+\.[0-9a-f]{{16}}\.tmp"
+        rf"|{COPIES}(/.+\.py)?|(.+/)?\.[^/]+\.[0-9a-f]{{16}}\.tmp"
     )
-    names = (path.relative_to(run.path).as_posix() for path in run.path.rglob("*"))
+    paths = (
+        p for p in run.path.rglob("*") if p.is_symlink() or not (p.is_dir() and any(p.iterdir()))
+    )
+    names = (path.relative_to(run.path).as_posix() for path in paths)
     return all(own.fullmatch(name) and not (run.path / name).is_symlink() for name in names)
 
 

@@ -170,6 +170,15 @@ def _source(folder: Path, name: str) -> Path | None:
     return file if file.is_file() else None
 
 
+def found_beside(folder: Path, top: str) -> Path | None:
+    """The file or package of that name in a folder, if Python takes no other for it."""
+    place = _source(folder, top)
+    if place is None or top in sys.stdlib_module_names or is_ours(top):
+        return None
+    elsewhere = _places(top) - {place.resolve(), (place / "__init__.py").resolve()}
+    return None if elsewhere else place
+
+
 def _import(module: UserModule) -> ModuleType:
     """Import one module; its folder is searched last."""
     importlib.invalidate_caches()

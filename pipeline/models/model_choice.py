@@ -47,6 +47,7 @@ class ModelRequest:
 
     Attributes:
         path: a zip or a run folder, instead of looking for a run.
+        zipped_in: the pack that the folder was unpacked from.
         algo: name of the agent; None for what the zip or its run folder says, or else ``"ppo"``.
         env_id: id of the environment; None for what the run folder says, or else
             ``"CartPole-v1"``.
@@ -62,6 +63,7 @@ class ModelRequest:
     """
 
     path: Path | None = None
+    zipped_in: Path | None = None
     algo: str | None = None
     env_id: str | None = None
     log_folder: Path = Path("logs")
@@ -147,17 +149,17 @@ def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
     return run
 
 
-def _check_modules(run: Run | None) -> None:
+def _check_modules(run: Run | None, zipped_in: Path | None = None) -> None:
     """Make sure that what a run needs has been imported, whoever recorded it."""
     if run is not None:
         packages = list(recorded_run(run).gym_packages)
-        check_recorded({"gym_packages": packages, **run.recorded_spec()}, run.path)
+        check_recorded({"gym_packages": packages, **run.recorded_spec()}, run.path, zipped_in)
 
 
 def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
     run = run_around(path)
     file = read_model(path, run)
-    _check_modules(run)
+    _check_modules(run, request.zipped_in)
     recorded = recorded_run(run)
     hand_written = hand_written_algorithm(file)
     algo = request.algo or hand_written or recorded.algo

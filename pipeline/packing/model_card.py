@@ -13,6 +13,7 @@ import yaml
 
 from agents import ALGORITHMS
 from pipeline.errors import visible
+from pipeline.module_records import copy_among
 
 # What stands around an environment, and a plain script would have to put there too.
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
@@ -35,7 +36,7 @@ def card(record: Mapping[str, Any], files: Collection[str]) -> str:
     films = [name for name in files if name.startswith("replay.")]
     sections = [
         f"---\n{_front_matter(record)}---\n",
-        f"# {_text(algo)} on {_text(env_id)}\n",
+        f"# {plain_text(algo)} on {plain_text(env_id)}\n",
         _trained(record),
         _figures(record),
         *(
@@ -48,13 +49,14 @@ def card(record: Mapping[str, Any], files: Collection[str]) -> str:
         fenced("yaml", str(yaml.safe_dump(spec["hyperparams"]))),
         "## Versions\n",
         "".join(
-            f"- {_text(name)} {_text(version)}\n" for name, version in record["versions"].items()
+            f"- {plain_text(name)} {plain_text(version)}\n"
+            for name, version in record["versions"].items()
         ),
     ]
     return visible("\n".join(sections))
 
 
-def _text(value: object) -> str:
+def plain_text(value: object) -> str:
     """A value as Markdown in which nothing is markup: the run may be anybody's."""
     return re.sub(r"[\\`*<>|&\[\]]", lambda found: f"\\{found[0]}", " ".join(str(value).split()))
 
@@ -62,8 +64,8 @@ def _text(value: object) -> str:
 def _trained(record: Mapping[str, Any]) -> str:
     steps, seed = record["n_timesteps"], record["spec"]["seed"]
     maker = "Trained with Yardstick (the Python package `rl-yardstick`)"
-    engine = f"; engine: {_text(record['engine'])}" if record.get("engine") else ""
-    return f"{maker} for {steps:,} environment steps, seed {_text(seed)}{engine}.\n"
+    engine = f"; engine: {plain_text(record['engine'])}" if record.get("engine") else ""
+    return f"{maker} for {steps:,} environment steps, seed {plain_text(seed)}{engine}.\n"
 
 
 def _front_matter(record: Mapping[str, Any]) -> str:
@@ -149,16 +151,22 @@ def _bandit_figures(record: Mapping[str, Any]) -> str:
 
 
 def _table(rows: list[tuple[str, Any]]) -> str:
-    told = [f"| {_text(name)} | {_text(value)} |\n" for name, value in rows if value is not None]
+    told = [
+        f"| {plain_text(name)} | {plain_text(value)} |\n"
+        for name, value in rows
+        if value is not None
+    ]
     return "".join(["| figure | value |\n", "|---|---|\n", *told])
 
 
 def _playing(record: Mapping[str, Any], files: Collection[str]) -> str:
     spec = record["spec"]
-    modules = _flag(spec.get("gym_packages") or [])
+    modules = to_type(spec, files)
     parts = [
-        "With Yardstick, from this folder or its zip (nothing in it is run):\n",
-        fenced("sh", f"yardstick enjoy .{modules}\n"),
+        "With Yardstick, in this folder (nothing in it is run, but for modules that you type):\n"
+        if modules
+        else "With Yardstick, from this folder or its zip (nothing in it is run):\n",
+        fenced("sh", f"yardstick enjoy .{_flag(modules)}\n"),
     ]
     text = script(record, files)
     if text is not None:
@@ -185,6 +193,11 @@ def _is_known(spec: Mapping[str, Any]) -> bool:
     """Whether the environment is one of Gymnasium's own."""
     registered = gym.registry.get(spec["env_id"])
     return registered is not None and str(registered.entry_point).startswith("gymnasium.")
+
+
+def to_type(spec: Mapping[str, Any], files: Collection[str]) -> list[str]:
+    """What to type after ``--gym-packages``: the copy of a module in the pack, or else its name."""
+    return [copy_among(files, str(name)) or str(name) for name in spec.get("gym_packages") or []]
 
 
 def plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:

@@ -13,12 +13,14 @@ from pipeline.errors import UserError, one_line
 from pipeline.file_digests import FIELD, RECORD, VERSION, VERSION_FIELD, sealed
 from pipeline.json_text import json_text
 from pipeline.models.recorded_runs import read_recorded, run_in
+from pipeline.module_records import COPIES
 from pipeline.packing.model_card import card, results
 from pipeline.packing.scrubbing import check_secrets, check_untold, record_to_tell, zip_to_tell
 from pipeline.run_folder import FINISHED, Run
 from safe_files.limits import MAX_ARCHIVE_BYTES
 
 CARD = "README.md"
+STUDY_RECORD = "study.json"  # of the pack of a study, with the digests of its files
 FILMS = (".mp4", ".gif")
 MOST_FILM_BYTES = 64 << 20
 
@@ -58,6 +60,9 @@ def _files(run: Run, record: dict[str, Any]) -> Iterator[tuple[str, bytes]]:
         raise UserError(f"{run.path} recorded no digests of its files: train again to pack it")
     spec, settings = record["spec"], run.params_path.name
     yield run.model_path.name, zip_to_tell(read_recorded(run, run.model_path, MAX_ARCHIVE_BYTES))
+    for name in sorted(recorded):
+        if name.startswith(f"{COPIES}/") and name.endswith(".py"):
+            yield name, read_recorded(run, run.path / name, MAX_ARCHIVE_BYTES)
     yield f"{settings}/config.yml", _yaml(spec["hyperparams"])
     arguments = {
         "algo": spec["algo"],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+import json
 import os
 import secrets
 import shutil
@@ -17,15 +19,20 @@ from pipeline.errors import UserError, one_line, shown
 from pipeline.file_digests import FIELD, RECORD, RecordedFiles, read_record
 from pipeline.files import portable_name, put_in_place, replacing, settle
 from pipeline.models.recorded_runs import run_in
-from pipeline.packing.pack_contents import contents
+from pipeline.module_records import COPIES
+from pipeline.packing.pack_contents import STUDY_RECORD, contents
 from pipeline.packing.scrubbing import zipped
-from safe_files.archives import read_members
-from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.archives import opened_zip, read_member, read_members
+from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import read_file
 
 _DEEPEST = 2  # folders of a name, the file itself counted
+_DEEPEST_MODULE = 8
+_DEEPEST_OF_STUDY = 3
+_MOST_OF_STUDY = 100_000  # files
 _LONGEST_NAME = 255
+_DAMAGE = (OSError, ValueError, LookupError, RuntimeError, EOFError, zipfile.BadZipFile)
 
 
 def pack(run_folder: Path, target: Path) -> Path:
@@ -47,6 +54,8 @@ def pack(run_folder: Path, target: Path) -> Path:
     if target.is_dir() if is_zip else (target.exists() or target.is_symlink()):
         raise UserError(f"{target} is there already: name another place for the pack")
     files = contents(run_folder)
+    for name in files:
+        check_name(name)
     if is_zip:
         with replacing(target) as file:
             file.write(zipped(dict(sorted(files.items()))))
@@ -74,7 +83,9 @@ def check_pack(path: Path) -> int:
     Raises:
         UserError: if one is missing or changed, or it is no pack.
     """
-    with unpacked(path) as folder:
+    if is_packed(path, STUDY_RECORD):
+        return _check_study(path)
+    with unpacked(path) as (folder, _):
         if not (folder / RECORD).is_file():
             raise UserError(f"{path} is no pack: it holds no {RECORD}")
         return _check_files(folder, path)
@@ -95,7 +106,7 @@ def _check_files(folder: Path, shown_as: Path, names: Collection[str] = ()) -> i
         if strange := set(names) - digests.keys():
             raise UserError(f"{shown(min(strange))} is not among the files that {RECORD} lists")
         for name in digests.keys() - {RECORD}:
-            _check_name(name)
+            check_name(name)
             RecordedFiles(folder, digests).check(folder / name)
     except (UserError, UnsafeFileError) as error:
         reason = one_line(error).replace(f"{folder}{os.sep}", "")
@@ -103,43 +114,105 @@ def _check_files(folder: Path, shown_as: Path, names: Collection[str] = ()) -> i
     return len(digests)
 
 
+def _check_study(path: Path) -> int:
+    """The same for the pack of a study."""
+    try:
+        with _opened_study(path) as (archive, names):
+            record = json.loads(_member(archive, STUDY_RECORD))
+            digests = record.get("files") if isinstance(record, dict) else None
+            if not isinstance(digests, dict) or digests.keys() != names - {STUDY_RECORD}:
+                raise UnsafeFileError(f"{STUDY_RECORD} does not list its files, and no others")
+            for name, digest in digests.items():
+                if hashlib.sha256(_member(archive, name)).hexdigest() != digest:
+                    raise UnsafeFileError(f"{shown(name)} is not as the record says")
+    except _DAMAGE as error:
+        raise UserError(f"{path} is not as it was packed: {one_line(error)}") from error
+    return len(names)
+
+
 @contextmanager
-def unpacked(path: Path) -> Iterator[Path]:
+def _opened_study(path: Path) -> Iterator[tuple[zipfile.ZipFile, set[str]]]:
+    """The pack of a study, and the names in it, none of which leads elsewhere."""
+    content = read_file(path, MAX_ARCHIVE_BYTES)
+    with opened_zip(content, Budget(len(content))) as archive:
+        infos = archive.infolist()
+        if len(infos) > _MOST_OF_STUDY:
+            raise UnsafeFileError(f"holds more than {_MOST_OF_STUDY:,} files")
+        _check_members(infos, _DEEPEST_OF_STUDY)
+        yield archive, {info.filename for info in infos}
+
+
+def _member(archive: zipfile.ZipFile, name: str) -> bytes:
+    info = archive.getinfo(name)
+    # Twice: Python puts it together from pieces.
+    Budget(info.compress_size).charge(2 * info.file_size)
+    return read_member(archive, info)
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
     """The folder of a pack; of a zip a temporary one, with nothing in it but what its record lists.
 
     Any other path is given as it is.
 
     Args:
-        path: of anything; of a zip, its suffix may be missing.
+        path: of anything; of a zip, its suffix may be missing. In the pack of a study, a run is
+            ``study.zip/runs/<agent>/<run>.zip``.
+
+    Yields:
+        The folder, and the zip that it was unpacked from, or None.
 
     Raises:
         UserError: if the zip holds anything that a pack may not, or not what its record says.
     """
     beside = path.with_name(f"{path.name}.zip") if path.name else path
     path = beside if not path.exists() and is_packed(beside) else path
-    if not is_packed(path):
-        yield path
+    study = next((above for above in path.parents if is_packed(above, STUDY_RECORD)), None)
+    if study is None and not is_packed(path):
+        if is_packed(path, STUDY_RECORD):
+            raise UserError(f"{path} is the pack of a study: name one of its runs, {_a_run(path)}")
+        yield path, None
         return
     try:
-        files = _members(read_file(path, MAX_ARCHIVE_BYTES))
-    except (OSError, ValueError, RuntimeError, EOFError, zipfile.BadZipFile) as error:
+        if study is None:
+            content = read_file(path, MAX_ARCHIVE_BYTES)
+        else:
+            content = _run_of(study, path.relative_to(study).as_posix())
+        files = _members(content)
+    except _DAMAGE as error:
         raise UserError(f"{path} is no pack that may be opened: {one_line(error)}") from error
     with tempfile.TemporaryDirectory(prefix="yardstick-pack-") as name:
         folder = Path(name) / path.stem
         folder.mkdir()
         _write(folder, files)
         _check_files(folder, path, files.keys())
-        yield folder
+        yield folder, study or path
 
 
-def is_packed(path: Path) -> bool:
-    """Whether a file is a zip with the record of a run in it, as no model has."""
+def _run_of(study: Path, name: str) -> bytes:
+    """The pack of a run in the pack of a study; its suffix may be missing."""
+    with _opened_study(study) as (archive, names):
+        found = next((n for n in (name, f"{name}.zip") if n in names), None)
+        if found is None:
+            raise UserError(f"{study} holds no {shown(name)}: {_a_run(study)}")
+        return _member(archive, found)
+
+
+def _a_run(study: Path) -> str:
+    """An example of the runs in the pack of a study."""
+    with _opened_study(study) as (_, names):
+        runs = sorted(name for name in names if name.endswith(".zip"))
+        return f"such as {study}/{runs[0]}" if runs else "but it holds none"
+
+
+def is_packed(path: Path, record: str = RECORD) -> bool:
+    """Whether a file is a zip with the record of a run in it, as no model has, or of a study."""
     if not path.is_file():
         return False
     try:
         with zipfile.ZipFile(path) as archive:
-            return RECORD in archive.namelist()
-    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+            return record in archive.namelist()
+    except _DAMAGE:
         return False
 
 
@@ -150,33 +223,48 @@ def _members(content: bytes) -> Mapping[str, bytes]:
         UnsafeFileError: if there is a link, a name that leads elsewhere, or too much.
     """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        for info in archive.infolist():
-            kind = stat.S_IFMT(info.external_attr >> 16)
-            if kind not in (0, stat.S_IFREG):
-                raise UnsafeFileError(f"holds {shown(info.filename)}, which is no regular file")
-            _check_name(info.filename)
-    files = read_members(content)
-    if len({name.casefold() for name in files}) < len(files):
+        _check_members(archive.infolist())
+    return read_members(content)
+
+
+def _check_members(infos: Collection[zipfile.ZipInfo], deepest: int = _DEEPEST) -> None:
+    """Refuse members that would not be files of their own, inside of the folder.
+
+    Raises:
+        UnsafeFileError: naming one.
+    """
+    for info in infos:
+        kind = stat.S_IFMT(info.external_attr >> 16)
+        if kind not in (0, stat.S_IFREG):
+            raise UnsafeFileError(f"holds {shown(info.filename)}, which is no regular file")
+        check_name(info.filename, deepest)
+    names = [info.filename for info in infos]
+    if len({name.casefold() for name in names}) < len(names):
         raise UnsafeFileError("holds two names that some systems take for one")
-    folders = {str(parent) for name in files for parent in PurePosixPath(name).parents}
-    if not folders.isdisjoint(files):
+    folders = {str(parent) for name in names for parent in PurePosixPath(name).parents}
+    if not folders.isdisjoint(names):
         raise UnsafeFileError("holds a file that is a folder too")
-    return files
 
 
-def _check_name(name: str) -> None:
+def check_name(name: str, deepest: int = _DEEPEST) -> None:
+    """Refuse a name that leads elsewhere, or that some file system does not take.
+
+    Raises:
+        UnsafeFileError: naming it.
+    """
     parts = name.split("/")
+    deepest = _DEEPEST_MODULE if parts[0] == COPIES else deepest
     good = all(
         part not in ("", ".", "..") and portable_name(part, _LONGEST_NAME) == part for part in parts
     )
-    if len(parts) > _DEEPEST or not good:
+    if len(parts) > deepest or not good:
         raise UnsafeFileError(f"holds {shown(name)}, which would lie elsewhere")
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
     for name, content in files.items():
         path = folder / name
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("xb") as file:
             file.write(content)
 

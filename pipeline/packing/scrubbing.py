@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import gzip
 import io
 import json
 import re
 import zipfile
+import zlib
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
@@ -40,6 +42,9 @@ _TOLD = (
 )
 _DATE = (1980, 1, 1, 0, 0, 0)
 _SERIALIZED = re.compile(rb'":serialized:": "([A-Za-z0-9+/=]*)"')
+_SCRIPT = re.compile(rb"(<script\b.*?</script>)", re.DOTALL)
+_PACKED = re.compile(rb">(H4sI(?:[A-Za-z0-9+/]{4})*[A-Za-z0-9+/=]{4})<")  # numbers of a page
+_LARGEST = 64 << 20  # bytes
 _SECRET = re.compile(r"passw|secret|token|credential|api_?key", re.IGNORECASE)
 _SHORTEST = 4  # letters of a path that is looked for: "/" is everywhere
 
@@ -105,12 +110,53 @@ def zipped(members: Mapping[str, bytes]) -> bytes:
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for name, content in members.items():
-            archive.writestr(zipfile.ZipInfo(name, _DATE), content)
+            archive.writestr(member_of(name), content)
     return stream.getvalue()
 
 
+def member_of(name: str) -> zipfile.ZipInfo:
+    """A member of a zip, which does not say when and where it was written."""
+    return zipfile.ZipInfo(name, _DATE)
+
+
+def names_alone(name: str, content: bytes, run: Run) -> bytes:
+    """A page or table in which the paths of this machine are the names of their files alone."""
+    if not name.endswith(".html"):
+        return _without_paths(content, run)
+    parts = _SCRIPT.split(content)
+    for place, part in enumerate(parts):
+        if place % 2 == 0:
+            parts[place] = _without_paths(part, run)
+        else:  # a script of the page's own, or numbers and texts, packed
+            parts[place] = _PACKED.sub(lambda found: _packed_anew(found[1], run), part)
+    return b"".join(parts)
+
+
+def _packed_anew(packed: bytes, run: Run) -> bytes:
+    text = _unpacked(packed)
+    told = _without_paths(text, run)
+    return b">%b<" % (packed if told == text else base64.b64encode(gzip.compress(told, mtime=0)))
+
+
+def _unpacked(packed: bytes) -> bytes:
+    """The text of packed numbers; nothing where it is none."""
+    try:
+        content = base64.b64decode(packed)
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(content, _LARGEST)
+    except (ValueError, zlib.error):
+        return b""
+
+
+def _without_paths(text: bytes, run: Run) -> bytes:
+    for place in _places_of(run):
+        for way in {place, place.replace(b"_", rb"\_")}:  # as Markdown and LaTeX write it
+            path = rb"(?<![\w.])%b(?:[/\\]+[^\s\"'<>&|,;:/\\]*)*(?![\w.-])" % re.escape(way)
+            text = re.sub(path, lambda found: re.split(rb"[/\\](?!_)", found[0])[-1], text)
+    return text
+
+
 def check_untold(files: Mapping[str, bytes], run: Run) -> None:
-    """Look through all files for the paths of this machine; models are looked into.
+    """Look through all files for the paths of this machine; models and pages are looked into.
 
     Raises:
         UserError: naming the file in which there is one.
@@ -134,7 +180,7 @@ def _places_of(run: Run) -> list[bytes]:
     paths = [Path.home(), Path.cwd(), run.path.resolve().parent]
     paths += [Path(text) for text in named if isinstance(text, str)]
     texts = {str(path) for path in paths if path.is_absolute()}
-    return sorted(text.encode() for text in texts if len(text) >= _SHORTEST)
+    return sorted((text.encode() for text in texts if len(text) >= _SHORTEST), key=len)[::-1]
 
 
 def _pieces(name: str, content: bytes) -> Iterable[bytes]:
@@ -143,3 +189,5 @@ def _pieces(name: str, content: bytes) -> Iterable[bytes]:
         for member in read_members(content).values():
             yield member
             yield from (base64.b64decode(text) for text in _SERIALIZED.findall(member))
+    for text in _PACKED.findall(content) if name.endswith(".html") else ():
+        yield _unpacked(text)

@@ -166,7 +166,7 @@ def wait_for(condition, seconds=60):
         time.sleep(0.05)
 
 
-FILES = ["curves.csv.gz", "runs", "summary.csv", "verdicts.md", "verdicts.tex"]
+FILES = ["curves.csv.gz", "runs", "study.yml", "summary.csv", "verdicts.md", "verdicts.tex"]
 
 
 def records(study):

@@ -1,6 +1,7 @@
 """Study files: what they may say, and how each mistake is told."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from agents import ALGORITHMS
 from experiments import study_files
-from experiments.study_files import find_study, read_study, swept
+from experiments.study_files import find_study, read_study, swept, write_study
 from experiments.study_plan import plan
 from experiments.study_spec import METRICS, AgentSpec, QuickSpec, file_name, layered
 from pipeline.environments import training_changes
@@ -424,3 +425,39 @@ def test_limits_that_are_none(tmp_path, line):
     path.write_text(f"{line}\nagents: [qlearning]\nenvironments: [FrozenLake-v1]\n")
     with pytest.raises(UserError, match=r"s\.yml:1: run_\w+ must be a (time|size)"):
         read_study(path)
+
+
+SHIPPED = Path(study_files.__file__).parents[1] / "studies"
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.rglob("*.yml")), ids=lambda path: path.stem)
+def test_what_is_written_asks_for_the_same(path, tmp_path):
+    if path.parent.name == "search":
+        return
+    study = read_study(path)
+    write_study(tmp_path, study)
+    again = read_study(tmp_path / "study.yml")
+    assert replace(again, name=study.name, source=path) == study
+
+
+def test_what_flags_changed_is_written(read, tmp_path):
+    """Also where it leaves of a sweep nothing that a file could say as one."""
+    (tmp_path / "map.txt").write_text("S.\n.G\n")
+    (tmp_path / "mine.yml").write_text("default:\n  n_timesteps: 9\n")
+    text = "agents: {qlearning: {sweep: {gamma: [0.5, 0.9]}}, sarsa: {conf_file: mine.yml}}\n"
+    study = read(f"{text}environments: [Warehouse-v0]\nrun_timeout: 10m\n")
+    arguments = {"desc": str(tmp_path / "map.txt"), "slip": 0.1}
+    changed = [layered(a.settings, {"gamma": 0.7, "env_kwargs": arguments}) for a in study.agents]
+    agents = [replace(a, settings=s) for a, s in zip(study.agents, changed, strict=True)]
+    (tmp_path / "there").mkdir()
+    write_study(tmp_path / "there", replace(study, agents=tuple(agents), n_seeds=3))
+    again = read_study(tmp_path / "there" / "study.yml")
+    assert (again.n_seeds, again.run_timeout) == (3, 600)
+    assert [agent.label for agent in again.agents] == [agent.label for agent in study.agents]
+    read_map = {"desc": ["S.", ".G"], "slip": 0.1}
+    wanted = [{**settings, "env_kwargs": read_map} for settings in changed]
+    assert [agent.settings for agent in again.agents] == wanted
+    assert again.agents[2].conf_file.read_text() == "default:\n  n_timesteps: 9\n"
+    assert again.agents[2].conf_file.parent == tmp_path / "there" / "settings"
+    write_study(tmp_path, study.quickened())
+    assert not (tmp_path / "study.yml").exists()

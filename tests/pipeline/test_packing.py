@@ -127,7 +127,7 @@ def test_a_bracket_is_called_so(packed, runs):
 def test_a_pack_verifies_and_plays_elsewhere(packed, runs, target):
     path = packed("dqn", target)
     assert check_pack(path) == len(list_of(path))
-    with unpacked(path) as folder:
+    with unpacked(path) as (folder, _):
         chosen = choose_model(ModelRequest(path=folder))
         assert (chosen.spec.algo, chosen.spec.env_id) == ("dqn", "CartPole-v1")
         assert chosen.statistics is not None
@@ -236,7 +236,7 @@ def test_where_something_lies_already(packed, runs, tmp_path):
         pack(runs["table"].path, tmp_path / "no" / "pack")
     again = packed("ppo", "pack.zip")
     pack(runs["table"].path, again)  # a file is replaced
-    with unpacked(again) as inside:
+    with unpacked(again) as (inside, _):
         assert choose_model(ModelRequest(path=inside)).spec.algo == "qlearning"
     assert default_target(runs["table"].path) == Path("qlearning-FrozenLake-v1-7")
 
@@ -364,7 +364,7 @@ def test_a_pack_imports_nothing(packed, tmp_path, monkeypatch):
 
 
 def test_a_model_file_is_no_pack(runs):
-    with unpacked(runs["table"].model_path) as path:
+    with unpacked(runs["table"].model_path) as (path, _):
         assert path == runs["table"].model_path
 
 

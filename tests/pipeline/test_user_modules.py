@@ -218,12 +218,17 @@ def test_the_module_of_an_id_that_was_typed_is_imported(write):
 
 
 def test_a_run_names_what_to_type(write, tmp_path):
-    folder = write(my_first="x = 1", my_package__in____init__="")
+    folder = write(
+        my_first="import my_beside", my_package__in____init__="", my_beside="import json"
+    )
+    write(json="x = 1", my_other="x = 1", my_package__in__part="'my_named:Class'", my_named="")
     modules = import_typed(["my_first", "my_package"])
     run = tmp_path / "run"
     run.mkdir()
     keep_copies(modules, run)
-    assert [path.name for path in run.rglob("*.py")] == ["my_first.py"]
+    copies = [path.relative_to(run / "modules").as_posix() for path in run.rglob("*.py")]
+    package = ["my_package/__init__.py", "my_package/part.py"]
+    assert sorted(copies) == ["my_beside.py", "my_first.py", "my_named.py", *package]
     recorded = {
         "gym_packages": [module.name for module in modules],
         "user_modules": [vars(module) for module in modules],
@@ -236,7 +241,19 @@ def test_a_run_names_what_to_type(write, tmp_path):
     shutil.rmtree(folder / "my_package")
     (folder / "my_first.py").unlink()
     told = complaint_of(check_recorded, recorded, run)
-    assert told.endswith(f"add --gym-packages {run}/modules/my_first.py my_package")
+    assert told.endswith(f"add --gym-packages {run}/modules/my_first.py {run}/modules/my_package")
+    packed = tmp_path / "study" / "runs" / "q" / "run.zip"
+    told = complaint_of(check_recorded, recorded, run, packed)
+    words = "modules/my_first.py modules/my_package"
+    assert told.endswith(
+        f"unzip it, read them, and if you trust them add, there, --gym-packages {words}"
+    )
+    shutil.copytree(run / "modules", tmp_path / "study" / "modules")
+    told = complaint_of(check_recorded, recorded, run, packed)
+    assert "read them, and if you trust them add --gym-packages" in told
+    assert told.endswith(
+        f"{tmp_path}/study/modules/my_first.py {tmp_path}/study/modules/my_package"
+    )
 
 
 def test_a_run_that_lies_is_quoted(tmp_path):
