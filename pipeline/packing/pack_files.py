@@ -194,7 +194,9 @@ def _run_of(study: Path, name: str) -> bytes:
     with _opened_study(study) as (archive, names):
         found = next((n for n in (name, f"{name}.zip") if n in names), None)
         if found is None:
-            raise UserError(f"{study} holds no {shown(name)}: {_a_run(study)}")
+            raise UserError(
+                f"{study} holds no {shown(name)}: name one of its runs, {_a_run(study)}"
+            )
         return _member(archive, found)
 
 

@@ -148,6 +148,10 @@ def outside(path, secret):
         ),
         (lambda root, _: (root / "summary.csv").write_text("a,b\n"), "summary.csv is damaged"),
         (
+            lambda root, _: (root / "curves.csv.gz").write_bytes(gzip.compress(HOME.encode())),
+            r"curves\.csv\.gz names .* nothing was packed",
+        ),
+        (
             lambda root, _: (root / "figures/a.png").write_text(f"{HOME}/x"),
             r"figures/a\.png names .* nothing was packed",
         ),
