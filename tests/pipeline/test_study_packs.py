@@ -217,6 +217,18 @@ def test_hostile_packs_are_refused(packed, tmp_path, changes, mode, complaint):
     assert not list(tmp_path.rglob("*odd*"))
 
 
+def test_what_a_zip_says_of_its_size_is_not_believed(packed):
+    """A member that says of itself that it takes a gigabyte before it is unpacked, too."""
+    rewrite(packed, sealed({**members(packed), RUN: bytes(90 << 20)}))
+    content = bytearray(packed.read_bytes())
+    place = content.rindex(RUN.encode(), 0, content.rindex(b"PK\5\6")) - 46
+    assert content[place : place + 4] == b"PK\1\2"
+    content[place + 20 : place + 24] = (1 << 30).to_bytes(4, "little")
+    packed.write_bytes(content)
+    with pytest.raises(UserError, match="would take more memory than"):
+        unpacked(packed / RUN).__enter__()
+
+
 @pytest.mark.parametrize(
     "changes",
     [{"report.html": b"other"}, {"more.py": b""}, {"study.json": b"[]"}, {"study.json": b"{"}],
