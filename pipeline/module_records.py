@@ -152,7 +152,7 @@ def _copy_in(folder: Path, name: str) -> str | None:
 
 def _copy_near(pack: Path, name: str) -> str | None:
     """What to type for the copy of a module that lies beside a pack, or in a folder above it."""
-    folders = list(pack.absolute().parents)[:_FOLDERS_ABOVE]
+    folders = list(pack.resolve().parents)[:_FOLDERS_ABOVE]
     return next((_near(f / copy) for f in folders if (copy := _copy_in(f, name))), None)
 
 

@@ -44,7 +44,10 @@ _DAMAGE = (
 
 
 def read_members(
-    content: bytes, expected: frozenset[str] | None = None, budget: Budget | None = None
+    content: bytes,
+    expected: frozenset[str] | None = None,
+    budget: Budget | None = None,
+    most: int = MAX_MEMBERS,
 ) -> dict[str, bytes]:
     """The members of a zip, by their names.
 
@@ -52,6 +55,7 @@ def read_members(
         content: the zip.
         expected: the names that members may have; None for any.
         budget: pays for the members; None for that of such a file.
+        most: how many there may be.
 
     Raises:
         UnsafeFileError: if it is no whole zip, unpacks to too much, or has other members.
@@ -63,8 +67,8 @@ def read_members(
         strange = [] if expected is None else sorted(set(names) - expected)
         if strange:
             raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
-        if len(names) > MAX_MEMBERS:
-            raise UnsafeFileError(f"holds more than {MAX_MEMBERS} members")
+        if len(names) > most:
+            raise UnsafeFileError(f"holds more than {most} members")
         # Twice what is unpacked: Python puts it together from pieces.
         copies = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
         budget.charge(sum(info.file_size * copies[info.compress_type] for info in infos))

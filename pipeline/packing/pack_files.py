@@ -11,7 +11,7 @@ import shutil
 import stat
 import tempfile
 import zipfile
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
@@ -30,7 +30,7 @@ from safe_files.regular_files import read_file
 _DEEPEST = 2  # folders of a name, the file itself counted
 _DEEPEST_MODULE = 8
 _DEEPEST_OF_STUDY = 3
-_MOST_OF_STUDY = 100_000  # files
+_MOST, _MOST_OF_STUDY = 1000, 100_000  # files
 _LONGEST_NAME = 255
 _DAMAGE = (OSError, ValueError, LookupError, RuntimeError, EOFError, zipfile.BadZipFile)
 
@@ -56,6 +56,8 @@ def pack(run_folder: Path, target: Path) -> Path:
     files = contents(run_folder)
     for name in files:
         check_name(name)
+    if len(files) > _MOST:
+        raise UserError(f"{run_folder} has modules of more files than a pack holds, {_MOST:,}")
     if is_zip:
         with replacing(target) as file:
             file.write(zipped(dict(sorted(files.items()))))
@@ -117,13 +119,13 @@ def _check_files(folder: Path, shown_as: Path, names: Collection[str] = ()) -> i
 def _check_study(path: Path) -> int:
     """The same for the pack of a study."""
     try:
-        with _opened_study(path) as (archive, names):
-            record = json.loads(_member(archive, STUDY_RECORD))
+        with _opened_study(path) as (read, names):
+            record = json.loads(read(STUDY_RECORD))
             digests = record.get("files") if isinstance(record, dict) else None
             if not isinstance(digests, dict) or digests.keys() != names - {STUDY_RECORD}:
                 raise UnsafeFileError(f"{STUDY_RECORD} does not list its files, and no others")
             for name, digest in digests.items():
-                if hashlib.sha256(_member(archive, name)).hexdigest() != digest:
+                if hashlib.sha256(read(name)).hexdigest() != digest:
                     raise UnsafeFileError(f"{shown(name)} is not as the record says")
     except _DAMAGE as error:
         raise UserError(f"{path} is not as it was packed: {one_line(error)}") from error
@@ -131,22 +133,22 @@ def _check_study(path: Path) -> int:
 
 
 @contextmanager
-def _opened_study(path: Path) -> Iterator[tuple[zipfile.ZipFile, set[str]]]:
-    """The pack of a study, and the names in it, none of which leads elsewhere."""
+def _opened_study(path: Path) -> Iterator[tuple[Callable[[str], bytes], set[str]]]:
+    """What reads a file in the pack of a study, and the names of all, none of which leads away."""
     content = read_file(path, MAX_ARCHIVE_BYTES)
     with opened_zip(content, Budget(len(content))) as archive:
         infos = archive.infolist()
         if len(infos) > _MOST_OF_STUDY:
             raise UnsafeFileError(f"holds more than {_MOST_OF_STUDY:,} files")
         _check_members(infos, _DEEPEST_OF_STUDY)
-        yield archive, {info.filename for info in infos}
 
+        def read(name: str) -> bytes:
+            info = archive.getinfo(name)
+            # Twice: Python puts it together from pieces. Not by what the zip says of its own size.
+            Budget(len(content)).charge(2 * info.file_size)
+            return read_member(archive, info)
 
-def _member(archive: zipfile.ZipFile, name: str) -> bytes:
-    info = archive.getinfo(name)
-    # Twice: Python puts it together from pieces.
-    Budget(info.compress_size).charge(2 * info.file_size)
-    return read_member(archive, info)
+        yield read, {info.filename for info in infos}
 
 
 @contextmanager
@@ -191,11 +193,13 @@ def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
 
 def _run_of(study: Path, name: str) -> bytes:
     """The pack of a run in the pack of a study; its suffix may be missing."""
-    with _opened_study(study) as (archive, names):
+    with _opened_study(study) as (read, names):
         found = next((n for n in (name, f"{name}.zip") if n in names), None)
         if found is None:
-            raise UserError(f"{study} holds no {shown(name)}: {_a_run(study)}")
-        return _member(archive, found)
+            raise UserError(
+                f"{study} holds no {shown(name)}: name one of its runs, {_a_run(study)}"
+            )
+        return read(found)
 
 
 def _a_run(study: Path) -> str:
@@ -224,7 +228,7 @@ def _members(content: bytes) -> Mapping[str, bytes]:
     """
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         _check_members(archive.infolist())
-    return read_members(content)
+    return read_members(content, most=_MOST)
 
 
 def _check_members(infos: Collection[zipfile.ZipInfo], deepest: int = _DEEPEST) -> None:

@@ -43,7 +43,9 @@ _TOLD = (
 _DATE = (1980, 1, 1, 0, 0, 0)
 _SERIALIZED = re.compile(rb'":serialized:": "([A-Za-z0-9+/=]*)"')
 _SCRIPT = re.compile(rb"(<script\b.*?</script>)", re.DOTALL)
-_PACKED = re.compile(rb">(H4sI(?:[A-Za-z0-9+/]{4})*[A-Za-z0-9+/=]{4})<")  # numbers of a page
+# Numbers of a page: gzip in base64.
+_SIGN = rb"[A-Za-z0-9+/]"
+_PACKED = re.compile(rb">(H4sI(?:%b{4})*(?:%b{3}=|%b{2}==)?)<" % (_SIGN, _SIGN, _SIGN))
 _LARGEST = 64 << 20  # bytes
 _SECRET = re.compile(r"passw|secret|token|credential|api_?key", re.IGNORECASE)
 _SHORTEST = 4  # letters of a path that is looked for: "/" is everywhere
@@ -133,17 +135,16 @@ def names_alone(name: str, content: bytes, run: Run) -> bytes:
 
 
 def _packed_anew(packed: bytes, run: Run) -> bytes:
-    text = _unpacked(packed)
-    told = _without_paths(text, run)
+    text = _unpacked(base64.b64decode(packed))
+    told = text if len(text) == _LARGEST else _without_paths(text, run)
     return b">%b<" % (packed if told == text else base64.b64encode(gzip.compress(told, mtime=0)))
 
 
-def _unpacked(packed: bytes) -> bytes:
-    """The text of packed numbers; nothing where it is none."""
+def _unpacked(content: bytes) -> bytes:
+    """What was packed by gzip, as far as it is looked at; nothing where it is no such thing."""
     try:
-        content = base64.b64decode(packed)
         return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(content, _LARGEST)
-    except (ValueError, zlib.error):
+    except zlib.error:
         return b""
 
 
@@ -189,5 +190,7 @@ def _pieces(name: str, content: bytes) -> Iterable[bytes]:
         for member in read_members(content).values():
             yield member
             yield from (base64.b64decode(text) for text in _SERIALIZED.findall(member))
+    if name.endswith(".gz"):
+        yield _unpacked(content)
     for text in _PACKED.findall(content) if name.endswith(".html") else ():
-        yield _unpacked(text)
+        yield _unpacked(base64.b64decode(text))

@@ -332,7 +332,7 @@ def test_bombs_and_damage(packed, tmp_path):
     with pytest.raises(UserError, match="is no pack that may be opened"):
         check_pack(path)
     path = packed("table", "pack.zip")
-    rewritten(path, {f"n{number}": b"" for number in range(70)})
+    rewritten(path, {f"n{number}": b"" for number in range(1001)})
     with pytest.raises(UserError, match="is no pack that may be opened"):
         check_pack(path)
     (tmp_path / "empty").mkdir()

@@ -148,6 +148,10 @@ def outside(path, secret):
         ),
         (lambda root, _: (root / "summary.csv").write_text("a,b\n"), "summary.csv is damaged"),
         (
+            lambda root, _: (root / "curves.csv.gz").write_bytes(gzip.compress(HOME.encode())),
+            r"curves\.csv\.gz names .* nothing was packed",
+        ),
+        (
             lambda root, _: (root / "figures/a.png").write_text(f"{HOME}/x"),
             r"figures/a\.png names .* nothing was packed",
         ),
@@ -211,6 +215,18 @@ def test_hostile_packs_are_refused(packed, tmp_path, changes, mode, complaint):
     with pytest.raises(UserError, match=complaint):
         unpacked(packed / RUN).__enter__()
     assert not list(tmp_path.rglob("*odd*"))
+
+
+def test_what_a_zip_says_of_its_size_is_not_believed(packed):
+    """A member that says of itself that it takes a gigabyte before it is unpacked, too."""
+    rewrite(packed, sealed({**members(packed), RUN: bytes(90 << 20)}))
+    content = bytearray(packed.read_bytes())
+    place = content.rindex(RUN.encode(), 0, content.rindex(b"PK\5\6")) - 46
+    assert content[place : place + 4] == b"PK\1\2"
+    content[place + 20 : place + 24] = (1 << 30).to_bytes(4, "little")
+    packed.write_bytes(content)
+    with pytest.raises(UserError, match="would take more memory than"):
+        unpacked(packed / RUN).__enter__()
 
 
 @pytest.mark.parametrize(
