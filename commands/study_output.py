@@ -216,10 +216,13 @@ def _judge(
 ) -> None:
     with doing(console, "judging the agents") as activity:
         from experiments.analysis import analyse
+        from experiments.failed_runs import with_advice
         from experiments.looking import take_looks
         from report.terminal_tables import print_analysis, print_episodes_table
 
         analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
+        activity.now("looking at runs that failed")
+        analysis = with_advice(analysis)
     print_analysis(console, analysis)
     width = results.study.episodes_table
     with doing(console, "writing the tables") as activity:

@@ -180,5 +180,5 @@ def _add_output_flags(parser: argparse.ArgumentParser) -> None:
         type=WATCHED,
         default=0,
         metavar="N",
-        help="episodes that it shows of tables (default: those of the first 5,000 steps)",
+        help="the first episodes of a table (default: the steps in which its policy gets better)",
     )

@@ -76,5 +76,5 @@ class TuningProgress(LiveProgress):
         if best is not None:
             text += f"; best {best[1]:.4g} (trial {best[0]})"
         if new > 0 and ended < self.n_trials:
-            text += f"; about {duration(seconds / new * (self.n_trials - ended))} left"
+            text += f"; about {duration(seconds / new * (self.n_trials - ended))} left by the clock"
         return text

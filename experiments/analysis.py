@@ -115,6 +115,7 @@ class EnvironmentAnalysis:
         look: which look at these runs it is.
         optimum_at_least: the lower end of the optimum's bracket; None where there is none.
         optima: by agent, where agents play environments whose optima differ; else empty.
+        advice: sentences on runs that failed, see `experiments.failed_runs`.
     """
 
     environment: str
@@ -135,6 +136,7 @@ class EnvironmentAnalysis:
     look: Standing = field(default_factory=Standing)
     optimum_at_least: float | None = None
     optima: Mapping[str, float] = field(default_factory=dict)
+    advice: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,7 @@ class ProgressDisplay(BlockCallback):
             where = " (there the environment is changed)" if self.on_variant else ""
             figures += f"  mean return in training{where} {mean_return:.2f}"
         left = self._seconds_left()
-        return figures if left is None else f"{figures}  about {duration(left)} left"
+        return figures if left is None else f"{figures}  about {duration(left)} left by the clock"
 
     def _seconds_left(self) -> float | None:
         """By the clock, at the speed of the last half of what is done; None where nobody knows.

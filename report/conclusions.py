@@ -32,8 +32,8 @@ class Conclusion:
         lead: who is best, and how that stands to the optimum.
         pairs: every verdict, with figures; several in a sentence.
         failed: whose runs failed, to stand beside verdicts that are shown as signs; may be empty.
-        notes: failures, how soon agents arrive, training on variants, what is missing, and how
-            often the runs have been looked at.
+        notes: failures, how soon agents arrive, training on variants, what is missing, what failed
+            agents do instead, and how often the runs have been looked at.
     """
 
     lead: str
@@ -61,6 +61,7 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
             *_on_variants(study, environment),
             *on_changes([environment]),
             *_on_missing(study, environment),
+            *environment.advice,
             *_on_looks(environment),
         ),
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import operator
 import sys
 import threading
 import types
@@ -28,6 +29,7 @@ _CONSTANT_TYPES = (
     types.FunctionType,
     types.BuiltinFunctionType,
     functools._lru_cache_wrapper,
+    operator.attrgetter,
     types.MethodType,
     types.MethodWrapperType,
     types.MethodDescriptorType,

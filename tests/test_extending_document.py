@@ -20,6 +20,9 @@ def test_the_document_can_be_followed(type_in_own_folder, own_folder):
     for command in COMMANDS:
         code, out, err = type_in_own_folder(*shlex.split(command))
         assert (code, err) == (0, ""), f"{command}\n{out}{err}"
+        if "my_rules" in command:  # as the page says of it; its state can be kept
+            assert "return -15.00 (exact), success 100.0%" in out
+            assert "no state can be kept" not in out
     assert gym.make("my/Corridor-v0").unwrapped.length == 6
     logs = own_folder / "logs"
     assert (logs / "qlearning" / "my-Corridor-v0_1" / "modules" / "my_corridor.py").is_file()

@@ -47,7 +47,7 @@ def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
         "moves": _columns(moves),
         "changes": _columns(changes),
         "begin": begin,
-        "is_cut": recorder.is_cut or end < len(recorder.steps),
+        "is_cut": recorder.is_cut or end - begin < len(recorder.steps),
         "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
     }
 

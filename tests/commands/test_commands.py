@@ -247,8 +247,8 @@ def test_a_broken_map_names_row_and_column(type_command, tmp_path):
         "train.py", "--algo", "qlearning", "--env", "Warehouse-v0", "--env-kwargs", "desc:map.txt"
     )
     assert code == 2
-    assert "row 1" in err
-    assert "column 1" in err
+    assert "row 2" in err
+    assert "column 2" in err
     assert contents(tmp_path) == ["map.txt"]
 
 

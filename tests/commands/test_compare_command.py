@@ -267,6 +267,24 @@ def test_a_study_file(type_command, folder):
     assert set(rows(folder / "studies" / "steps-quick")["n_episodes"]) == {4}
 
 
+def test_an_agent_that_learns_nothing_gets_advice_once(type_command, folder):
+    """Not the random agent; in the terminal, on the page and in the file for papers."""
+    words = ("--env", "Warehouse-v0", "--algos", "qlearning", "random", "--seeds", 2, "-n", 400)
+    code, out, err = type_command(*words, "-f", "studies", "--name", "failed")
+    assert (code, err) == (0, "")
+    told = re.findall(r"^(\w+) failed in (.*?); seed 0: (.*)$", out, re.M)
+    assert [(agent, of) for agent, of, _ in told] == [("qlearning", "2 of 2 runs")]
+    ((_, _, advice),) = told
+    assert re.fullmatch(
+        r"100% of its episodes run out of time: it .* row \d+, column \d+; try first: -n \d+ "
+        r"\(now 2 steps for each state and action\)\.",
+        advice,
+    )
+    for name in ("report.html", "verdicts.md"):
+        text = (folder / "studies" / "failed" / name).read_text(encoding="utf-8")
+        assert "qlearning failed in 2 of 2 runs; seed 0: 100" in text, name
+
+
 def test_a_run_that_fails_does_not_stop_the_others(type_command, folder):
     words = ["--env", "Fragile-v0", "--gym-packages", "fragile_walks", "--no-report"]
     words += ["--algos", "qlearning", "random", "--seeds", 3, "-n", 2000, "-j", 2, "-f", "studies"]

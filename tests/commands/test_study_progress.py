@@ -134,7 +134,8 @@ def test_so_does_the_line_of_a_search(clock):
             progress.trial_ended(4, 0.5, "")
             clock.now += 2
             assert progress.figures() == (
-                "1 of 10 trials, 1 run in 2 s, 3 workers; best 0.5 (trial 4); about 18 s left"
+                "1 of 10 trials, 1 run in 2 s, 3 workers; best 0.5 (trial 4); "
+                "about 18 s left by the clock"
             )
 
 

@@ -63,7 +63,8 @@ def test_elsewhere_ten_plain_lines(clock):
     assert max(share % 10 for share in shares) <= 1
     for line, share in zip(lines[1:], shares[1:], strict=True):
         steps, left = re.match(
-            r" *\d+%  ([\d,]+) steps  mean return in training 0\.\d\d(?:  about (\d+) s left)?$",
+            r" *\d+%  ([\d,]+) steps  mean return in training 0\.\d\d"
+            r"(?:  about (\d+) s left by the clock)?$",
             line,
         ).groups()
         assert int(steps.replace(",", "")) == pytest.approx(10 * share, abs=6)
@@ -147,7 +148,8 @@ def test_a_line_comes_early_and_then_every_ten_seconds_also_while_no_step_ends(c
     lines = slow_training(clock, at=30, activity="evaluating").splitlines()
     # Two seconds after the beginning, and then ten after each line.
     assert re.fullmatch(
-        r"  \d%  2\d steps  mean return in training 0.00  about \d+ s left  evaluating, 2 s",
+        r"  \d%  2\d steps  mean return in training 0.00"
+        r"  about \d+ s left by the clock  evaluating, 2 s",
         lines[0],
     )
     assert [re.search(r"evaluating, (\d+) s", line)[1] for line in lines[:3]] == ["2", "12", "22"]

@@ -5,6 +5,7 @@ import dataclasses
 import enum
 import functools
 import json
+import operator
 import random
 import threading
 from array import array
@@ -89,6 +90,7 @@ class Everything:
         self.space = gym.spaces.Box(0.0, 1.0, (2,), seed=seed)
         self.function = lambda: seed
         self.partial = functools.partial(max, 1)
+        self.getter = operator.attrgetter("a")
 
     def step(self):
         self.optimizer.zero_grad()

@@ -1,0 +1,63 @@
+"""What the agents of failed runs do instead, and what to try first: once for each agent."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import replace
+
+from experiments.analysis import StudyAnalysis
+from experiments.planned_runs import PlannedRun
+from experiments.study_results import StudyResults
+from pipeline.errors import UserError
+from pipeline.evaluation.advice import FAILED, NEARLY_ALL, Advice, advice
+from pipeline.evaluation.exact import exact_evaluator
+from pipeline.models.model_loading import load_model
+
+
+def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
+    """The analysis with sentences on runs that failed, where something can be said of them."""
+    results = analysis.results
+    return replace(
+        analysis,
+        environments=tuple(
+            replace(one, advice=tuple(_sentences(results, one.environment)))
+            for one in analysis.environments
+        ),
+    )
+
+
+def _sentences(results: StudyResults, environment: str) -> Iterator[str]:
+    table = results.summary[results.summary["environment"] == environment]
+    runs = {
+        (run.agent, run.seed): run for run in results.finished if run.environment == environment
+    }
+    for agent, rows in table.groupby("agent", sort=False):
+        has_failed = rows["score"].astype(float) < FAILED
+        # Such a policy may never end an episode; the advice looks whether it does.
+        has_failed |= rows["success_rate"].astype(float) < 1 - NEARLY_ALL
+        failed = rows[has_failed & rows["exact"].astype(bool)]
+        if failed.empty:
+            continue
+        seed = int(failed["seed"].min())
+        found = _advice(runs[str(agent), seed])
+        if found is not None:
+            of = f"{len(failed)} of {len(rows)} runs" if len(rows) > 1 else "its run"
+            first = f"; seed {seed}" if len(failed) > 1 else ""
+            then = f"; try first: {found.try_first}" if found.try_first else ""
+            yield f"{agent} failed in {of}{first}: {found.instead}{then}."
+
+
+def _advice(planned: PlannedRun) -> Advice | None:
+    """The advice on a run, which is loaded; None where that cannot be."""
+    run, spec = planned.run, planned.spec
+    with suppress(UserError, OSError):
+        evaluator = exact_evaluator(spec)
+        if evaluator is None:
+            return None
+        agent = load_model(spec.algo, run.model_path, modules=spec.user_modules, device="cpu")
+        if evaluator.obstacle(agent):
+            return None
+        n_steps = int(run.read_info()["n_timesteps"])
+        return advice(spec, agent, evaluator, evaluator(agent), n_steps)
+    return None
