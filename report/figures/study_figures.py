@@ -36,8 +36,7 @@ from report.figures.figure_style import (
     wrapped,
 )
 from report.series.agent_marks import COLOURS, DASHES, Mark
-from report.series.axis_scale import linear_up_to
-from report.series.curve_series import Curve, LearningCurves
+from report.series.curve_series import Curve, LearningCurves, linear_up_to
 from report.series.run_series import Grid, RunSeries, Sweep, best_of
 from report.wording import enumeration, number
 
