@@ -33,9 +33,9 @@ def test_the_example_is_a_study(tmp_path):
     path.write_text(example)
     study = read_study(path)
     assert [agent.label for agent in study.agents] == [
-        "qlearning learning_rate=0.01",
-        "qlearning learning_rate=0.1",
-        "qlearning learning_rate=0.9",
+        "qlearning with α = 0.01",
+        "qlearning with α = 0.1",
+        "qlearning with α = 0.9",
         "careful",
     ]
     assert len(plan(study, tmp_path)) == 4 * 2 * 20

@@ -33,7 +33,7 @@ from report.series.study_series import EnvironmentSeries, StudySeries
 
 # More agents than this make no readable lines; a study of parameters shows them by parameter.
 MOST_LINES = 14
-MOST_COLUMNS = 3
+MOST_IN_PAIRS = 8  # panels that have a page in two columns; more stand in three
 
 Marks = Mapping[str, Mark]
 
@@ -96,7 +96,7 @@ def _study_figures(
 def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Marks) -> None:
     agents = list(dict.fromkeys(rows["agent"]))
     if agents:
-        n_columns = min(len(agents), MOST_COLUMNS)
+        n_columns = min(len(agents), 2 if len(agents) <= MOST_IN_PAIRS else 3)
         n_rows = -(-len(agents) // n_columns)
         with files.figure(name, n_columns, n_rows, height=2.2) as places:
             for axes, agent in zip(places, agents, strict=False):

@@ -149,8 +149,10 @@ def _figure_of(axes: Axes) -> Figure:
 
 
 def band_words(n_curves: int) -> str:
-    """What the bands of so many curves are, the best first."""
-    return "95 % interval" if n_curves <= MOST_BANDS else f"95 % interval, of the best {MOST_BANDS}"
+    """What the bands of so many curves are."""
+    return (
+        "95 % interval" if n_curves <= MOST_BANDS else f"95 % interval, of the first {MOST_BANDS}"
+    )
 
 
 def shared_legend(*places: Axes, band: str = "") -> None:

@@ -36,8 +36,7 @@ from report.figures.figure_style import (
     wrapped,
 )
 from report.series.agent_marks import COLOURS, DASHES, Mark
-from report.series.axis_scale import linear_up_to
-from report.series.curve_series import Curve, LearningCurves
+from report.series.curve_series import Curve, LearningCurves, linear_up_to
 from report.series.run_series import Grid, RunSeries, Sweep, best_of
 from report.wording import enumeration, number
 
@@ -71,7 +70,7 @@ def draw_learning_curves(
     environment: EnvironmentAnalysis,
     marks: Marks,
 ) -> None:
-    """Axes for each of the `panels`; intervals of the best agents."""
+    """Axes for each of the `panels`; intervals of the first agents, which are the best."""
     title = f"{environment.environment}: "
     for place, (kind, by) in zip(places, panels(curves), strict=True):
         found = curves[kind]
@@ -94,7 +93,7 @@ def draw_learning_curves(
 
 
 def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
-    """Curves, the best first, with the intervals of few."""
+    """Curves, the first ones with their intervals."""
     for place, (agent, curve) in enumerate(curves.items()):
         style = line_style(marks[agent])
         marker = "o" if len(curve.x) == 1 else ""  # which has no length

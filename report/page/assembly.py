@@ -11,33 +11,28 @@ from pipeline.files import write_text
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.page import (
     bandit_section,
-    comparison_section,
-    curve_section,
     film_section,
-    overall_section,
     overview_section,
     policy_section,
-    ranking_section,
+    result_sections,
     settings_section,
-    verdict_section,
-    watching_section,
 )
 from report.page.markup import SHARED, as_json, frame, packed, template_file, templates
 from report.page.sections import LearningPage, Report, Section
 from report.series.study_series import StudySeries
 
-# A new kind of section is a module with such a function, named here.
+# A new kind of section is such a function, named here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
-    verdict_section.section,
+    result_sections.verdict,
     overview_section.section,
-    ranking_section.section,
-    curve_section.section,
+    result_sections.ranking,
+    result_sections.curves,
     bandit_section.section,
-    comparison_section.section,
-    overall_section.section,
+    result_sections.comparison,
+    result_sections.overall,
     policy_section.section,
     film_section.section,
-    watching_section.section,
+    result_sections.watching,
     settings_section.section,
 )
 

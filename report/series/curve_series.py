@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 
 from experiments.analysis import EnvironmentAnalysis
 from experiments.seed_values import curves_by_agent, mean_curve
 from experiments.study_results import StudyResults
 from mdp.array_types import Floats
-from report.series.axis_scale import linear_up_to
 
 KINDS = ("evaluation", "training")
 AXES = ("step", "episode", "seconds")
+
+# Returns that are so many times larger than what matters flatten a linear axis.
+DWARFED = 10
 
 
 @dataclass(frozen=True)
@@ -74,3 +77,23 @@ def _curves(of_agents: Mapping[str, Sequence[pd.DataFrame]], by: str) -> dict[st
             points, band = found
             curves[agent] = Curve(points, band.point, band.low, band.high)
     return curves
+
+
+def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | None:
+    """Where a symmetric logarithmic axis ceases to be linear.
+
+    Args:
+        curves: returns in the order of time, each of shape (n_points,).
+        optimum: the highest expected return, where it is known.
+
+    Returns:
+        The optimum's magnitude or, where it is not known, the largest of the returns that the
+        curves end with; None where no return dwarfs it, so that a linear axis shows all.
+    """
+    known = [finite for curve in curves if len(finite := curve[np.isfinite(curve)])]
+    if not known:
+        return None
+    if optimum is None:
+        optimum = max(float(np.abs(curve[-max(len(curve) // 4, 1) :]).max()) for curve in known)
+    scale = max(abs(optimum), 1.0)
+    return scale if max(float(np.abs(curve).max()) for curve in known) > DWARFED * scale else None

@@ -13,8 +13,7 @@ from experiments.seed_values import values_over_seeds
 from experiments.study_results import StudyResults
 from experiments.study_spec import AgentSpec, symbol
 from mdp.array_types import Floats, Ints
-from report.series.axis_scale import linear_up_to
-from report.series.curve_series import Curve
+from report.series.curve_series import Curve, linear_up_to
 from verdicts import Estimate
 
 LEAST_VALUES = 3  # of a parameter, for a figure of it

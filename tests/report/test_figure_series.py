@@ -8,8 +8,7 @@ import pytest
 
 from experiments.pull_statistics import pull_statistics
 from experiments.study_spec import AgentSpec
-from report.series.axis_scale import linear_up_to
-from report.series.curve_series import learning_curves
+from report.series.curve_series import learning_curves, linear_up_to
 from report.series.pull_series import arm_series, mean_regret, regret_of_runs
 from report.series.run_series import best_of, grids, run_series, sweeps
 

@@ -22,12 +22,11 @@ from report.page import (
     film_section,
     overview_section,
     policy_section,
+    result_sections,
     settings_section,
-    verdict_section,
     write_report,
 )
 from report.page.assembly import SECTIONS, render
-from report.page.comparison_section import improvement_matrix
 from report.page.markup import breakable, inline_script, p_value, packed, plain, setting
 from report.page.sections import Report
 from report.series.agent_marks import COLOURS, agent_marks
@@ -240,7 +239,7 @@ def test_an_agent_has_the_colour_of_the_printed_figures(page, report_study):
 
 def test_the_matrix_of_improvement_is_the_pairs_seen_from_both_sides(report_study):
     environment = report_study.analysis.environments[0]
-    matrix = improvement_matrix(environment)
+    matrix = result_sections.improvement_matrix(environment)
     assert [matrix[i][i] for i in range(3)] == [None] * 3
     first = environment.pairs[0]
     assert matrix[0][1] == first.probability_of_improvement.point
@@ -470,7 +469,7 @@ def sweep_page(made_up, tmp_path):
         EnvironmentSeries(places[1], None, RunSeries((), None), None, {}, {"swept": grid}),
     ]
     report = Report(StudySeries(analysis, agent_marks(analysis.study), tuple(series)), "compare")
-    return Page(render(report, [verdict_section.section(report)]))
+    return Page(render(report, [result_sections.verdict(report)]))
 
 
 def test_a_sweep_has_its_answer_on_top(sweep_page):

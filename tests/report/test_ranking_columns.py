@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from report.page import ranking_section
+from report.page import result_sections
 from report.page.sections import Report
 from report.ranking_cells import bar
 from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, Row, filled
@@ -20,7 +20,7 @@ def ranking(made_up):
         place = made_up.environment(agents, **changes)
         labels = [agent.agent for agent in agents]
         analysis = made_up.analysis([place], labels, metric=metric)
-        section = ranking_section.section(Report(StudySeries(analysis, {}, ()), ""))
+        section = result_sections.ranking(Report(StudySeries(analysis, {}, ()), ""))
         (table,) = section.context["tables"]
         return table["headings"], table["rows"]
 

@@ -172,10 +172,10 @@ def test_the_warehouse_with_the_rewards_of_the_text(tmp_path):
 
 def test_with_discount_a_tenth_the_tie_rule_decides(tmp_path):
     part = shrunk(study("warehouse-discount"), environments="shelf -1 ", n_seeds=5)
-    part = shrunk(part, ("first-index ties gamma=0.1", "random ties gamma=0.1"))
+    part = shrunk(part, ("first-index ties with γ = 0.1", "random ties with γ = 0.1"))
     results = run(part, tmp_path)
-    first = training_returns(results, "first-index ties gamma=0.1")[:, 200:300].mean()
-    at_random = training_returns(results, "random ties gamma=0.1")[:, 200:300].mean()
+    first = training_returns(results, "first-index ties with γ = 0.1")[:, 200:300].mean()
+    at_random = training_returns(results, "random ties with γ = 0.1")[:, 200:300].mean()
     assert first == pytest.approx(-985, abs=40)  # the mean of 30 seeds
     assert at_random == pytest.approx(-11.7, abs=15)
 

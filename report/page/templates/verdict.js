@@ -13,7 +13,7 @@ report.section("verdict", (root, { files, metric, sweeps }) => {
           y: curve.y,
           name: report.text(names.length > 1 ? `${name}, ${curve.parameter}` : name),
           mode: "lines+markers",
-          line: { color: report.css(`--agent-${k % 7}`), width: 2 },
+          line: { color: report.css(`--agent-${k % 7}`), width: 2, dash: ["solid", "dash", "dashdot", "dot"][k % 4] },
           error_y: { type: "data", symmetric: false, array: reach(curve.y, curve.high), arrayminus: reach(curve.y, curve.low), thickness: 1.5, width: 4 },
           hovertemplate: `${report.text(curve.parameter)} = %{x}: %{y:,.4~r}`,
         })),
