@@ -28,7 +28,7 @@ EPILOG = """\
 examples:
   python train.py --env Warehouse-v0 --algo ppo --engine auto
   python train.py --env FrozenLake-v1 --algo qlearning --n-episodes 5000 --seed 0
-  python train.py --env CartPole-v1 --algo dqn -params learning_rate:1e-3 buffer_size:50000
+  python train.py --env CartPole-v1 --algo dqn -params learning_rate:lin_0.003 buffer_size:50000
   python train.py --env Warehouse-v0 --algo sarsa --env-kwargs shelf_reward:-1 slip:0.1
   python train.py --resume logs/ppo/Warehouse-v0_3
   python train.py --list

@@ -23,7 +23,7 @@ def blocks(language):
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_can_be_carried_out(monkeypatch, tmp_path, command):
     monkeypatch.chdir(ROOT)
-    study = study_spec(build_parser().parse_args(shlex.split(command)))
+    study = study_spec(build_parser().parse_args(shlex.split(command, comments=True)))
     assert len(plan(study, tmp_path)) >= study.n_seeds
 
 
