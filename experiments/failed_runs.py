@@ -7,12 +7,11 @@ from contextlib import suppress
 from dataclasses import replace
 
 from experiments.analysis import StudyAnalysis
+from experiments.child_processes import do_aside
 from experiments.planned_runs import PlannedRun
 from experiments.study_results import StudyResults
 from pipeline.errors import UserError
-from pipeline.evaluation.advice import FAILED, NEARLY_ALL, Advice, advice
-from pipeline.evaluation.exact import exact_evaluator
-from pipeline.models.model_loading import load_model
+from pipeline.evaluation import FAILED, NEARLY_ALL
 
 
 def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
@@ -40,16 +39,21 @@ def _sentences(results: StudyResults, environment: str) -> Iterator[str]:
         if failed.empty:
             continue
         seed = int(failed["seed"].min())
-        found = _advice(runs[str(agent), seed])
+        found = do_aside(advice_on, runs[str(agent), seed])
         if found is not None:
             of = f"{len(failed)} of {len(rows)} runs" if len(rows) > 1 else "its run"
             first = f"; seed {seed}" if len(failed) > 1 else ""
-            then = f"; try first: {found.try_first}" if found.try_first else ""
-            yield f"{agent} failed in {of}{first}: {found.instead}{then}."
+            instead, try_first = found
+            then = f"; try first: {try_first}" if try_first else ""
+            yield f"{agent} failed in {of}{first}: {instead}{then}."
 
 
-def _advice(planned: PlannedRun) -> Advice | None:
-    """The advice on a run, which is loaded; None where that cannot be."""
+def advice_on(planned: PlannedRun) -> tuple[str, str | None] | None:
+    """What a run's agent does instead and what to try first; None where nothing can be said."""
+    from pipeline.evaluation.advice import advice
+    from pipeline.evaluation.exact import exact_evaluator
+    from pipeline.models.model_loading import load_model
+
     run, spec = planned.run, planned.spec
     with suppress(UserError, OSError):
         evaluator = exact_evaluator(spec)
@@ -59,5 +63,6 @@ def _advice(planned: PlannedRun) -> Advice | None:
         if evaluator.obstacle(agent):
             return None
         n_steps = int(run.read_info()["n_timesteps"])
-        return advice(spec, agent, evaluator, evaluator(agent), n_steps)
+        found = advice(spec, agent, evaluator, evaluator(agent), n_steps)
+        return None if found is None else (found.instead, found.try_first)
     return None

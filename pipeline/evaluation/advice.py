@@ -21,12 +21,12 @@ from envs.layout import GridLayout
 from mdp import TransitionModel, policy_return, state_visitation, value_iteration
 from mdp.array_types import Floats
 from pipeline.environments import make_single_env
+from pipeline.evaluation import FAILED, NEARLY_ALL
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.train_spec import TrainSpec
 
-# A score below this is a failure. One of planning above the other is a success.
-FAILED, SOLVED = 0.05, 0.5
+SOLVED = 0.5  # a score of planning from which on it may be recommended
 NEAR_OPTIMUM = 0.01  # of the optimum
 # The value of the start, as a share of that of standing still.
 NEAR_STANDING_STILL = 0.8
@@ -39,7 +39,6 @@ MATTERS = 0.05
 MOST_OUTCOMES = 500_000
 # Where an episode is caught: where it spends nearly all of its last steps.
 LAST_STEPS = 100
-NEARLY_ALL = 0.99
 MOST_STATES_NAMED = 3
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.overall_analysis import OverallAnalysis
 from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
-from report.conclusions import conclusion, places_without_a_run
+from report.conclusions import conclusion, on_changes, places_without_a_run
 from report.latex import LATEX
 from report.markdown import MARKDOWN
 from report.page.sections import Report, Section, estimate_data
@@ -105,9 +105,9 @@ def _ranking(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, An
             for column, _ in columns
         ],
         "rows": [
-            (row.agent.agent, [cells[place] for _, cells in columns])
-            for place, row in enumerate(rows)
+            (row.agent, [cells[place] for _, cells in columns]) for place, row in enumerate(rows)
         ],
+        "changes": on_changes([environment]),
     }
 
 
