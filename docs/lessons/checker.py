@@ -159,8 +159,10 @@ def check_target(target: Callable[..., float], kind: str) -> str:
     try:
         ended, blind = told(0.9, True, values), told(0.0, False, values)
         usual, higher = told(0.9, False, values), told(0.9, False, values + 1)
-    except TypeError as fault:
+    except (TypeError, ValueError, IndexError, NameError) as fault:
         return f"It cannot be called or gives no number: {fault}"
+    if not np.isfinite([ended, blind, usual, higher]).all():
+        return "It gives a number that is not finite."
     if abs(ended - reward) > TOLERANCE:
         return "When the episode has terminated nothing follows: the target is the reward alone."
     if abs(blind - reward) > TOLERANCE:
