@@ -103,7 +103,7 @@ def do_aside(function: Callable[..., Any], *args: Any) -> Any:
     Importing them here too would take more than a second and 200 MB. Without a server, and where
     the child fails, it is called here, so that what it raises is raised from here.
     """
-    if fork_server.server_pid() is not None:
+    if fork_server.server_pid() is not None and not _stopping.is_set():
         with contextlib.suppress(TaskFailedError, OSError, EOFError, RuntimeError):
             return supervise(function, *args, clean_up=_nothing)
     return function(*args)

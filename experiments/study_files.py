@@ -226,7 +226,9 @@ def _swept_entry(members: Sequence[AgentSpec]) -> dict[str, Any] | None:
         key: list({repr(m.swept[key]): m.swept[key] for m in members}.values())
         for key in first.swept
     }
-    if swept(agent, sweep) != [replace(member, group=agent.label) for member in members]:
+    found = swept(agent, sweep)
+    alone = [replace(a, label=a.label.removeprefix(f"{agent.label} with ")) for a in found]
+    if [replace(member, group=agent.label) for member in members] not in (found, alone):
         return None
     return {**_agent_entry(agent, kept), **({"sweep": sweep} if sweep else {})}
 

@@ -29,7 +29,7 @@ OUTPUT = {"--seed": 1, "--engine": 1, "--watch-learning": -1, "--resume-or-start
 SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--objective": 1}
 SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
 STUDY = {"--env": -1, "--algos": -1, "--seeds": 1, "--first-seed": 1}
-STUDY |= {"--episodes-table": 1, "--render-every": 1}
+STUDY |= {"--episodes-table": 1, "--render-every": 1, "--metric": 1}
 ROW = re.compile(r"^\| `(--env [^`]*)` \| ([^|]*) \| [^|]* \| ([^|]*) \| ([^|]*) \|$", re.MULTILINE)
 LINE = re.compile(r"^(python (?:train|compare)\.py [^#\n]*?)(?: +#[^\n]*)?$", re.MULTILINE)
 
@@ -53,10 +53,12 @@ class Command:
         """The trainings that it stands for, as arguments of ``train.py``; none for other commands.
 
         Commands that need the reader's modules or files of runs are carried out by the tests of
-        their pages, and study files by the tests of studies.
+        their pages, and study files by the tests of studies. ``train.py`` does not train on the
+        environment as it comes.
         """
         words = list(self.words)
         needs = {"--list", "--resume", "-i", "--gym-packages", "--conf-file", "--logged"}
+        needs |= {"--as-it-comes"}
         if needs & set(words) or "--env" not in words:
             return []
         rest = _without(words, {**OUTPUT, **SEARCH, **STUDY, "--algo": 1})
@@ -111,6 +113,8 @@ def commands_in(text: str) -> list[Command]:
             script = "train"
         else:
             rest = match[5]
+        if re.search(r"\{\w+\}", rest):  # a program's template, to be filled
+            continue
         words = tuple(shlex.split(rest.rstrip(".,;:)")))
         if words:
             found.append(Command(script, words))

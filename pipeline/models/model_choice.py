@@ -47,7 +47,6 @@ class ModelRequest:
 
     Attributes:
         path: a zip or a run folder, instead of looking for a run.
-        zipped_in: the pack that the folder was unpacked from.
         algo: name of the agent; None for what the zip or its run folder says, or else ``"ppo"``.
         env_id: id of the environment; None for what the run folder says, or else
             ``"CartPole-v1"``.
@@ -60,10 +59,10 @@ class ModelRequest:
         user_modules: modules of the user's, imported already; a run has no others imported.
         seed: of the episodes.
         device: torch device of the networks.
+        zipped_in: the pack that the folder was unpacked from.
     """
 
     path: Path | None = None
-    zipped_in: Path | None = None
     algo: str | None = None
     env_id: str | None = None
     log_folder: Path = Path("logs")
@@ -74,6 +73,7 @@ class ModelRequest:
     user_modules: tuple[UserModule, ...] = ()
     seed: int = 0
     device: str = "auto"
+    zipped_in: Path | None = None
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,8 @@ def section(report: Report) -> Section | None:
     for n_done, runs in enumerate(runs_to_film, start=1):
         groups.append([])
         without_room.append([])
-        report.tell(f"filming episodes on {runs[0].environment}")
+        for run in runs[:1]:
+            report.tell(f"filming episodes on {run.environment}")
         for run, path in zip(runs, do_aside(films_of, runs), strict=True):
             if path is None:
                 continue

@@ -71,6 +71,7 @@ def train(folder, algo, log, run, **kwargs):
 @pytest.fixture
 def type_command(folder, monkeypatch, capsys):
     monkeypatch.chdir(folder)
+    monkeypatch.setenv("COLUMNS", "120")  # room for the paths of runs
 
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["compare.py", *words])

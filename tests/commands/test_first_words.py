@@ -106,8 +106,7 @@ def test_training_and_playing_begin_with_what_they_are_about(announced, tmp_path
 def test_a_study_begins_with_its_title_and_goes_on_unread(announced, left_by_its_reader, tmp_path):
     words = [*LAKE, "--algos", "qlearning", "--seeds", "1", "-n", "500", "--name", "s"]
     title = "qlearning on FrozenLake-v1\n"
-    assert said_before_libraries(tmp_path, "compare", *words) == title
-    assert list(tmp_path.iterdir()) == []
+    assert said_before_libraries(tmp_path, "compare", *words).startswith(title)
     found = left_by_its_reader(tmp_path, "compare.py", *words, "--no-report")
     assert found == (title, "", 0)
     summary = tmp_path / "logs" / "studies" / "s" / "summary.csv"
@@ -118,6 +117,7 @@ def test_a_study_begins_with_its_title_and_goes_on_unread(announced, left_by_its
         "loading the libraries",
         "reading the results",
         "judging the agents",
+        "looking at runs that failed",
         "writing the tables",
         "working out the curves",
         "drawing the figures",

@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import gymnasium as gym
@@ -113,6 +114,10 @@ def test_a_study_says_it_once_for_each_environment(capsys):
             agent=agent,
             environment=environment,
             seed=seed,
+            path=Path(agent, f"{environment}_{seed}"),
+            spec=SimpleNamespace(
+                algo=agent, hyperparams=SimpleNamespace(n_timesteps=500, n_episodes=None)
+            ),
             run=SimpleNamespace(read_info=lambda info=info: info),
         )
         for agent in ("sarsa", "qlearning")

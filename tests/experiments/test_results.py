@@ -586,7 +586,7 @@ def test_figures_as_png_and_svg_whose_text_is_text(tmp_path):
     for path in paths:
         if path.suffix == ".png":
             with Image.open(path) as picture:
-                assert min(picture.size) > 500
+                assert picture.size[0] == 1950  # 6.5 inches of 300 dots
             continue
         texts = re.findall(r"<text [^>]*>([^<]*)</text>", path.read_text())
         assert "qlearning" in " ".join(texts)

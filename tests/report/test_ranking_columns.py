@@ -38,14 +38,14 @@ def test_headings_in_their_order(ranking, made_up):
         ("Success", "in the end", "descending"),
         ("Stays from", "step, at 96", "ascending"),
         ("Episodes", "to stay at 96", "ascending"),
-        ("Training", "seconds", "ascending"),
+        ("CPU time", "seconds of training", "ascending"),
         ("Runs", "finished", "descending"),
     ]
 
 
 def test_figures_of_each_agent_the_best_first(ranking, made_up):
     _, rows = ranking([made_up.agent("first", 90.0), made_up.agent("second", 40.0, n_missing=1)])
-    assert [label for label, _ in rows] == ["first", "second"]
+    assert [row.agent for row, _ in rows] == ["first", "second"]
     assert [[(cell.text, cell.note) for cell in cells] for _, cells in rows] == [
         [
             ("90", "89.9 to 90.2"),
@@ -107,7 +107,7 @@ def test_what_applies_to_no_agent_has_no_column(ranking, made_up):
     )
     headings, _ = ranking([agent], optimum=None, baseline=None, threshold=None)
     titles = [heading["title"] for heading in headings]
-    assert titles == ["Mean", "IQM", "Median", "Training", "Runs"]
+    assert titles == ["Mean", "IQM", "Median", "CPU time", "Runs"]
 
 
 def test_an_agent_without_a_figure_comes_last_and_has_a_dash(ranking, made_up):
@@ -124,7 +124,7 @@ def test_an_agent_without_a_figure_comes_last_and_has_a_dash(ranking, made_up):
     )
     headings, (_, (_, cells)) = ranking([made_up.agent("with", 2.0), without])
     found = {h["title"]: cell for h, cell in zip(headings, cells, strict=True)}
-    for title in ("Mean", "Score", "Gap", "Success", "Stays from", "Training"):
+    for title in ("Mean", "Score", "Gap", "Success", "Stays from", "CPU time"):
         assert (found[title].text, found[title].value, found[title].note) == ("-", None, ""), title
     assert found["Stays from"].aside == ""
 
