@@ -313,8 +313,9 @@ def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], 
     outlooks = {key: each for key, each in found.items() if each is not None}
     pace = machine_pace() if outlooks else 1.0
     expected = {
-        key: expected_seconds(missing[key][0].spec, pace * seconds_of(each.plan, each))
+        key: seconds
         for key, each in outlooks.items()
+        if (seconds := expected_seconds(missing[key][0].spec, pace * seconds_of(each.plan, each)))
     }
     lines = [(key[0], each, len(missing[key])) for key, each in outlooks.items()]
     return study_line(lines), expected

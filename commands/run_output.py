@@ -196,9 +196,9 @@ def _print_advice(console: Console, training: Training, final: Evaluation, n_ste
     if found is None:
         return
     console.print(f"instead  {found.instead}", highlight=False, soft_wrap=True)
-    if found.try_first is not None:
-        line = f"try      {found.try_first}; more: docs/not-learning.md"
-        console.print(line, highlight=False, soft_wrap=True)
+    more = "docs/not-learning.md"
+    tried = f"try      {found.try_first}; more: {more}" if found.try_first else f"more     {more}"
+    console.print(tried, highlight=False, soft_wrap=True)
 
 
 def _describe_evaluations(outcome: Outcome) -> str:

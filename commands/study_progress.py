@@ -92,7 +92,7 @@ class StudyProgress(LiveProgress):
         text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
         if 0 < self.n_ended < self.n_missing:
             left = self.left.seconds(time.monotonic(), self.n_workers)
-            text += f", about {duration(left)} left by the clock"
+            text += "" if left is None else f", about {duration(left)} left by the clock"
         text += self.place_words
         n_failed = self.failed.total()
         return f"{text}, {n_failed} failed" if n_failed else text

@@ -151,13 +151,13 @@ def _read_rows(desc: object) -> tuple[tuple[str, ...], str]:
 
 def _read_file(path: Path) -> str:
     try:
-        return read_file(path, MAX_MAP_BYTES).decode("utf-8")
+        return read_file(path, MAX_MAP_BYTES).decode("utf-8-sig")
     except OSError as error:
         reason = str(error.strerror)
     except UnsafeFileError as error:
         raise ValueError(f"desc: {error}") from error
     except UnicodeDecodeError:
-        reason = "it is not a text file"
+        reason = "it is not a text file in UTF-8"
     raise ValueError(f"desc: cannot read the map file {path}: {reason}")
 
 

@@ -13,6 +13,9 @@ from experiments.study_results import StudyResults
 from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL
 
+# Agents of an environment that advice is given on, each of which is loaded and asked.
+MOST_TOLD = 4
+
 
 def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
     """The analysis with sentences on runs that failed, where something can be said of them."""
@@ -31,6 +34,7 @@ def _sentences(results: StudyResults, environment: str) -> Iterator[str]:
     runs = {
         (run.agent, run.seed): run for run in results.finished if run.environment == environment
     }
+    n_told, more = 0, []
     for agent, rows in table.groupby("agent", sort=False):
         has_failed = rows["score"].astype(float) < FAILED
         # Such a policy may never end an episode; the advice looks whether it does.
@@ -38,6 +42,10 @@ def _sentences(results: StudyResults, environment: str) -> Iterator[str]:
         failed = rows[has_failed & rows["exact"].astype(bool)]
         if failed.empty:
             continue
+        if n_told == MOST_TOLD:
+            more.append(f"{agent} ({len(failed)} of {len(rows)})")
+            continue
+        n_told += 1
         seed = int(failed["seed"].min())
         found = do_aside(advice_on, runs[str(agent), seed])
         if found is not None:
@@ -46,6 +54,8 @@ def _sentences(results: StudyResults, environment: str) -> Iterator[str]:
             instead, try_first = found
             then = f"; try first: {try_first}" if try_first else ""
             yield f"{agent} failed in {of}{first}: {instead}{then}."
+    if more:
+        yield f"Runs of {len(more)} more agents failed: {', '.join(more)}."
 
 
 def advice_on(planned: PlannedRun) -> tuple[str, str | None] | None:

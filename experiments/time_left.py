@@ -29,15 +29,21 @@ LONGER = 1.2
 BUSY = 4.0
 
 
-def expected_seconds(spec: TrainSpec, processor_seconds: float | None = None) -> float:
-    """What a run is expected to take; of networks the processor time may be known."""
+def expected_seconds(spec: TrainSpec, processor_seconds: float | None = None) -> float | None:
+    """What a run is expected to take; of networks the processor time may be known.
+
+    None for an agent of the user's, which may be compiled or not.
+    """
     if processor_seconds:
         return EACH_RUN + processor_seconds
     from agents import ALGORITHMS
 
+    entry = ALGORITHMS.get(spec.algo)
+    if entry is None or not (entry.package or entry.entry_point.startswith("agents.")):
+        return None
     budget = spec.hyperparams
     steps = budget.n_timesteps or STEPS_OF_EPISODE * (budget.n_episodes or 1)
-    is_fast = spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].family in {*FAMILIES, "bandits"}
+    is_fast = entry.family in {*FAMILIES, "bandits"}
     return EACH_RUN + steps * (EACH_STEP if is_fast else EACH_SLOW_STEP)
 
 
@@ -85,9 +91,12 @@ class TimeLeft:
         self._taken[key] = self._taken.get(key, 0.0) + now - self._began.pop(run.path)[1]
         self._n_taken[key] += 1
 
-    def seconds(self, now: float, n_workers: int) -> float:
-        """How long all runs together may still take."""
+    def seconds(self, now: float, n_workers: int) -> float | None:
+        """How long all runs together may still take; None while that cannot be said."""
         each = self._estimates(now)
+        missing = [*(key for key, _ in self._under_way()), *+self._n_waiting]
+        if not each.keys() >= set(missing):
+            return None
         under_way = [
             max(each[key] - (now - began), (LONGER - 1) * (now - began))
             for key, began in self._under_way()
@@ -112,21 +121,24 @@ class TimeLeft:
             ]
             if not like:  # on a busy machine everything takes longer
                 like = [min(max(ratio, 1.0), BUSY) for _, ratio in off]
-            found[key] = expected * (sum(like) / len(like) if like else 1.0)
+            if expected is not None:
+                found[key] = expected * (sum(like) / len(like) if like else 1.0)
         for key, began in self._under_way():
-            if not self._n_taken[key]:
+            if not self._n_taken[key] and key in found:
                 found[key] = max(found[key], LONGER * (now - began))
         return found
 
     def _by_how_much_off(self, now: float) -> list[tuple[str, float]]:
         """Agents, and what their runs took by what they were expected to take."""
         off = [
-            (self._algos[key], self._taken[key] / n / self._expected[key])
+            (self._algos[key], self._taken[key] / n / expected)
             for key, n in self._n_taken.items()
+            if (expected := self._expected[key]) is not None
         ]
         known = {algo for algo, _ in off}
         late = [
-            (self._algos[key], LONGER * (now - began) / self._expected[key])
+            (self._algos[key], LONGER * (now - began) / expected)
             for key, began in self._under_way()
+            if (expected := self._expected[key]) is not None
         ]
         return off + [(algo, ratio) for algo, ratio in late if ratio > 1 and algo not in known]

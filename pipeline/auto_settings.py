@@ -231,6 +231,8 @@ def resolved_spec(
     spec = TrainSpec(hyperparams=split(rest, where), saved_hyperparams=rest, **fields)
     found = _wrappers(raw, spec, where)
     if len(rest) < len(raw):
+        known = {**rest, **{key: one.value for key, one in found.items()}}
+        spec = replace(spec, hyperparams=split(known, where))
         check_fit(spec)
         found |= _answers(raw, spec, where)
     if not found:

@@ -180,12 +180,16 @@ class ProgressDisplay(BlockCallback):
     def _seconds_left(self) -> float | None:
         """By the clock, at the speed of the last half of what is done; None where nobody knows.
 
-        Off-policy agents are faster before they begin to learn, and compiling comes first.
+        Off-policy agents are faster before they begin to learn. What comes before the first steps
+        are done, such as compiling, does not count.
         """
         now, share = time.monotonic(), self.share_done
         if share >= self.marks[-1][1] + 0.001:
             self.marks.append((now, share))
-        half = (self.marks[0][1] + share) / 2
-        began, before = next(mark for mark in reversed(self.marks) if mark[1] <= half)
-        left = (now - began) * (1 - share) / max(share - before, 1e-9)
-        return left if before < share < 1 and share >= 0.01 and left >= 1 else None
+        marks = self.marks[1:]
+        if not marks or share < marks[0][1] + 0.02:
+            return None
+        half = (marks[0][1] + share) / 2
+        began, before = next(mark for mark in reversed(marks) if mark[1] <= half)
+        left = (now - began) * (1 - share) / (share - before)
+        return left if share < 1 and left >= 1 else None

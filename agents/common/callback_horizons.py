@@ -158,8 +158,9 @@ def members(callback: BaseCallback) -> list[BaseCallback]:
 
 
 def unknown_callbacks(callback: BaseCallback) -> list[str]:
-    """Names of the callbacks that must be asked after each step."""
-    return [type(member).__name__ for member in members(callback) if not _is_known(member)]
+    """Names of the callbacks that must be asked after each step, each once."""
+    names = (type(member).__name__ for member in members(callback) if not _is_known(member))
+    return list(dict.fromkeys(names))
 
 
 def _is_known(callback: BaseCallback) -> bool:

@@ -8,6 +8,7 @@ it can help.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,10 +21,13 @@ from envs.known_models import observations_of_states, transition_model
 from envs.layout import GridLayout
 from mdp import TransitionModel, policy_return, state_visitation, value_iteration
 from mdp.array_types import Floats
+from pipeline.auto_settings import resolved_spec
 from pipeline.environments import make_single_env
+from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation
+from pipeline.settings.hyperparam_entries import read_hyperparams
 from pipeline.train_spec import TrainSpec
 
 SOLVED = 0.5  # a score of planning from which on it may be recommended
@@ -147,16 +151,29 @@ def _try_first(
     needs_steps = n_steps < few * n_pairs and not isinstance(agent, PlanningAgent)
     if not (raises_gamma or needs_steps) or reached < SOLVED:
         return None
-    changes = []
+    flags, now = [], []
+    if needs_steps:
+        enough = _round_up(max(MANY_STEPS * n_pairs, 4 * n_steps))
+        flags.append(f"-n {max(enough, _shipped_steps(spec))}")
+        instead = ", instead of --n-episodes" if spec.hyperparams.n_episodes else ""
+        now.append(f"{n_steps / n_pairs:.3g} for each state and action{instead}")
     if raises_gamma:
         even = (
             f", where even exact planning scores {score:.2f}" if score < reached - MATTERS else ""
         )
-        changes.append(f"-params gamma:{nearer:.6g} (now {gamma:.6g}{even})")
-    if needs_steps:
-        enough = _round_up(max(MANY_STEPS * n_pairs, 4 * n_steps))
-        changes.append(f"-n {enough} (now {n_steps / n_pairs:.0f} steps for each state and action)")
-    return " and ".join(changes)
+        flags.append(f"-params gamma:{nearer:.6g}")
+        now.append(f"gamma {gamma:.6g}{even}")
+    return f"{' '.join(flags)} (now {'; '.join(now)})"
+
+
+def _shipped_steps(spec: TrainSpec) -> int:
+    """The steps that the shipped settings have for the environment; 0 where they have none."""
+    with suppress(UserError):
+        steps = read_hyperparams(spec.algo, spec.env_id).get("n_timesteps")
+        asked = {"n_timesteps": steps, "env_kwargs": dict(spec.hyperparams.env_kwargs)}
+        shipped = resolved_spec(asked, algo=spec.algo, env_id=spec.env_id, seed=0)
+        return shipped.hyperparams.n_timesteps or 0
+    return 0
 
 
 def _round_up(number: int) -> int:

@@ -17,6 +17,7 @@ from report.page.sections import Report, Section, first_runs
 from report.wording import number
 from safe_files.regular_files import NO_LIMIT, read_file
 
+MOST_FILMED = 8  # agents of an environment, the best of them
 ALL_BYTES = 1_000_000  # of the films of a page, a third more as text
 
 
@@ -45,13 +46,16 @@ def section(report: Report) -> Section | None:
     groups: list[list[Film]] = []
     contents: dict[bytes, int] = {}  # and their places on the page
     without_room: list[list[str]] = []
+    not_filmed: list[list[str]] = []
     runs_to_film = first_runs(report.analysis)
     for n_done, runs in enumerate(runs_to_film, start=1):
         groups.append([])
         without_room.append([])
         for run in runs[:1]:
             report.tell(f"filming episodes on {run.environment}")
-        for run, path in zip(runs, do_aside(films_of, runs), strict=True):
+        filmed, others = runs[:MOST_FILMED], runs[MOST_FILMED:]
+        not_filmed.append([run.agent for run in others])
+        for run, path in zip(filmed, do_aside(films_of, filmed), strict=True):
             if path is None:
                 continue
             content = read_file(path, NO_LIMIT)
@@ -65,7 +69,7 @@ def section(report: Report) -> Section | None:
     if not any(groups):
         return None
     data = [data_uri("image/gif", content) for content in contents]
-    context = {"films": groups, "without_room": without_room}
+    context = {"films": groups, "without_room": without_room, "not_filmed": not_filmed}
     return Section("films", "Episodes", context, data, by_environment=True)
 
 

@@ -277,7 +277,7 @@ def test_an_agent_that_learns_nothing_gets_advice_once(type_command, folder):
     ((_, _, advice),) = told
     assert re.fullmatch(
         r"100% of its episodes run out of time: it .* row \d+, column \d+; try first: -n \d+ "
-        r"\(now 2 steps for each state and action\)\.",
+        r"\(now [\d.]+ for each state and action\)\.",
         advice,
     )
     for name in ("report.html", "verdicts.md"):

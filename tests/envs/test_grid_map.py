@@ -90,10 +90,17 @@ def test_a_broken_map_in_a_file_is_refused_with_its_name(tmp_path: Path) -> None
     with pytest.raises(ValueError, match=r"map\.txt: unknown letter '\?' at row 2, column 1"):
         WarehouseEnv(desc=path)
     path.write_bytes(b"S.\xff\xfe.G")
-    with pytest.raises(ValueError, match=r"map\.txt: it is not a text file"):
+    with pytest.raises(ValueError, match=r"map\.txt: it is not a text file in UTF-8"):
         WarehouseEnv(desc=path)
     with pytest.raises(ValueError, match="is no regular file"):
         WarehouseEnv(desc=tmp_path)
+
+
+def test_windows_marks_files_as_utf8_by_their_first_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "map.txt"
+    path.write_bytes(b"\xef\xbb\xbfS.\r\n.G\r\n")
+    rows = [WarehouseEnv(desc=desc).desc.tolist() for desc in (path, ["S.", ".G"])]
+    assert rows[0] == rows[1]
 
 
 def test_the_maze_names_its_own_letters() -> None:

@@ -1,11 +1,14 @@
 """How long a study may still take, held against simulated times."""
 
 import heapq
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from agents import ALGORITHMS
+from agents.algorithm_entries import AlgorithmEntry
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from experiments.time_left import TimeLeft, expected_seconds
@@ -102,3 +105,16 @@ def test_expectations_go_by_agent_and_budget():
     table, network = runs_of(1)[0].spec, runs_of(1)[2].spec
     assert (table.algo, network.algo) == ("qlearning", "dqn")
     assert expected_seconds(table) < expected_seconds(network) < expected_seconds(network, 60.0)
+
+
+def test_nothing_is_said_while_an_agent_of_the_users_has_not_ended_a_run(monkeypatch):
+    """Nobody knows whether it is compiled."""
+    monkeypatch.setitem(ALGORITHMS, "own", AlgorithmEntry("own:Own", "own"))
+    runs = [replace(run, spec=replace(run.spec, algo="own")) for run in runs_of(3)[:12]]
+    left = TimeLeft(runs, {})
+    left.start(0.0, 1)
+    assert left.seconds(1.0, 1) is None
+    for n, run in enumerate(runs[: len(ENVIRONMENTS) * len(TAKES)], start=1):
+        left.end(run, 2.0 * n)
+        left.start(2.0 * n, 1)
+    assert left.seconds(24.0, 1) == pytest.approx(0.0)

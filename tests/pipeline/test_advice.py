@@ -74,17 +74,14 @@ def test_what_it_does_instead(env_id, env_kwargs, table, instead):
 @pytest.mark.parametrize(
     ("start_value", "n_steps", "try_first"),
     [
-        (-81.0, 400 * PAIRS, "-params gamma:0.9995 (now 0.99)"),
+        (-81.0, 400 * PAIRS, "-params gamma:0.9995 (now gamma 0.99)"),
         (-79.0, 130 * PAIRS, None),
         (
             -81.0,
             400 * PAIRS - 1,
-            (
-                "-params gamma:0.9995 (now 0.99) and "
-                "-n 400000 (now 400 steps for each state and action)"
-            ),
+            ("-n 1000000 -params gamma:0.9995 (now 400 for each state and action; gamma 0.99)"),
         ),
-        (-79.0, PAIRS, "-n 250000 (now 1 steps for each state and action)"),
+        (-79.0, PAIRS, "-n 1000000 (now 1 for each state and action)"),
     ],
 )
 def test_by_two_signals(start_value, n_steps, try_first):
@@ -96,7 +93,7 @@ def test_by_two_signals(start_value, n_steps, try_first):
 def test_a_discount_that_hides_the_goal_from_planning_too():
     found = judged("Warehouse-v0", None, env_kwargs={"slip": 0.2}, gamma=0.99)
     assert found.try_first == (
-        "-params gamma:0.9995 (now 0.99, where even exact planning scores 0.00)"
+        "-params gamma:0.9995 (now gamma 0.99, where even exact planning scores 0.00)"
     )
 
 

@@ -87,8 +87,8 @@ def test_a_second_training_counts_its_own_steps_alone(clock):
     agent.learn(1000, callback=ProgressDisplay(console, live=False), reset_num_timesteps=False)
     *lines, last = console.file.getvalue().splitlines()
     assert "2,000 steps" in last
-    left = {line[:3]: re.search(r"about (\d+) s left", line)[1] for line in lines}
-    assert int(left[" 60"]) == pytest.approx(8, abs=1)
+    left = {line[:3]: re.search(r"about (\d+) s left", line) for line in lines}
+    assert int(left[" 60"][1]) == pytest.approx(8, abs=1)
 
 
 def test_in_a_terminal_a_bar(clock):
@@ -148,10 +148,9 @@ def test_a_line_comes_early_and_then_every_ten_seconds_also_while_no_step_ends(c
     lines = slow_training(clock, at=30, activity="evaluating").splitlines()
     # Two seconds after the beginning, and then ten after each line.
     assert re.fullmatch(
-        r"  \d%  2\d steps  mean return in training 0.00"
-        r"  about \d+ s left by the clock  evaluating, 2 s",
-        lines[0],
+        r"  \d%  2\d steps  mean return in training 0.00  evaluating, 2 s", lines[0]
     )
+    assert "left by the clock" in lines[3]
     assert [re.search(r"evaluating, (\d+) s", line)[1] for line in lines[:3]] == ["2", "12", "22"]
     # Thereafter nothing of it is left.
     assert not any("evaluating" in line for line in lines[3:])
