@@ -252,7 +252,8 @@ def draw_grid(
     axes.set_yticks(range(len(down)), down)
     axes.tick_params(length=0)
     y, x = grid.parameters
-    title += f": {METRIC_WORDS[metric]}; the best in {'a frame' if len(best) == 1 else 'frames'}"
+    frames = "a frame" if len(best) == 1 else "frames"
+    title += f": {METRIC_WORDS[metric]}, means over seeds; the best in {frames}"
     lettering(axes, title=title, x=x, y=y, beside=1.8)
 
 
