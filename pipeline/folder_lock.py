@@ -29,11 +29,13 @@ from pipeline.folder_clock import (
     seconds_silent,
 )
 from pipeline.signs_of_life import Heartbeat
+from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import NEW, open_number, read_file
 
 SECONDS_OF_SILENCE = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2
 _LARGEST = 10_000  # bytes
+_GONE: dict[str, Any] = {}  # told from others by being this one
 
 
 class FolderInUseError(UserError):
@@ -150,6 +152,10 @@ def _appears(path: Path, content: str) -> bool:
         os.link(draft, path)
     except FileExistsError:
         return False
+    except FileNotFoundError:
+        if path.parent.is_dir():
+            return False  # who has the lock has cleared the draft away
+        raise
     except OSError:  # a file system without links: the lock is empty for an instant
         try:
             with path.open("x", encoding="utf-8") as file:
@@ -170,11 +176,14 @@ def _unlink(path: Path) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What a lock says; nothing where it is gone, or says nothing."""
-    with contextlib.suppress(OSError, ValueError, RecursionError):
+    """What a lock says; nothing where it says nothing, and that it is gone where it is."""
+    try:
         owner = json.loads(read_file(path, _LARGEST))
-        return owner if isinstance(owner, dict) else {}
-    return {}
+    except FileNotFoundError:
+        return _GONE
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return owner if isinstance(owner, dict) else {}
 
 
 def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object]) -> bool:
@@ -208,13 +217,15 @@ def _remove_dead(path: Path, owner: dict[str, Any]) -> None:
         grave.mkdir()
     except FileExistsError:
         # Another is at it, or was killed while it was.
-        with contextlib.suppress(OSError):
+        with contextlib.suppress(OSError, UnsafeFileError):  # it may come and go meanwhile
             if seconds_silent(grave) > SECONDS_BETWEEN_SIGNS:
                 grave.rmdir()
         time.sleep(_SECONDS_BETWEEN_LOOKS)
         return
     try:
-        if _read(path).get("token") == owner.get("token"):
+        now = _read(path)
+        # In the place of one that is gone the next may come before it is unlinked.
+        if now is not _GONE and now.get("token") == owner.get("token"):
             path.unlink(missing_ok=True)
     finally:
         with contextlib.suppress(OSError):
