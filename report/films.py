@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from experiments.study_results import StudyResults
     from pipeline.models.model_choice import ChosenModel
 
+FILM = "episode.gif"
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
 TRAINING_STEPS = 500  # fifty seconds
 COLOURS = 128
@@ -47,8 +48,8 @@ def film_of(planned: PlannedRun) -> Path | None:
         A GIF, which has how the episode went beside it in a JSON file; None where the environment
         cannot be drawn.
     """
-    path = planned.path / "episode.gif"
-    if not is_kept(path):
+    path = planned.path / FILM
+    if not has_film(planned):
         from pipeline.filming import as_gif
 
         try:
@@ -65,8 +66,9 @@ def film_of(planned: PlannedRun) -> Path | None:
     return path
 
 
-def is_kept(path: Path) -> bool:
-    """Whether a film and how it went lie there, as this module leaves them."""
+def has_film(planned: PlannedRun) -> bool:
+    """Whether the film of a run and how it went lie in its folder, as this module leaves them."""
+    path = planned.path / FILM
     try:
         episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
         # Films are no part of the run, so that it has no digest of them.

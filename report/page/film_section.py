@@ -11,7 +11,7 @@ from typing import Any
 from PIL import Image
 
 from experiments.child_processes import do_aside
-from report.films import MAX_BYTES, films_of
+from report.films import MAX_BYTES, films_of, has_film
 from report.page.markup import data_uri
 from report.page.sections import Report, Section, first_runs
 from report.wording import number
@@ -47,20 +47,22 @@ def section(report: Report) -> Section | None:
     contents: dict[bytes, int] = {}  # and their places on the page
     without_room: list[list[str]] = []
     not_filmed: list[list[str]] = []
-    runs_to_film = first_runs(report.analysis)
-    for n_done, runs in enumerate(runs_to_film, start=1):
+    ranked = first_runs(report.analysis)
+    to_film = [run for runs in ranked for run in runs[:MOST_FILMED]]
+    report.tell("filming episodes")
+    made = films_of(to_film) if all(map(has_film, to_film)) else do_aside(films_of, to_film)
+    paths = dict(zip((run.path for run in to_film), made, strict=True))
+    for n_done, runs in enumerate(ranked, start=1):
         groups.append([])
         without_room.append([])
-        for run in runs[:1]:
-            report.tell(f"filming episodes on {run.environment}")
-        filmed, others = runs[:MOST_FILMED], runs[MOST_FILMED:]
-        not_filmed.append([run.agent for run in others])
-        for run, path in zip(filmed, do_aside(films_of, filmed), strict=True):
+        not_filmed.append([run.agent for run in runs[MOST_FILMED:]])
+        for run in runs[:MOST_FILMED]:
+            path = paths[run.path]
             if path is None:
                 continue
             content = read_file(path, NO_LIMIT)
             # What an environment does not take is left to the next ones.
-            room = ALL_BYTES * n_done // len(runs_to_film) - sum(map(len, contents))
+            room = ALL_BYTES * n_done // len(ranked) - sum(map(len, contents))
             if content in contents or len(content) <= room:
                 place = contents.setdefault(content, len(contents))
                 groups[-1].append(_film(run.agent, path, content, place))

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 import pytest
+from selenium import webdriver
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.run_curves import CURVE_COLUMNS
 from experiments.study_results import RUN_COLUMNS, StudyResults
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from report import films
+from tests.report.browsing import BROWSER, DRIVER, FLAGS
 from verdicts import Estimate, PairComparison, Summary, ThresholdSummary
 
 
@@ -272,3 +274,17 @@ def tuning_record():
 def tuning_trial():
     """Makes up a trial."""
     return made_up_trial
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    assert BROWSER is not None, "the report has to be tested in Chromium: install it"
+    assert DRIVER is not None, "the report has to be tested in Chromium: install its chromedriver"
+    options = webdriver.ChromeOptions()
+    options.binary_location = BROWSER
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
+    yield driver
+    driver.quit()
