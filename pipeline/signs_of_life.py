@@ -198,8 +198,8 @@ class Activity:
             yield
 
     def _on_compiling(self) -> None:
-        if self._bar is None:
-            self.say(COMPILING)
+        if self._bar is None:  # a line that stays says what it was for
+            self.say(f"{self._text}: {COMPILING}")
         else:
             self.at(COMPILING)
 

@@ -177,7 +177,7 @@ def shared_legend(*places: Axes, band: str = "") -> None:
 def make_room(axes: Axes, names: Sequence[str]) -> None:
     """Make a figure of one panel as high as the names beside its axes need."""
     lines = max(name.count("\n") + 1 for name in names)
-    _figure_of(axes).set_figheight(1.0 + len(names) * max(0.32, _LINE * lines + 0.04))
+    _figure_of(axes).set_figheight(1.1 + len(names) * max(0.32, _LINE * lines + 0.04))
 
 
 def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:

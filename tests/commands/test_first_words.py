@@ -106,7 +106,8 @@ def test_training_and_playing_begin_with_what_they_are_about(announced, tmp_path
 def test_a_study_begins_with_its_title_and_goes_on_unread(announced, left_by_its_reader, tmp_path):
     words = [*LAKE, "--algos", "qlearning", "--seeds", "1", "-n", "500", "--name", "s"]
     title = "qlearning on FrozenLake-v1\n"
-    assert said_before_libraries(tmp_path, "compare", *words).startswith(title)
+    begun = "1 runs, 0 of them there already; 2 at once, in logs/studies/s\n"
+    assert said_before_libraries(tmp_path, "compare", *words, "-j", 2) == title + begun
     found = left_by_its_reader(tmp_path, "compare.py", *words, "--no-report")
     assert found == (title, "", 0)
     summary = tmp_path / "logs" / "studies" / "s" / "summary.csv"

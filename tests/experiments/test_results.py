@@ -587,6 +587,7 @@ def test_figures_as_png_and_svg_whose_text_is_text(tmp_path):
         if path.suffix == ".png":
             with Image.open(path) as picture:
                 assert picture.size[0] == 1950  # 6.5 inches of 300 dots
+                assert min(picture.size) > 500
             continue
         texts = re.findall(r"<text [^>]*>([^<]*)</text>", path.read_text())
         assert "qlearning" in " ".join(texts)

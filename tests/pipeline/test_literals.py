@@ -198,7 +198,9 @@ def test_values_on_the_command_line(assignment: str, value: Any) -> None:
 
 @pytest.mark.parametrize("assignment", ["gamma", "gamma=0.9", "gamma:", "gamma: ", ":0.9", "a-b:1"])
 def test_an_assignment_of_another_form_is_refused(assignment: str) -> None:
-    with pytest.raises(UserError, match=r"^-params: .* does not have the form key:value"):
+    with pytest.raises(
+        UserError, match=r"^-params: .* does not have the form key:value(: did you mean \S+\?)?$"
+    ):
         parse_assignments(["size:8", assignment], "-params")
 
 

@@ -107,7 +107,7 @@ def test_compiling_is_said_at_once_and_once(clock):
         clock.now += 9
         activity.look()
     compile_something()
-    assert file.getvalue() == f"{COMPILING}\n"
+    assert file.getvalue() == f"loading: {COMPILING}\n"
 
 
 def test_a_quiet_console_gets_no_line_and_no_thread(clock, hearts):
