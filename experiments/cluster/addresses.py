@@ -33,15 +33,10 @@ class LocalWorkers:
 
 @dataclass(frozen=True)
 class SchedulerAddress:
-    """A scheduler that is there, by its address or by the file that has it.
+    """A scheduler that is there, by its address or by the file that has it."""
 
-    Attributes:
-        text: the address; empty where it stands in the file.
-        file: the file; None where there is none.
-    """
-
-    text: str
-    file: Path | None = None
+    text: str  # the address; empty where it stands in the file
+    file: Path | None = None  # the file; None where there is none
 
     def read(self) -> str:
         """The address, as it is now: with ``tcp://`` or ``tls://``.
@@ -55,19 +50,12 @@ class SchedulerAddress:
 
 @dataclass(frozen=True)
 class JobQueue:
-    """Workers that a queueing system starts as jobs.
+    """Workers that a queueing system starts as jobs."""
 
-    Attributes:
-        system: its name in dask-jobqueue.
-        settings: what dask-jobqueue is told of it.
-        n_cores: of each job, as many runs at once.
-        file: where that stands.
-    """
-
-    system: str
-    settings: dict[str, Any]
-    n_cores: int
-    file: Path
+    system: str  # its name in dask-jobqueue
+    settings: dict[str, Any]  # what dask-jobqueue is told of it
+    n_cores: int  # of each job, as many runs at once
+    file: Path  # where that stands
 
 
 Cluster = LocalWorkers | SchedulerAddress | JobQueue

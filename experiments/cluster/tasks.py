@@ -10,7 +10,7 @@ def do_order(order: bytes) -> bytes:
     """Do a run on the worker that calls this.
 
     Args:
-        order: see `experiments.cluster.orders`.
+        order: see `experiments.cluster.working`.
 
     Returns:
         See `experiments.cluster.answers`.

@@ -11,16 +11,15 @@ from rich.console import Console
 
 from agents.bandits.batch import run_batch
 from experiments.analysis import analyse
-from experiments.bandit_results import (
+from experiments.bandits import (
     STATISTICS_FILE,
+    PullStatistics,
     read_run,
     run_regret,
     stacked_statistics,
 )
-from experiments.pull_statistics import PullStatistics
-from experiments.study_files import read_study
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
 from pipeline.run_files import PULLS_FILE
 from pipeline.run_folder import Run
 from pipeline.training import train
@@ -153,7 +152,7 @@ def test_what_has_no_compiled_copy_goes_one_by_one(tmp_path, monkeypatch, do_stu
         raise NotCompilable("of a reason")
 
     expected = do_study(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "one")
-    monkeypatch.setattr("experiments.bandit_batches.run_batch", refuse)
+    monkeypatch.setattr("agents.bandits.batch.run_batch", refuse)
     found = do_study(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "two")
     assert found.summary["engine"].unique().tolist() == ["one by one: of a reason"]
     assert found.summary["regret"].tolist() == expected.summary["regret"].tolist()

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.study_files import read_study
+from experiments.study import read_study
 from report.series.regret_bounds import (
     auer_bound,
     best_of_normals,

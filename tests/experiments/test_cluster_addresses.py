@@ -15,8 +15,7 @@ from experiments.cluster.addresses import (
     is_loopback,
     read_cluster,
 )
-from experiments.cluster.clusters import checked_cluster
-from experiments.cluster.job_queues import QUEUES, _retiring
+from experiments.cluster.schedulers import QUEUES, _retiring, checked_cluster
 from pipeline.errors import UserError
 
 SYSTEMS = tuple(QUEUES)

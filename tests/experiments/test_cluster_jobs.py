@@ -5,8 +5,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from experiments.cluster import job_queues
-from experiments.cluster.job_queues import SECONDS_TO_RESTART, Jobs
+from experiments.cluster import schedulers
+from experiments.cluster.schedulers import SECONDS_TO_RESTART, Jobs
 
 
 class Queue:
@@ -43,7 +43,7 @@ class Queue:
 @pytest.fixture
 def clock(monkeypatch):
     fake = SimpleNamespace(now=100.0)
-    monkeypatch.setattr(job_queues, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    monkeypatch.setattr(schedulers, "time", SimpleNamespace(monotonic=lambda: fake.now))
     return fake
 
 

@@ -14,18 +14,17 @@ import pytest
 from distributed import Client, LocalCluster
 
 import compare
+from experiments.cluster import answers, schedulers
 from experiments.cluster import cluster_launcher as launching_there
-from experiments.cluster import connections, endings
 from experiments.cluster.addresses import JobQueue, LocalWorkers, SchedulerAddress
 from experiments.cluster.cluster_launcher import cluster_launcher
-from experiments.cluster.clusters import opened
-from experiments.cluster.job_queues import opened_queue
-from experiments.cluster.orders import Probe
-from experiments.drafts import draft_path
-from experiments.execution import execute
+from experiments.cluster.schedulers import opened, opened_queue
+from experiments.cluster.working import Probe
+from experiments.launching import execute
+from experiments.plan import plan
+from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.user_modules import import_typed
 
@@ -130,9 +129,9 @@ def check_what_is_refused(there, folder, monkeypatch):
     """It is tried again, and then told."""
 
     def lying(planned, root, files):
-        raise endings.RefusedAnswerError("a stray file")
+        raise answers.RefusedAnswerError("a stray file")
 
-    monkeypatch.setattr(endings, "receive", lying)
+    monkeypatch.setattr(answers, "receive", lying)
     root = folder / "refused"
     root.mkdir()
     (failure,) = execute(runs_of(root)[:1], root, there(root), lambda *_: None)
@@ -224,7 +223,7 @@ def test_all_ports_of_jobs_want_a_certificate(tmp_path):
 
 
 def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr("experiments.cluster.clusters.SECONDS_TO_CONNECT", 0.2)
+    monkeypatch.setattr("experiments.cluster.schedulers.SECONDS_TO_CONNECT", 0.2)
     nowhere = partial(cluster_launcher, SchedulerAddress("127.0.0.1:1"), tmp_path, "c")
     with pytest.raises(UserError, match="there is no scheduler"), nowhere():
         pass
@@ -233,10 +232,10 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("address", ["tcp://10.0.0.1:8786", "tcp://0.0.0.0:8786"])
 def test_one_that_says_itself_that_it_is_open_is_refused(address):
-    connection = connections.Connection(pytest.fail, pytest.fail, is_told=False)
+    connection = schedulers.Connection(pytest.fail, pytest.fail, is_told=False)
     with pytest.raises(UserError, match="without TLS"):
         connection._check_open(["tls://10.0.0.2:1", "tcp://127.0.0.1:2", address])
-    connections.Connection(pytest.fail, pytest.fail, is_told=True)._check_open([address])
+    schedulers.Connection(pytest.fail, pytest.fail, is_told=True)._check_open([address])
 
 
 def test_without_a_cluster_nothing_of_dask_is_loaded():

@@ -6,16 +6,21 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.cluster import receiving
-from experiments.cluster.answers import RefusedAnswerError, files_in
-from experiments.cluster.orders import Probe, RunOrder, probing
-from experiments.cluster.receiving import check_in_place, receive
-from experiments.cluster.sent_runs import MOST_SENDS, SentRun
-from experiments.drafts import draft_path
+from experiments.cluster import answers
+from experiments.cluster.answers import (
+    MOST_SENDS,
+    RefusedAnswerError,
+    SentRun,
+    check_in_place,
+    files_in,
+    receive,
+)
+from experiments.cluster.working import Probe, RunOrder, probing
+from experiments.plan import plan
+from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 20})
 
@@ -95,7 +100,7 @@ def test_logs_go_to_their_own_folder(tmp_path, done):
 
 
 def test_a_run_that_is_said_to_be_there_has_to_be(tmp_path, monkeypatch):
-    monkeypatch.setattr(receiving, "SECONDS_TO_APPEAR", 0.0)
+    monkeypatch.setattr(answers, "SECONDS_TO_APPEAR", 0.0)
     with pytest.raises(RefusedAnswerError, match="not in its folder"):
         check_in_place(runs_of(tmp_path)[0])
 

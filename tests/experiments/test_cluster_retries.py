@@ -7,12 +7,11 @@ import pytest
 from distributed.scheduler import KilledWorker
 
 from experiments.child_processes import NO_LIMITS
-from experiments.cluster.answers import Answer, packed
+from experiments.cluster.answers import MOST_SENDS, Answer, packed
 from experiments.cluster.cluster_launcher import ClusterLauncher
-from experiments.cluster.orders import probing
-from experiments.cluster.sent_runs import MOST_SENDS
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.cluster.working import probing
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 20})

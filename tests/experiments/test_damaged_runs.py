@@ -15,15 +15,14 @@ from rich.console import Console
 import compare
 from commands.places import Place
 from commands.study_output import repair, run_study
-from experiments.bandit_results import STATISTICS_FILE
-from experiments.drafts import draft_path
+from experiments.bandits import STATISTICS_FILE
 from experiments.launching import local_launcher
-from experiments.repair import move_damaged_aside
-from experiments.run_figures import read_value_maps
+from experiments.plan import plan
+from experiments.results import read_results, read_run
+from experiments.run_files import read_value_maps
+from experiments.run_folders import draft_path, move_damaged_aside
 from experiments.run_in_child import do_run
-from experiments.study_plan import plan
-from experiments.study_results import read_results, read_run
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.file_digests import DamagedFileError
 from pipeline.run_files import PULLS_FILE
 

@@ -11,15 +11,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-from experiments import execution, launching, run_or_go_on
+from experiments import launching, run_in_child
 from experiments.child_processes import NO_LIMITS, StoppedError, TaskFailedError
-from experiments.drafts import draft_path, leave_drafts, run_name
-from experiments.execution import WINDOW, execute
-from experiments.launching import available_cores, failure_log
+from experiments.launching import WINDOW, available_cores, execute, failure_log
+from experiments.plan import plan
+from experiments.run_folders import draft_path, leave_drafts, run_name
 from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.resuming.saved_states import SavedState
 from pipeline.resuming.state_keeping import StateKeeping
@@ -105,7 +104,7 @@ def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(
         (draft / "state" / "odd.state").touch()
         raise error from cause
 
-    monkeypatch.setattr(run_or_go_on, "train", fail)
+    monkeypatch.setattr(run_in_child, "train", fail)
     with pytest.raises(type(error)):
         do_run(planned, draft, "compare.py s.yml")
     leave_drafts(tmp_path, run_name(planned))
@@ -117,9 +116,9 @@ def test_a_study_goes_on_from_states_of_its_own_sources_alone(tmp_path, monkeypa
     planned, _ = runs_of(tmp_path)
     left = StateKeeping(state=SavedState(None, {"sources": sources}), goes_on=True)
     for name, value in (("holds_state", True), ("go_on", left)):
-        monkeypatch.setattr(run_or_go_on, name, lambda *_, value=value: value)
+        monkeypatch.setattr(run_in_child, name, lambda *_, value=value: value)
     monkeypatch.setattr(type(planned), "is_of", lambda *_: True)
-    found = run_or_go_on._to_go_on_with(planned, planned.run)
+    found = run_in_child._to_go_on_with(planned, planned.run)
     assert found.goes_on == (sources != "older")
 
 
@@ -194,7 +193,7 @@ class Growing:
 
 
 def test_runs_are_handed_over_in_windows_as_wide_as_there_are_workers(tmp_path, monkeypatch):
-    monkeypatch.setattr(execution, "SECONDS_BETWEEN_LOOKS", 0.01)
+    monkeypatch.setattr(launching, "SECONDS_BETWEEN_LOOKS", 0.01)
     runs, launcher, told = runs_of(tmp_path, n_seeds=12), Growing(), []
 
     def listen(run, failure):

@@ -13,7 +13,10 @@ from hypothesis.extra import numpy as arrays
 import envs  # noqa: F401
 from envs.bandits import log_uniformly, read_log
 from experiments.off_policy.estimators import (
+    ArmMeans,
+    ArmRegressions,
     check_support,
+    cross_fit,
     difference_in_value,
     direct_method,
     doubly_robust,
@@ -25,7 +28,6 @@ from experiments.off_policy.estimators import (
     snips,
     terms_as_logged,
 )
-from experiments.off_policy.reward_models import ArmMeans, ArmRegressions, cross_fit
 from verdicts import Estimate, paired_difference
 
 ESTIMATORS = ("ips", "snips", "direct", "doubly_robust")

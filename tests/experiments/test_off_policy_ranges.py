@@ -6,10 +6,10 @@ import pytest
 from experiments.off_policy.estimators import (
     check_rewards,
     check_support,
+    cross_fit,
     effective_sample_size,
     importance_weights,
 )
-from experiments.off_policy.reward_models import cross_fit
 
 TINY = 5e-324  # the smallest number above 0
 JUST_ABOVE_1 = np.nextafter(1, 2)

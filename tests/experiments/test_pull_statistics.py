@@ -8,7 +8,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
 from envs.bandits import log_uniformly
-from experiments.pull_statistics import QUANTILES, PullStatistics, points_of, pull_statistics
+from experiments.bandits import QUANTILES, PullStatistics, points_of, pull_statistics
 from pipeline.pull_recording import PullRecorder, are_bandits
 
 FIGURES = ("arms", "rewards", "expected_rewards", "regrets", "optimal", "matched")

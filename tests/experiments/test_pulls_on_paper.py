@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import envs  # noqa: F401  # registers the bandits
-from experiments.bandit_results import true_means
-from experiments.pull_statistics import MAX_POINTS, PullStatistics, points_of, pull_statistics
+from experiments.bandits import MAX_POINTS, PullStatistics, points_of, pull_statistics, true_means
 
 # Arm 0 costs .3 a pull and arm 1 nothing; two runs of four pulls.
 ARMS = np.array([[0, 1, 1, 0], [1, 1, 0, 1]], dtype=np.int16)

@@ -5,12 +5,11 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.drafts import draft_path
-from experiments.replaced_runs import check_settings_kept, in_the_way, move_replaced_aside
+from experiments.plan import plan
+from experiments.run_files import mixed_versions
+from experiments.run_folders import check_settings_kept, draft_path, in_the_way, move_replaced_aside
 from experiments.run_in_child import do_run
-from experiments.run_versions import mixed_versions
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 
 LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 20})

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.run_figures import read_episodes, read_evaluations
+from experiments.run_files import read_episodes, read_evaluations
 from pipeline.file_digests import DamagedFileError
 from pipeline.run_folder import Run
 

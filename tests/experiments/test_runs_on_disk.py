@@ -3,10 +3,10 @@
 import os
 from pathlib import Path
 
-from experiments import run_in_child
-from experiments.run_in_child import do_planned_run
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments import run_folders
+from experiments.plan import plan
+from experiments.run_in_child import do_run
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
 from pipeline.run_folder import FINISHED
 
@@ -17,7 +17,7 @@ def test_a_draft_is_on_the_disk_before_it_has_its_name(monkeypatch, tmp_path):
     agent = AgentSpec("table", "qlearning", tuned=False)
     [run] = plan(StudySpec("s", "S", (agent,), (house,), n_seeds=1), tmp_path)
     events = []
-    fsync, put = os.fsync, run_in_child.put_in_place
+    fsync, put = os.fsync, run_folders.put_in_place
 
     def synced(number):
         events.append(Path(f"/proc/self/fd/{number}").readlink().name)
@@ -28,8 +28,8 @@ def test_a_draft_is_on_the_disk_before_it_has_its_name(monkeypatch, tmp_path):
         put(*args)
 
     monkeypatch.setattr(files.os, "fsync", synced)
-    monkeypatch.setattr(run_in_child, "put_in_place", named)
-    do_planned_run(run, tmp_path, "")
+    monkeypatch.setattr(run_folders, "put_in_place", named)
+    do_run(run, run_folders.draft_path(tmp_path, run), "")
     assert run.run.read_info()["state"] == FINISHED
     place = events.index("named")
     assert {path.name for path in run.path.rglob("*")} <= set(events[:place])

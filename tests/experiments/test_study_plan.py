@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from experiments.study_plan import check_settings, plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.plan import check_settings, plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
 from pipeline.run_folder import FAILED, FINISHED
@@ -45,7 +45,7 @@ def test_every_agent_on_every_environment_with_every_seed(tmp_path):
 
 
 def test_a_study_has_a_bearable_number_of_runs(monkeypatch):
-    monkeypatch.setattr("experiments.study_plan.MOST_RUNS", 6)
+    monkeypatch.setattr("experiments.plan.MOST_RUNS", 6)
     dry = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_episodes": 9})
     study = study_of("qlearning", "sarsa", "dqn", environments=(LAKE, dry), n_seeds=1)
     assert len(plan(study, Path("nowhere"))) == 6

@@ -9,9 +9,9 @@ import pytest
 
 from agents import ALGORITHMS
 from agents.algorithm_entries import AlgorithmEntry
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from experiments.time_left import TimeLeft, expected_seconds
+from experiments.launching import TimeLeft, expected_seconds
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 
 # What a run takes by agent, in seconds; environments change it twofold.
 TAKES = {"qlearning": 0.5, "sarsa": 0.6, "dqn": 40.0, "double_dqn": 90.0, "ppo": 25.0}

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.study_spec import AS_IT_COMES, AgentSpec, EnvironmentSpec, StudySpec
-from experiments.tuning_seeds import TuningSeeds, tuning_seeds
+from experiments.plan import TuningSeeds, tuning_seeds
+from experiments.study import AS_IT_COMES, AgentSpec, EnvironmentSpec, StudySpec
 from report.seed_sentence import seed_sentence, spans
 
 LAKE, PENDULUM = (EnvironmentSpec(name, name) for name in ("FrozenLake-v1", "Pendulum-v1"))
