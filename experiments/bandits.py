@@ -1,13 +1,17 @@
-"""Runs on bandits: done as one batch for each agent, and their figures pull by pull."""
+"""Runs on bandits: done as one batch for each agent, and their figures pull by pull.
+
+All that reads here raises `DamagedFileError` for a file that is missing, changed, or holds anything
+else.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -205,11 +209,8 @@ def _mean_since_last(by_pull: Floats, points: Ints) -> Floats:
 def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int]) -> Floats:
     """Mean over runs of what recommending the arm pulled most so far falls short by.
 
-    Args:
-        cells: which context and arm, as one number, shape (n_runs, n_pulls).
-        regrets: likewise.
-        at: the pulls to give it at, counted from 0.
-        shape: numbers of contexts and arms.
+    ``cells`` number context and arm, shape (n_runs, n_pulls); ``at`` are pulls counted from 0;
+    ``shape`` holds the numbers of contexts and arms.
     """
     n_runs, rows = len(cells), np.arange(len(cells))
     counts = np.zeros((n_runs, shape[0] * shape[1]))
@@ -253,11 +254,7 @@ def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStat
 
 
 def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
-    """A row of the summary for each run of a batch.
-
-    Raises:
-        DamagedFileError: if a file of the batch is missing or changed, or holds anything else.
-    """
+    """A row of the summary for each run of a batch."""
     info = read_outcome(planned.run, ("seconds",))
     cpu_seconds = info.get("cpu_seconds")
     path = planned.path / STATISTICS_FILE
@@ -292,11 +289,7 @@ def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
 
 
 def run_regret(planned: PlannedRun) -> float | None:
-    """The regret of a run of its own, or None where it was on no bandit.
-
-    Raises:
-        DamagedFileError: if the file of its pulls is missing or changed, or holds anything else.
-    """
+    """The regret of a run of its own, or None where it was on no bandit."""
     files = planned.run.files
     if not files.matching(PULLS_FILE):
         return None
@@ -310,9 +303,6 @@ def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
     """The pulls of a run of its own in the order of time, each of shape (n_pulls,).
 
     Agents that collect whole rollouts go on beyond ``n_timesteps``; that is left out.
-
-    Raises:
-        DamagedFileError: if their file is missing or changed, or holds anything else.
     """
     return {name: array.T.ravel()[:n_timesteps] for name, array in _pulls(folder).items()}
 
@@ -336,18 +326,11 @@ def _pulls(folder: Path) -> dict[str, NDArray[Any]]:
 
 
 def check_pulls(spec: TrainSpec, folder: Path) -> None:
-    """Make sure that what a run pulled is there in the environment of its spec.
-
-    Raises:
-        DamagedFileError: if it is not.
-    """
+    """Make sure that what a run pulled is there in the environment of its spec."""
     pulls = read_run(folder, spec.hyperparams.n_timesteps)
-    env = make_single_env(spec)
-    try:
+    with closing(make_single_env(spec)) as env:
         bandit: Any = env.unwrapped
         sizes = {"arms": bandit.n_arms, "contexts": bandit.n_contexts}
-    finally:
-        env.close()
     for name, size in sizes.items():
         if size > 0 and name in pulls and pulls[name].max() >= size:
             raise DamagedFileError(folder / PULLS_FILE, f"is damaged: {name} are of another bandit")
@@ -357,41 +340,28 @@ def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
     """The same for runs that were done one by one, from the pulls in their folders."""
     runs = [read_run(folder, spec.hyperparams.n_timesteps) for folder in folders]
     n_pulls = min(len(run["arms"]) for run in runs)
-    env = make_single_env(spec)
-    try:
+    stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
+    return _statistics_on(spec, *(stacked.get(name) for name in (*_PULLS, "contexts")))
+
+
+def _statistics_on(
+    spec: TrainSpec, arms: Any, rewards: Any, regrets: Any, contexts: Any, **more: Any
+) -> PullStatistics:
+    """Figures of pulls on the bandit of a spec, see `pull_statistics`."""
+    with closing(make_single_env(spec)) as env:
         bandit: Any = env.unwrapped
-        n_contexts = max(bandit.n_contexts, 1)
-        stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
-        statistics = pull_statistics(
-            stacked["arms"],
-            stacked["rewards"],
-            stacked["regrets"],
-            stacked["contexts"] if n_contexts > 1 and "contexts" in stacked else None,
-            bandit.n_arms,
-            n_contexts,
-            true_means=true_means(env),
-        )
-        return suited(statistics, bandit)
-    finally:
-        env.close()
-
-
-def suited(statistics: PullStatistics, bandit: Any) -> PullStatistics:
-    """Figures without simple regret where no arm could be recommended.
-
-    That is where the worth of arms moves, or goes by a vector.
-    """
-    if bandit.n_contexts > 0 and not getattr(bandit, "drift_std", 0.0) > 0:
-        return statistics
-    return replace(statistics, simple_regret=np.full_like(statistics.simple_regret, np.nan))
-
-
-def true_means(env: gym.Env[Any, Any]) -> Floats | None:
-    """Means of the arms by context, shape (n_contexts, n_arms), where each run has the same."""
-    bandit: Any = env.unwrapped
-    moves = getattr(bandit, "redraws", False) or getattr(bandit, "drift_std", 0.0) > 0
-    means = getattr(bandit, "means", None)
-    return None if moves or means is None else np.array(means, dtype=np.float64)
+        is_drifting = getattr(bandit, "drift_std", 0.0) > 0
+        # Means of the arms where each run has the same.
+        means = None if is_drifting else getattr(bandit, "means", None)
+        if means is not None and not getattr(bandit, "redraws", False):
+            more["true_means"] = np.array(means, dtype=np.float64)
+        n_arms, n_contexts = bandit.n_arms, max(bandit.n_contexts, 1)
+        is_known = bandit.n_contexts > 0 and not is_drifting
+    contexts = contexts if n_contexts > 1 else None
+    found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
+    # No arm can be recommended where the worth of arms moves, or goes by a vector.
+    nowhere = np.full_like(found.simple_regret, np.nan)
+    return found if is_known else replace(found, simple_regret=nowhere)
 
 
 # --- All runs of an agent as one batch: each a fresh agent and one episode.
@@ -406,11 +376,16 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     with compile_timer() as time_compiling:
         result, engine = _run(spec, n_runs)
     _check_rewards(result, spec.seed)
-    env = make_single_env(spec)
-    try:
-        statistics = _statistics(env, result)
-    finally:
-        env.close()
+    statistics = _statistics_on(
+        spec,
+        result.arms,
+        result.rewards,
+        result.regrets,
+        result.contexts,
+        estimates=result.estimates,
+        moments=result.moments,
+        posteriors=result.posteriors,
+    )
     statistics.save(run.path / STATISTICS_FILE)
     write_settings(run, spec, command)
     run.end(
@@ -456,20 +431,3 @@ def _check_rewards(result: BatchResult, first_seed: int) -> None:
             pull = int(np.argmin(np.isfinite(rewards)))
             what = f"reward of seed {seed} at step {pull + 1:,}"
             raise NotFiniteError(what, float(rewards[pull]))
-
-
-def _statistics(env: gym.Env[Any, Any], result: BatchResult) -> PullStatistics:
-    bandit: Any = env.unwrapped
-    statistics = pull_statistics(
-        result.arms,
-        result.rewards,
-        result.regrets,
-        result.contexts,
-        bandit.n_arms,
-        max(bandit.n_contexts, 1),
-        result.estimates,
-        true_means(env),
-        result.moments,
-        result.posteriors,
-    )
-    return suited(statistics, bandit)

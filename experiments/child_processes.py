@@ -44,11 +44,9 @@ LEFT_TO_SUPERVISOR = tuple(
 def answer_from_child(sender: Connection, last_words: Connection, tasks: Connection) -> None:
     """Do tasks until there are none any more, or one fails, and send what came of each.
 
-    Args:
-        sender: takes ``("returned", value)`` or ``("raised", (message, traceback))``.
-        last_words: takes the traceback where the process crashes, or is about to be ended.
-        tasks: where they come from: function, arguments, and what to call if the supervisor dies
-            first, pickled.
+    A task is a function, its arguments, and what to call if the supervisor dies first, pickled. The
+    ``sender`` takes `RETURNED` and the value, or `RAISED` and the message with the traceback;
+    ``last_words`` the traceback where the process crashes, or is about to be ended.
     """
     leave_signals_to_supervisor()
     if sys.platform != "win32":  # there a pipe has no number that a crash could write to
@@ -124,8 +122,7 @@ context: Any = multiprocessing.get_context(START_METHOD)
 def start_server(warm_ups: str = "[]") -> None:
     """Start what children begin from, in the background: start it early to have it sooner.
 
-    Args:
-        warm_ups: what it is to compile once for all runs, see `experiments.warm_ups`.
+    It compiles ``warm_ups`` once for all runs, see `experiments.warm_ups`.
     """
     for name in THREAD_VARIABLES:
         os.environ.setdefault(name, "1")
@@ -292,13 +289,10 @@ class _Child:
                 connection.close()
 
     def attempt(self, task: bytes, limits: RunLimits, is_last: bool) -> tuple[str, Any]:
-        """Have a task done, and end the child where it exceeds a limit.
+        """Have a task done: `RETURNED` and value; `RAISED`, reason and details; or `DIED` and how.
 
-        One that has returned a value may be given another task; any other has ended.
-
-        Returns:
-            `RETURNED` and the value; `RAISED` and the reason with its details; or `DIED`, how, and
-            the traceback as far as there is one.
+        The child is ended where it exceeds a limit. One that has returned a value may be given
+        another task; any other has ended.
         """
         with contextlib.suppress(OSError):  # it is gone, as is found below
             self.tasks.send_bytes(task)
@@ -408,11 +402,7 @@ def _start(child: BaseProcess) -> None:
 
 @contextlib.contextmanager
 def local_executor(n_workers: int) -> Iterator[ThreadPoolExecutor]:
-    """As many supervisors as ``n_workers``; their children are ended when the block is left early.
-
-    Args:
-        n_workers: processes that work at once.
-    """
+    """As many supervisors as processes that work at once; left early, it ends their children."""
     be_ready()
     executor = ThreadPoolExecutor(n_workers)
     try:

@@ -166,11 +166,7 @@ def grown(study: StudySpec, counts: Counts) -> StudySpec:
 
 
 def take_planned_looks(results: StudyResults) -> list[Step]:
-    """Look at every environment as was settled, and write down who gets more seeds.
-
-    Raises:
-        UserError: if runs that have been looked at are others now.
-    """
+    """Look at every environment as was settled, and write down who gets more seeds."""
     log = read_looks(results.root)
     environments, steps = dict(log.environments), []
     for environment in results.study.environments:
@@ -204,11 +200,7 @@ def _settled(study: StudySpec, looks: Looks, most: int | None) -> Design:
 
 
 def _check_same(root: Path, there: Design, now: Design) -> None:
-    """Refuse to look otherwise than was settled.
-
-    Raises:
-        UserError: naming what differs.
-    """
+    """Refuse to look otherwise than was settled, naming what differs."""
     differences = [
         f"{key} {before}, now {after}"
         for key, before, after in (
@@ -230,11 +222,7 @@ def _check_same(root: Path, there: Design, now: Design) -> None:
 
 
 def _check_runs(root: Path, looks: Looks, evidence: Evidence) -> None:
-    """Refuse runs that have been done anew since they were looked at.
-
-    Raises:
-        UserError: naming the environment.
-    """
+    """Refuse runs that have been done anew since they were looked at."""
     for there in looks.planned:
         now = look_at(evidence, there.seeds, there.question, there.level, planned=True)
         # Some may be missing now, or may have been then.

@@ -381,11 +381,7 @@ class TimeLeft:
 
 
 class EarlyResults:
-    """What each run has to say, read when it has ended.
-
-    Args:
-        study: whose runs they are.
-    """
+    """What each run of a study has to say, read when it has ended."""
 
     def __init__(self, study: StudySpec) -> None:
         self.study = study

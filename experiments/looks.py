@@ -100,11 +100,7 @@ class Looks:
         return self._unplanned_level(self.taken)
 
     def level_at(self, place: int) -> float:
-        """The error rate that the look at a place in ``taken`` may spend.
-
-        Raises:
-            ValueError: if it is a planned one, and nothing was planned.
-        """
+        """The error rate that the look at a place in ``taken`` may spend."""
         if not self.taken[place].planned:
             return self._unplanned_level(self.taken[:place])
         if self.design is None:
@@ -197,13 +193,10 @@ class _MisfitError(Exception):
 def _read_as(kind: Any, data: Any, where: str) -> Any:
     """Plain data as a dataclass that has these fields and no others, each of its type.
 
-    Whole numbers are at least 0, and all numbers finite.
-
-    Raises:
-        _MisfitError: naming the first field that is something else.
+    Whole numbers are at least 0, and all numbers finite. `_MisfitError` names what is not so.
     """
     arguments = get_args(kind)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         kinds = get_type_hints(kind)
         if not isinstance(data, dict) or data.keys() != kinds.keys():
             raise _MisfitError(where)

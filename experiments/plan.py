@@ -77,10 +77,7 @@ class PlannedRun:
     @property
     def is_finished(self) -> bool:
         """Whether the folder holds this very run, to its end; what else it holds is not read."""
-        try:
-            info = self.run.read_info()
-        except DamagedFileError:
-            return False
+        info = _info(self.run)
         if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
             return False
         recorded, wanted = _recorded(info), self.spec.save_every_n_episodes
@@ -90,11 +87,8 @@ class PlannedRun:
 
     def is_of(self, run: Run) -> bool:
         """Whether what a folder was begun with is this very run."""
-        try:
-            recorded = _recorded(run.read_info())
-        except DamagedFileError:
-            return False
-        return bool(_identity(recorded) == _identity(self.spec.as_data()))
+        info = _info(run)
+        return bool(info and _identity(_recorded(info)) == _identity(self.spec.as_data()))
 
     @property
     def differences(self) -> dict[str, tuple[Any, Any]]:
@@ -103,10 +97,7 @@ class PlannedRun:
         Empty where they are the same: then a run is done again because it lacks something, such as
         checkpoints, or in a batch the seeds that are new.
         """
-        try:
-            info = self.run.read_info()
-        except DamagedFileError:
-            return {}
+        info = _info(self.run)
         if info.get("state") != FINISHED:
             return {}
         there = _by_name(_identity(_recorded(info)))
@@ -151,6 +142,14 @@ class ReadPlannedRun(PlannedRun):
     def run(self) -> Run:
         """The run folder."""
         return ReadRun(self.path, environment_name(self.spec.env_id))
+
+
+def _info(run: Run) -> dict[str, Any]:
+    """The record of a run; empty where it is damaged."""
+    try:
+        return run.read_info()
+    except DamagedFileError:
+        return {}
 
 
 def _identity(spec: Mapping[str, Any]) -> Any:

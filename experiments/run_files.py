@@ -1,6 +1,7 @@
 """The files that one finished run left, each held against its digest and its form.
 
-Runs of earlier versions recorded no digests: of these a file counts that has the form.
+Runs of earlier versions recorded no digests: of these a file counts that has the form. All that
+reads here raises `DamagedFileError` for a file that is missing, changed, or holds anything else.
 """
 
 from __future__ import annotations
@@ -54,11 +55,7 @@ class Episodes:
 
 
 def read_episodes(run: Run) -> Episodes:
-    """The training episodes that Monitor wrote down.
-
-    Raises:
-        DamagedFileError: if a file of them is missing or changed, or holds anything else.
-    """
+    """The training episodes that Monitor wrote down."""
     files = run.files
     paths = files.matching("*.monitor.csv")
     if not paths:
@@ -99,11 +96,7 @@ def _table_of(content: bytes) -> Floats:
 
 
 def read_evaluations(run: Run) -> tuple[Floats, Floats]:
-    """Steps and mean returns of the evaluations during training, each of shape (n_evaluations,).
-
-    Raises:
-        DamagedFileError: if their file is missing or changed, or holds anything else.
-    """
+    """Steps and mean returns of the evaluations during training, each of shape (n_evaluations,)."""
     files = run.files
     for path in files.matching(run.evaluations_path.name):
         arrays = read_arrays(path, files.read(path))
@@ -121,15 +114,7 @@ def read_evaluations(run: Run) -> tuple[Floats, Floats]:
 
 
 def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
-    """What ``run.json`` says came out, in which ``final`` maps names to figures.
-
-    Args:
-        run: the run.
-        required: the names of figures that have to be there.
-
-    Raises:
-        DamagedFileError: if it is damaged, or says anything else.
-    """
+    """What ``run.json`` says came out, with ``required`` names; ``final`` maps names to figures."""
     info = run.read_info()
     final = info.get("final")
     if not (final is None or isinstance(final, dict)):
@@ -168,11 +153,7 @@ def _is_figure(value: object) -> bool:
 
 
 def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
-    """The maps that a run kept, as `pipeline.evaluation.value_maps` writes them.
-
-    Raises:
-        DamagedFileError: if their file is missing or changed, or holds anything else.
-    """
+    """The maps that a run kept, as `pipeline.evaluation.value_maps` writes them."""
     path = run.value_maps_path
     arrays = read_arrays(path, run.files.read(path))
     lacking = [name for name in _MAPS if name not in arrays]
@@ -244,11 +225,7 @@ def _curve(planned: PlannedRun, kind: str, figures: dict[str, Floats]) -> Curve:
 
 
 def evaluation_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
-    """Mean returns of the evaluations during training.
-
-    Raises:
-        DamagedFileError: if their file is missing or changed, or holds anything else.
-    """
+    """Mean returns of the evaluations during training."""
     steps, returns = read_evaluations(planned.run)
     seconds = np.interp(
         steps, np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
@@ -282,11 +259,7 @@ def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
 
 
 def difference(run: Run, other: Run) -> str:
-    """In what two finished runs differ; empty where they are the same to the last bit.
-
-    Raises:
-        DamagedFileError: if a file of one of them is missing or damaged.
-    """
+    """In what two finished runs differ; empty where they are the same to the last bit."""
     if _tensors(run) != _tensors(other):
         return "the agent"
     one, another = read_episodes(run), read_episodes(other)
@@ -311,11 +284,7 @@ def _tensors(run: Run) -> dict[str, bytes]:
 
 
 def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
-    """Which versions differ between runs, in a line; empty where none does.
-
-    Args:
-        infos: contents of ``run.json``, see `pipeline.run_folder.Run.read_info`.
-    """
+    """Which versions differ between the ``run.json`` of runs, in a line; empty where none does."""
     counts: dict[str, Counter[str]] = {}
     for info in infos:
         for package, version in info.get("versions", {}).items():

@@ -96,11 +96,7 @@ def _run_of(draft: Path) -> str:
 
 
 def take_over(draft: Path) -> bool:
-    """Make ``draft`` of what a process that is gone has left of the same run.
-
-    Returns:
-        Whether there was anything.
-    """
+    """Make ``draft`` of what a process that is gone has left of the run; whether it left any."""
     left = [
         one
         for one in _drafts(draft.parent.parent)
@@ -153,13 +149,9 @@ def _remove_empty(folder: Path) -> None:
 
 
 def leave_drafts(root: Path, name: str) -> None:
-    """Remove what this process, or one that is gone, has not finished of a run.
+    """Remove what this process, or one that is gone, has not finished of the run of this name.
 
     What can be gone on from stays.
-
-    Args:
-        root: the study's folder.
-        name: of the run, see `run_name`.
     """
     for draft in _drafts(root):
         is_left = _run_of(draft) == name and (_is_own(draft) or _is_dead(draft))
@@ -169,12 +161,7 @@ def leave_drafts(root: Path, name: str) -> None:
 
 
 def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
-    """Remove what processes that are gone have left.
-
-    Args:
-        root: the study's folder.
-        kept: names of runs that are to be done, by whom theirs are taken over.
-    """
+    """Remove what processes that are gone have left, but of ``kept`` runs, which are to be done."""
     for draft in _drafts(root):
         if _is_dead(draft) and _run_of(draft) not in kept:
             remove_draft(draft)
@@ -203,11 +190,7 @@ def in_the_way(planned: Sequence[PlannedRun]) -> list[PlannedRun]:
 
 
 def check_settings_kept(planned: Sequence[PlannedRun], root: Path) -> None:
-    """Refuse to do runs again that have finished with other settings.
-
-    Raises:
-        UserError: naming how many, in what they differ, and the ways out.
-    """
+    """Refuse to do runs again that have finished with other settings, and name the ways out."""
     others = [(run, run.differences) for run in in_the_way(planned)]
     others = [(run, differences) for run, differences in others if differences]
     if not others:
@@ -230,8 +213,7 @@ def move_replaced_aside(
 ) -> tuple[list[PlannedRun], Path | None]:
     """Move all that is in the way of the plan to one folder, ``replaced/<number>``.
 
-    Returns:
-        The runs that it was in the way of; and that folder, None where there were none.
+    The runs that it was in the way of; and that folder, None where there were none.
     """
     moved = [run for run in in_the_way(planned) if _is_kept_aside(run.path)]
     if not moved:
@@ -300,11 +282,7 @@ def move_aside(folder: Path) -> Path:
 def move_damaged_aside(
     study: StudySpec, planned: Sequence[PlannedRun], tell: Tell = tell_nobody
 ) -> list[tuple[LeftOut, Path]]:
-    """Rename the folder of every run that would be left out.
-
-    Returns:
-        These runs with the reason, each with where its folder lies now.
-    """
+    """Rename the folder of every run that would be left out; each with where it lies now."""
     from experiments.results import LeftOut, read_run
 
     moved = []

@@ -47,12 +47,8 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
 def _do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
     """Do a run in its draft, to its end.
 
-    Args:
-        planned: the run.
-        draft: its folder. It is there where another process has left it: the run goes on from its
-            state if that is whole, of these very settings, and saved by these very sources, and
-            else begins anew.
-        command: the command that asked for the study.
+    The draft is there where another process has left it: the run goes on from its state if that is
+    whole, of these very settings, and saved by these very sources, and else begins anew.
     """
     run = Run(draft, planned.run.env_name)
     keeping = _to_go_on_with(planned, run)

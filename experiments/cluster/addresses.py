@@ -39,11 +39,7 @@ class SchedulerAddress:
     file: Path | None = None  # the file; None where there is none
 
     def read(self) -> str:
-        """The address, as it is now: with ``tcp://`` or ``tls://``.
-
-        Raises:
-            UserError: if the file cannot be read, or holds none.
-        """
+        """The address, as it is now: with ``tcp://`` or ``tls://``."""
         text = self.text if self.file is None else _address_in(self.file)
         return text if "://" in text else f"tcp://{text}"
 
@@ -62,15 +58,7 @@ Cluster = LocalWorkers | SchedulerAddress | JobQueue
 
 
 def read_cluster(text: str, systems: tuple[str, ...]) -> Cluster:
-    """What ``--cluster`` means.
-
-    Args:
-        text: what was typed.
-        systems: the queueing systems that there are.
-
-    Raises:
-        UserError: if it means nothing.
-    """
+    """What ``--cluster`` means, or `UserError`; ``systems`` are the queueing systems there are."""
     if text.startswith("local:"):
         number = text.removeprefix("local:")
         if number.isascii() and number.isdecimal() and 0 < int(number[:9]) <= MOST_LOCAL_WORKERS:
@@ -87,15 +75,9 @@ def read_cluster(text: str, systems: tuple[str, ...]) -> Cluster:
 
 
 def check_address(address: str, has_certificates: bool, is_told: bool) -> None:
-    """Refuse to talk to a scheduler that others may talk to.
+    """Refuse a scheduler that is open to the network, or by TLS without its certificates.
 
-    Args:
-        address: the scheduler's.
-        has_certificates: whether Dask is configured with those that TLS takes.
-        is_told: whether the user has said that an open one will do.
-
-    Raises:
-        UserError: if it is open to the network, or TLS lacks its certificates.
+    Where ``is_told``, the user has said that an open one will do.
     """
     scheme = urlsplit(address).scheme
     if scheme not in ("tcp", "tls"):

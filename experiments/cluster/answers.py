@@ -70,11 +70,7 @@ def packed(answer: Answer) -> bytes:
 
 
 def unpacked(content: object) -> Answer:
-    """The answer that bytes hold.
-
-    Raises:
-        RefusedAnswerError: if they hold none, or one with files that may not be written.
-    """
+    """The answer that bytes hold; refused if they hold none, or files that may not be written."""
     if not isinstance(content, bytes):
         raise RefusedAnswerError(f"it is a {type(content).__name__}, and not bytes")
     head, rest = _head(content)
@@ -91,11 +87,7 @@ def unpacked(content: object) -> Answer:
 
 
 def files_in(folder: Path, prefix: str) -> dict[str, bytes]:
-    """All files in a folder, by relative name after a prefix.
-
-    Raises:
-        ValueError: if they are more, or larger, than an answer takes.
-    """
+    """All files in a folder, by relative name after a prefix; ValueError if they are too many."""
     paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
     size = sum(path.stat().st_size for path in paths)
     if size > LARGEST or len(paths) > MOST_FILES:
@@ -171,11 +163,7 @@ _SECONDS_BETWEEN_LOOKS = 0.25
 
 
 def check_in_place(planned: PlannedRun) -> None:
-    """Make sure that a run lies in its folder, as a worker says that shares it.
-
-    Raises:
-        RefusedAnswerError: if it does not.
-    """
+    """Make sure that a run lies in its folder, as a worker says that shares it."""
     until = time.monotonic() + SECONDS_TO_APPEAR
     while not planned.is_finished:
         if time.monotonic() > until:
@@ -184,17 +172,7 @@ def check_in_place(planned: PlannedRun) -> None:
 
 
 def receive(planned: PlannedRun, root: Path, files: Mapping[str, bytes]) -> None:
-    """Put the files of a run in place, if they are those of this very run, whole.
-
-    Args:
-        planned: the run.
-        root: the study's folder.
-        files: by name, ``run/...`` and ``tensorboard/...``.
-
-    Raises:
-        RefusedAnswerError: if they are not.
-        OSError: if they cannot be written.
-    """
+    """Put files ``run/...`` and ``tensorboard/...`` in place, if they are of this very run."""
     run, log = _part(files, "run/"), _part(files, "tensorboard/")
     if len(run) + len(log) != len(files) or (log and planned.spec.tensorboard_log is None):
         raise RefusedAnswerError("it holds files of no run")
@@ -271,21 +249,12 @@ class SentRun:
     reason: str = ""  # why it was last lost or refused
 
     def begin(self, worker: str, has_left: bool) -> None:
-        """Note that a worker has begun; where another had before, that one was lost.
-
-        Args:
-            worker: its address.
-            has_left: whether the one before it left in good order.
-        """
+        """Note that a worker has begun; where another had before, that one was lost."""
         self.lose(has_left)
         self.worker = worker
 
     def lose(self, has_left: bool) -> None:
-        """Note that the worker that had begun is gone, if one had.
-
-        Args:
-            has_left: whether it left in good order.
-        """
+        """Note that the worker that had begun, if any, is gone; ``has_left`` if in good order."""
         if self.worker is not None and not has_left:
             self.n_lost += 1
             self.reason = f"the worker that did it was lost {self.n_lost} times ({self.worker})"
@@ -307,19 +276,10 @@ class SentRun:
 
 
 def ending_of(sent: SentRun, content: object, root: Path) -> tuple[str, str] | None:
-    """What a run ends with by the answer of its worker; what it leaves is in its place then.
+    """Why a run failed, in one line and at length; both empty where it is done, and in its place.
 
-    Args:
-        sent: the run.
-        content: the answer, of which nothing is believed.
-        root: the study's folder.
-
-    Returns:
-        Why it failed, in one line and at length, both empty where it is done; None where the run is
-        to be sent again.
-
-    Raises:
-        UserError: if the worker can do no run at all.
+    Nothing is believed of ``content``, the answer of its worker. None where the run is to be sent
+    again; a worker that can do no run at all is a `UserError`.
     """
     try:
         answer = unpacked(content)

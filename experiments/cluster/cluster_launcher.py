@@ -82,14 +82,7 @@ def cluster_launcher(
 
 
 class ClusterLauncher:
-    """The driver's side of a cluster.
-
-    Args:
-        probe: lies in the study's folder.
-        command: the command that asked for the study.
-        limits: what each run may take.
-        n_wanted: how many workers there will be at least.
-    """
+    """The driver's side of a cluster, of which there will be ``n_wanted`` workers at least."""
 
     connection: Connection
 

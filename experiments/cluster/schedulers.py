@@ -99,10 +99,6 @@ class Jobs:
     """As many jobs as are wanted, of which those that have ended are sent again.
 
     Dask finds out that a job has ended only where one worker is all of it.
-
-    Args:
-        queue: of dask-jobqueue, with its scheduler in this process.
-        n_jobs: how many.
     """
 
     def __init__(self, queue: Any, n_jobs: int) -> None:
@@ -111,11 +107,7 @@ class Jobs:
         queue.scale(jobs=n_jobs)
 
     def replace(self, left: Collection[str]) -> None:
-        """Send again those whose workers have gone; called now and then.
-
-        Args:
-            left: addresses of workers that left in good order: these are not started again.
-        """
+        """Send again those whose workers have gone; not those that left in good order."""
         self._queue.loop.add_callback(self._replace, frozenset(left))
 
     def _replace(self, left: frozenset[str]) -> None:
@@ -184,12 +176,9 @@ class ClusterGoneError(UserError):
 
 
 class Connection:
-    """A client of a scheduler, and another when it has lost it.
+    """A client of a scheduler, made by ``connect``, and another when it has lost it.
 
-    Args:
-        connect: makes one; raises OSError where there is no scheduler.
-        prepare: called with each.
-        is_told: whether the user has said that an open scheduler will do.
+    Each is handed to ``prepare``.
     """
 
     def __init__(
@@ -205,11 +194,7 @@ class Connection:
         self._identity = ""
 
     def begin(self) -> None:
-        """Connect for the first time.
-
-        Raises:
-            UserError: if there is no scheduler, or it is open to the network.
-        """
+        """Connect for the first time; `UserError` if there is no scheduler, or an open one."""
         try:
             self._client = self._connected()
         except OSError as error:
@@ -222,11 +207,7 @@ class Connection:
                 self._is_lost = True
 
     def client(self) -> Client:
-        """A client that has its scheduler; it is waited for.
-
-        Raises:
-            ClusterGoneError: if it does not come back.
-        """
+        """A client that has its scheduler, which is waited for; else `ClusterGoneError`."""
         with self._lock:
             client = self._client
             if client is None or self._closed.is_set():
@@ -238,12 +219,7 @@ class Connection:
             return self._client
 
     def n_threads(self) -> Mapping[str, int]:
-        """How many runs each worker does at once, by address.
-
-        Raises:
-            UserError: if a worker is open to the network.
-            OSError: if the scheduler cannot be asked.
-        """
+        """How many runs each worker does at once, by address; a worker must not be open."""
         client = self.client()
         if _identity(client)["id"] != self._identity:
             self.lose(client)
@@ -315,11 +291,7 @@ Replace = Callable[[Collection[str]], object]
 
 
 def checked_cluster(text: str, is_told: bool) -> Cluster:
-    """What ``--cluster`` means, before anything is begun.
-
-    Raises:
-        UserError: if it means nothing, or a scheduler that is open to others.
-    """
+    """What ``--cluster`` means, before anything is begun; refused if it is open to others."""
     cluster = read_cluster(text, tuple(QUEUES))
     if isinstance(cluster, SchedulerAddress):
         check_address(cluster.read(), has_certificates(Security()), is_told)
@@ -330,14 +302,8 @@ def checked_cluster(text: str, is_told: bool) -> Cluster:
 def opened(cluster: Cluster, n_runs: int, is_told: bool) -> Iterator[tuple[Connect, Replace]]:
     """Have a scheduler while the ``with`` statement runs.
 
-    Args:
-        cluster: which.
-        n_runs: for how many runs at once jobs are to be started.
-        is_told: whether the user has said that an open one will do.
-
-    Yields:
-        What makes a client of it; and what is to be called now and then with the addresses of
-        workers that left in good order, so that workers and jobs that have ended are replaced.
+    Yields what makes a client of it; and what is to be called now and then with the addresses of
+    workers that left in good order, so that workers and jobs that have ended are replaced.
     """
     _be_quiet()
     dask.config.set({"distributed.deploy.lost-worker-timeout": SECONDS_TO_RESTART})
