@@ -144,7 +144,7 @@ def question_of(study: StudySpec) -> Question:
 
 # --- The file in the folder of a study that remembers the looks at it.
 
-FILE = "looks.json"
+LOOKS_FILE = "looks.json"
 _FORMAT = 1
 _LARGEST = 50_000_000  # bytes; a thousand agents looked at a hundred times take less
 _LARGEST_NUMBER = 1e300
@@ -153,7 +153,7 @@ _LARGEST_NUMBER = 1e300
 def write_looks(root: Path, log: LookLog) -> None:
     """Replace the file, so that it is there whole and for good."""
     looks = {name: asdict(each) for name, each in log.environments.items()}
-    write_json(root / FILE, {"format": _FORMAT, "environments": looks})
+    write_json(root / LOOKS_FILE, {"format": _FORMAT, "environments": looks})
 
 
 def read_looks(root: Path) -> LookLog:
@@ -162,7 +162,7 @@ def read_looks(root: Path) -> LookLog:
     Raises:
         UserError: if the file is not as it was written, so that nobody knows how many there were.
     """
-    path = root / FILE
+    path = root / LOOKS_FILE
     try:
         data = json.loads(read_file(path, _LARGEST))
     except FileNotFoundError:

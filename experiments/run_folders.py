@@ -31,7 +31,7 @@ from pipeline.signs_of_life import Tell, tell_nobody
 if TYPE_CHECKING:
     from experiments.results import LeftOut
 
-FOLDER = ".drafts"
+DRAFTS_FOLDER = ".drafts"
 LONGEST_DRAFT_NAME = 150  # bytes, besides the numbers and names of process and machine
 # After this long without a sign, a process elsewhere counts as gone: sooner than a lock, so that
 # whoever takes over the lock of a driver finds its drafts to be free.
@@ -48,7 +48,7 @@ def run_name(planned: PlannedRun) -> str:
 
 def draft_path(root: Path, planned: PlannedRun) -> Path:
     """Where a run of this process is written until it is whole."""
-    return root / FOLDER / f"{_own_mark()}@{platform.node()}@{run_name(planned)}"
+    return root / DRAFTS_FOLDER / f"{_own_mark()}@{platform.node()}@{run_name(planned)}"
 
 
 def _own_mark() -> str:
@@ -86,7 +86,7 @@ def holds_state(draft: Path) -> bool:
 
 def _drafts(root: Path) -> list[Path]:
     with contextlib.suppress(OSError):
-        return sorted(path for path in (root / FOLDER).iterdir() if path.is_dir())
+        return sorted(path for path in (root / DRAFTS_FOLDER).iterdir() if path.is_dir())
     return []
 
 
@@ -157,7 +157,7 @@ def leave_drafts(root: Path, name: str) -> None:
         is_left = _run_of(draft) == name and (_is_own(draft) or _is_dead(draft))
         if is_left and not holds_state(draft):
             remove_draft(draft)
-    _remove_empty(root / FOLDER)
+    _remove_empty(root / DRAFTS_FOLDER)
 
 
 def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
@@ -165,7 +165,7 @@ def remove_dead_drafts(root: Path, kept: Collection[str] = ()) -> None:
     for draft in _drafts(root):
         if _is_dead(draft) and _run_of(draft) not in kept:
             remove_draft(draft)
-    _remove_empty(root / FOLDER)
+    _remove_empty(root / DRAFTS_FOLDER)
 
 
 def make_folder(path: Path) -> None:

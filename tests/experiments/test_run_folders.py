@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import run_folders, run_in_child
+from experiments import run_folders
 from experiments.plan import plan
 from experiments.run_files import mixed_versions
 from experiments.run_folders import (
@@ -241,7 +241,7 @@ def test_no_file_of_a_run_is_open_when_it_is_renamed_into_place(
         assert (draft / "run.json").is_file()
 
     still_open = []
-    monkeypatch.setattr(run_in_child, "put_in_place", note)
+    monkeypatch.setattr(run_folders, "put_in_place", note)
     env = EnvironmentSpec(env_id, env_id, {"n_timesteps": 60})
     study = StudySpec("s", "S", (AgentSpec(algo, algo),), (env,), n_seeds=1)
     (planned,) = plan(study, tmp_path)
