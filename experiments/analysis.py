@@ -270,14 +270,13 @@ class AgentAnalysis:
     on_variant: bool = False
     #: What training changed in the environment, as the runs recorded it, in words.
     changes: tuple[str, ...] = ()
+    #: When it reached the threshold for good; likewise.
+    steps_to_stay: ThresholdSummary | None = None
 
     @property
     def marked(self) -> str:
         """The label, with a mark where the training was on a changed environment."""
         return f"{self.agent} {MARK}" if self.changes else self.agent
-
-    #: When it reached the threshold for good; likewise.
-    steps_to_stay: ThresholdSummary | None = None
 
 
 @dataclass(frozen=True)

@@ -380,6 +380,9 @@ class TimeLeft:
         return off + [(algo, ratio) for algo, ratio in late if ratio > 1 and algo not in known]
 
 
+# --- What runs have to say, read while others are still under way.
+
+
 class EarlyResults:
     """What each run of a study has to say, read when it has ended."""
 
