@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
@@ -350,18 +351,26 @@ def _statistics_on(
     """Figures of pulls on the bandit of a spec, see `pull_statistics`."""
     with closing(make_single_env(spec)) as env:
         bandit: Any = env.unwrapped
-        is_drifting = getattr(bandit, "drift_std", 0.0) > 0
-        # Means of the arms where each run has the same.
-        means = None if is_drifting else getattr(bandit, "means", None)
-        if means is not None and not getattr(bandit, "redraws", False):
-            more["true_means"] = np.array(means, dtype=np.float64)
         n_arms, n_contexts = bandit.n_arms, max(bandit.n_contexts, 1)
-        is_known = bandit.n_contexts > 0 and not is_drifting
+        is_known = bandit.n_contexts > 0 and not _is_drifting(bandit)
+        more["true_means"] = true_means(env)
     contexts = contexts if n_contexts > 1 else None
     found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
     # No arm can be recommended where the worth of arms moves, or goes by a vector.
     nowhere = np.full_like(found.simple_regret, np.nan)
     return found if is_known else replace(found, simple_regret=nowhere)
+
+
+def true_means(env: gym.Env[Any, Any]) -> Floats | None:
+    """Means of the arms by context, shape (n_contexts, n_arms), where each run has the same."""
+    bandit: Any = env.unwrapped
+    moves = getattr(bandit, "redraws", False) or _is_drifting(bandit)
+    means = getattr(bandit, "means", None)
+    return None if moves or means is None else np.array(means, dtype=np.float64)
+
+
+def _is_drifting(bandit: Any) -> bool:
+    return bool(getattr(bandit, "drift_std", 0.0) > 0)
 
 
 # --- All runs of an agent as one batch: each a fresh agent and one episode.
