@@ -32,12 +32,10 @@ from rich.table import Table
 from experiments.cluster import cluster_launcher as launching_there
 from experiments.cluster.addresses import SchedulerAddress
 from experiments.cluster.cluster_launcher import cluster_launcher
-from experiments.cluster.orders import Probe, probing
-from experiments.execution import execute
-from experiments.launching import Launchers, local_launcher
-from experiments.planned_runs import PlannedRun
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.cluster.working import Probe, probing
+from experiments.launching import Launchers, execute, local_launcher
+from experiments.plan import PlannedRun, plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 
 N_WORKERS = 2
 N_UNCOUNTED = 5 * N_WORKERS

@@ -25,7 +25,7 @@ from typing import Any
 from _process_trees import timed
 
 from experiments.launching import available_cores
-from experiments.study_files import read_study
+from experiments.study import read_study
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDIES = ("warehouse-learning-rate", "warehouse-discount", "warehouse-epsilon")

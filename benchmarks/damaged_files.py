@@ -30,13 +30,12 @@ from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from experiments.drafts import draft_path
-from experiments.planned_runs import PlannedRun
-from experiments.run_curves import joined
+from experiments.plan import PlannedRun, plan
+from experiments.results import read_run
+from experiments.run_files import joined
+from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
-from experiments.study_plan import plan
-from experiments.study_results import read_run
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.models.continuation import agent_to_continue
 from pipeline.models.model_choice import ChosenModel, ModelRequest, choose_model

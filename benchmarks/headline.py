@@ -20,9 +20,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis, analyse
-from experiments.study_files import read_study
-from experiments.study_plan import plan
-from experiments.study_results import read_results
+from experiments.plan import plan
+from experiments.results import read_results
+from experiments.study import read_study
 from report.conclusions import conclusion
 from report.markdown import escaped, markdown_table, name_of
 from report.seed_sentence import spans

@@ -26,9 +26,9 @@ import numpy as np
 import pandas as pd
 
 from experiments.analysis import analyse
-from experiments.run_curves import CURVE_COLUMNS
-from experiments.study_results import RUN_COLUMNS, StudyResults
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.results import RUN_COLUMNS, StudyResults
+from experiments.run_files import CURVE_COLUMNS
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.figures.figure_files import write_figures
 from report.page import write_report
 from report.series.study_series import study_series

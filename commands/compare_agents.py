@@ -29,8 +29,8 @@ from pipeline.stopping import stops_noticed
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from experiments.planned_runs import PlannedRun
-    from experiments.study_spec import StudySpec
+    from experiments.plan import PlannedRun
+    from experiments.study import StudySpec
 
 SEEDS = whole_number(1, 1_000_000)
 FIRST_SEED = whole_number(0, 2**31)
@@ -190,9 +190,9 @@ def _compare(args: argparse.Namespace) -> int:
 
     study = study_spec(args)
     from commands.terminal import table_console
-    from experiments.fork_server import end_server
+    from experiments.child_processes import end_server
+    from experiments.plan import plan
     from experiments.run_limits import RunLimits
-    from experiments.study_plan import plan
     from pipeline.folder_lock import folder_lock, told_if_gone
     from safe_files.regular_files import take_up
 
@@ -225,7 +225,7 @@ def _do_study(
     place: Place,
 ) -> int:
     """Do a study with the seeds that it has, once it is known how often it was looked at."""
-    from experiments.looks_file import read_looks
+    from experiments.looks import read_looks
 
     read_looks(root)
     place = _prepare(args, study, planned, root, console, place)
@@ -244,7 +244,7 @@ def _grow_study(
 ) -> int:
     """Do a study with more and more seeds, as was settled before the first look."""
     from experiments.growing import counts_of, grown, settle, settled_looks
-    from experiments.study_plan import plan
+    from experiments.plan import plan
 
     looks = settled_looks(study, root, args.max_seeds)
     counts = counts_of(study, looks)
@@ -278,8 +278,8 @@ def _prepare(
         repair(console, study, planned)
     with doing(console, "looking for runs that are there") as activity, loading_libraries():
         from experiments.child_processes import do_aside
-        from experiments.replaced_runs import check_settings_kept
-        from experiments.study_plan import check_settings
+        from experiments.plan import check_settings
+        from experiments.run_folders import check_settings_kept
 
         if not args.replace:
             check_settings_kept(planned, root)
@@ -306,7 +306,7 @@ def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], 
         return "", {}
     from agents.networks.engine_costs import machine_pace
     from commands.engine_lines import seconds_of, study_line
-    from experiments.time_left import expected_seconds
+    from experiments.launching import expected_seconds
     from pipeline.engine_outlook import planned_outlook
 
     found = {key: planned_outlook(runs[0].spec) for key, runs in missing.items()}

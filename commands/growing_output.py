@@ -9,11 +9,10 @@ from rich.console import Console
 
 from commands.places import Place
 from commands.study_output import conclude, do_missing, read, say
-from experiments.early_results import EarlyResults
 from experiments.growing import Counts, Step, counts_after, grown, take_planned_looks
-from experiments.launching import RunFailure
-from experiments.study_plan import plan
-from experiments.study_spec import StudySpec
+from experiments.launching import EarlyResults, RunFailure
+from experiments.plan import plan
+from experiments.study import StudySpec
 from report.wording import enumeration, seeds
 
 

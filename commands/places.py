@@ -19,7 +19,7 @@ from pipeline.errors import UserError
 if TYPE_CHECKING:
     from experiments.cluster.addresses import Cluster
     from experiments.launching import Launcher, Launchers
-    from experiments.planned_runs import PlannedRun
+    from experiments.plan import PlannedRun
     from experiments.run_limits import RunLimits
 
 
@@ -104,7 +104,7 @@ def place_of(
 
 
 def _start_server(planned: Sequence[PlannedRun]) -> None:
-    from experiments.fork_server import start_server
+    from experiments.child_processes import start_server
 
     start_server(_warm_ups(planned))  # it imports the libraries while this process does
 
@@ -128,7 +128,7 @@ def _cluster(
     for library in ("distributed", "cryptography", "dask_jobqueue"):
         if importlib.util.find_spec(library) is None:
             raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'")
-    from experiments.cluster.clusters import checked_cluster
+    from experiments.cluster.schedulers import checked_cluster
 
     cluster = checked_cluster(args.cluster, args.insecure_cluster)
     _check_jobs(cluster, args.jobs)

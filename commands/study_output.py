@@ -11,12 +11,10 @@ from rich.console import Console
 
 from commands.places import Place
 from commands.study_progress import StudyProgress
-from experiments.early_results import EarlyResults
-from experiments.execution import execute
-from experiments.launching import RunFailure
-from experiments.planned_runs import PlannedRun
-from experiments.replaced_runs import move_replaced_aside
-from experiments.study_spec import StudySpec
+from experiments.launching import EarlyResults, RunFailure, execute
+from experiments.plan import PlannedRun
+from experiments.run_folders import move_replaced_aside
+from experiments.study import StudySpec
 from pipeline.signs_of_life import Activity, doing
 
 if TYPE_CHECKING:
@@ -24,7 +22,7 @@ if TYPE_CHECKING:
 
     from experiments.analysis import StudyAnalysis
     from experiments.looks import Standing
-    from experiments.study_results import LeftOut, StudyResults
+    from experiments.results import LeftOut, StudyResults
     from report.page.sections import LearningPage
 
 
@@ -69,7 +67,7 @@ def read(
 ) -> StudyResults:
     """Read the runs that there are, but for those that were read early."""
     with doing(console, "reading the results") as activity:
-        from experiments.study_results import read_results
+        from experiments.results import read_results
 
         return read_results(study, planned, root, activity.at, early.of)
 
@@ -125,7 +123,7 @@ def _make_way(console: Console, planned: Sequence[PlannedRun], root: Path) -> No
 
 
 def _print_mixed_versions(console: Console, results: StudyResults) -> None:
-    from experiments.run_versions import mixed_versions
+    from experiments.run_files import mixed_versions
 
     note = mixed_versions(run.run.read_info() for run in results.finished)
     if note:
@@ -135,7 +133,7 @@ def _print_mixed_versions(console: Console, results: StudyResults) -> None:
 def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) -> None:
     """Move the folders of damaged runs aside, and say so."""
     with doing(console, "looking for damaged runs") as activity:
-        from experiments.repair import move_damaged_aside
+        from experiments.run_folders import move_damaged_aside
 
         moved = move_damaged_aside(study, planned, activity.at)
     for damaged, place in moved:
@@ -215,9 +213,8 @@ def _judge(
     with_page: bool,
 ) -> None:
     with doing(console, "judging the agents") as activity:
-        from experiments.analysis import analyse
-        from experiments.failed_runs import with_advice
-        from experiments.looking import take_looks
+        from experiments.analysis import analyse, with_advice
+        from experiments.growing import take_looks
         from report.terminal_tables import print_analysis, print_episodes_table
 
         analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
@@ -226,7 +223,7 @@ def _judge(
     print_analysis(console, analysis)
     width = results.study.episodes_table
     with doing(console, "writing the tables") as activity:
-        from experiments.study_files import write_study
+        from experiments.study import write_study
         from report.result_files import write_tables, write_verdicts
         from report.series.episode_blocks import episodes_table
 

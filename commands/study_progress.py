@@ -12,9 +12,8 @@ from rich.table import Table
 from rich.text import Text
 
 from commands.live_progress import LiveProgress
-from experiments.launching import RunFailure
-from experiments.planned_runs import PlannedRun
-from experiments.time_left import TimeLeft
+from experiments.launching import RunFailure, TimeLeft
+from experiments.plan import PlannedRun
 from pipeline.signs_of_life import duration
 
 

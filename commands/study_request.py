@@ -11,15 +11,16 @@ from typing import Any
 from agents import ALGORITHMS
 from commands.flag_values import LONGEST_FOLDER_NAME
 from commands.parsing import check_tensorboard
-from experiments.study_files import find_study, read_study
-from experiments.study_spec import (
+from experiments.study import (
     AS_IT_COMES,
     METRICS,
     AgentSpec,
     EnvironmentSpec,
     StudySpec,
     file_name,
+    find_study,
     layered,
+    read_study,
 )
 from pipeline.agent_checks import with_engine
 from pipeline.environments import check_env_id

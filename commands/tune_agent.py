@@ -36,7 +36,7 @@ def _tune(args: argparse.Namespace) -> int:
 
     tuning = tuning_spec(args)
     from commands.terminal import table_console
-    from experiments.fork_server import end_server
+    from experiments.child_processes import end_server
 
     go_on_unread()
     console = table_console()

@@ -21,9 +21,9 @@ from commands.tune_output import (
     print_winner,
 )
 from commands.tune_progress import TuningProgress
-from experiments.drafts import remove_dead_drafts
-from experiments.early_results import EarlyResults
-from experiments.study_plan import plan
+from experiments.launching import EarlyResults
+from experiments.plan import plan
+from experiments.run_folders import remove_dead_drafts
 from pipeline.folder_lock import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning
@@ -146,7 +146,7 @@ def _retested(
 ) -> tuple[int, Outcome]:
     """The exit code, and what the re-test shows."""
     from experiments.analysis import analyse
-    from experiments.looking import take_looks
+    from experiments.growing import take_looks
 
     root = place.root / FOLDER
     study = retest_study(place.tuning, place.root, candidates)

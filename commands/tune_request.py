@@ -9,7 +9,7 @@ from typing import Any
 
 from agents import ALGORITHMS
 from commands.flag_values import LONGEST_FOLDER_NAME
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from pipeline.agent_checks import with_engine
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown

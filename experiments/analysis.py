@@ -1,40 +1,243 @@
-"""From the runs of a study to judgements: estimates with intervals, verdicts on pairs, ranks."""
+"""From the runs of a study to judgements: estimates with intervals, verdicts on pairs, ranks.
+
+Beside typical scores it says who failed, who arrived when, and what the agents of failed runs do
+instead.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 import pandas as pd
 
-from experiments.evidence import Evidence, evidence_on
+from agents import ALGORITHMS
+from experiments.child_processes import do_aside
 from experiments.looks import Standing
-from experiments.overall_analysis import OverallAnalysis, analyse_overall
-from experiments.reliability import failures, speeds
-from experiments.seed_values import RESAMPLING_SEED
-from experiments.study_results import StudyResults
-from experiments.study_spec import COSTS, StudySpec
+from experiments.plan import PlannedRun
+from experiments.results import RESAMPLING_SEED, StudyResults, values_over_seeds
+from experiments.study import COSTS, StudySpec
 from mdp.array_types import Floats
 from pipeline.environments import training_changes, trains_on_variant
+from pipeline.errors import UserError
+from pipeline.evaluation import FAILED, NEARLY_ALL
 from pipeline.signs_of_life import Tell, tell_nobody
 from pipeline.train_spec import TrainSpec
 from verdicts import (
     FEWEST_SEEDS,
+    Band,
     Estimate,
     FailureCount,
     PairComparison,
     SpeedComparison,
     Summary,
     ThresholdSummary,
+    compare_speed,
+    count_failures,
     describe_pairs,
     estimate,
     fail_more_often,
+    failure_threshold,
+    fewest_seeds,
     grow,
     judge_pairs,
+    performance_profile,
+    probability_of_improvement,
     summarise,
     summarise_steps,
 )
+
+# Of the metrics, those on the scale of the best random or constant policy.
+ON_THE_SCALE = ("final", "best")
+
+# Where the agents live whose policies do not depend on what they go through.
+FIXED_POLICIES = ("agents.planning:", "agents.reference:")
+
+
+def agents_without_chance(results: StudyResults, table: pd.DataFrame) -> frozenset[str]:
+    """The agents that do not learn, where policies are evaluated exactly: every run is the same."""
+    if not (table["exact"] == True).all():  # noqa: E712  # None is no False here
+        return frozenset()
+    return frozenset(
+        agent.label
+        for agent in results.study.agents
+        if agent.algo in ALGORITHMS
+        and ALGORITHMS[agent.algo].entry_point.startswith(FIXED_POLICIES)
+    )
+
+
+def failures(
+    metric: str,
+    scores: Mapping[str, Floats],
+    baseline: float | None,
+    level: float,
+    certain: Collection[str],
+) -> dict[str, FailureCount]:
+    """By agent that depends on chance, the runs that get less than half as far as the best do.
+
+    Both counted from the baseline. The bounds of all agents hold together. Nothing where the
+    baseline is not known.
+    """
+    by_chance = {name: values for name, values in scores.items() if name not in certain}
+    if metric not in ON_THE_SCALE or baseline is None or not by_chance:
+        return {}
+    known = [values[np.isfinite(values)] for values in scores.values()]
+    typical = max((float(np.median(values)) for values in known if len(values)), default=np.nan)
+    threshold = failure_threshold(baseline, typical)
+    if np.isnan(threshold):
+        return {}
+    return {
+        name: count_failures(values, threshold, level / len(by_chance))
+        for name, values in by_chance.items()
+    }
+
+
+def speeds(
+    results: StudyResults, environment: str, agents: Sequence[str], level: float
+) -> tuple[SpeedComparison, ...]:
+    """Which agents come to stay above the threshold sooner than others."""
+    curves = results.curves
+    chosen = (curves["environment"] == environment) & (curves["kind"] == "evaluation")
+    spans = [
+        np.diff(rows["step"].to_numpy(dtype=np.float64), prepend=0.0).max()
+        for _, rows in curves[chosen & curves["agent"].isin(agents)].groupby(["agent", "seed"])
+    ]
+    spacing = max(spans, default=0.0)
+    if not spacing > 0:
+        return ()
+    steps = values_over_seeds(results, environment, "steps_to_stay")
+    return tuple(compare_speed({name: steps[name] for name in agents}, spacing, level))
+
+
+# --- What the verdicts on an environment rest on.
+
+MARGIN = 0.02  # of the way from the best random or constant policy to the optimum
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What verdicts on an environment rest on."""
+
+    environment: str  #: its label
+    #: By agent, the higher the better, shape (n_seeds,): NaN where there is no run.
+    scores: Mapping[str, Floats]
+    seeds: Mapping[str, int]  #: by agent, how many of the seeds it was to have
+    #: The highest expected return that any policy has, or of a bracket what none exceeds; or None.
+    optimum: float | None
+    optimum_at_least: float | None  #: the lower end of that bracket; None where there is none
+    baseline: float | None  #: that of the best random or constant policy, or None
+    threshold: float | None  #: the return that counts as solved, or None
+    margin: float  #: the difference within which agents count as equivalent
+    certain: frozenset[str]  #: the agents that do not depend on chance
+
+    @property
+    def given(self) -> dict[str, Floats]:
+        """The scores by agent, as many as it has seeds."""
+        return {name: values[: self.seeds[name]] for name, values in self.scores.items()}
+
+    def fewest(self, level: float) -> int:
+        """With how few seeds any two agents can be told apart at this level."""
+        there = {name for name, values in self.scores.items() if np.isfinite(values).any()}
+        n_tested = math.comb(len(there), 2) - math.comb(len(there & self.certain), 2)
+        return max(fewest_seeds(level / max(n_tested, 1)), FEWEST_SEEDS)
+
+
+def evidence_on(results: StudyResults, environment: str) -> Evidence | None:
+    """What there is on an environment; None where no run has finished."""
+    study, table = results.study, results.summary
+    table = table[table["environment"] == environment]
+    if table.empty:
+        return None
+    sign = -1.0 if study.metric in COSTS else 1.0
+    values = values_over_seeds(results, environment, study.metric)
+    optimum, baseline = _first(table, "optimum"), _first(table, "baseline")
+    at_least = _first(table, "optimum_at_least")
+    reachable = optimum if at_least is None else at_least
+    span = 0.0 if reachable is None or baseline is None else reachable - baseline
+    return Evidence(
+        environment=environment,
+        scores={name: sign * each for name, each in values.items()},
+        seeds=_seeds(results, environment),
+        optimum=optimum,
+        optimum_at_least=at_least,
+        baseline=baseline,
+        threshold=_first(table, "threshold"),
+        margin=MARGIN * span if study.margin is None else study.margin,
+        certain=agents_without_chance(results, table),
+    )
+
+
+def _seeds(results: StudyResults, environment: str) -> dict[str, int]:
+    counts = dict.fromkeys((agent.label for agent in results.study.agents), 0)
+    for run in results.planned:
+        if run.environment == environment:
+            counts[run.agent] += run.n_runs
+    return counts
+
+
+def _first(table: pd.DataFrame, column: str) -> float | None:
+    known = table[column].dropna()
+    return None if known.empty else float(known.iloc[0])
+
+
+# --- All environments together.
+
+
+@dataclass(frozen=True)
+class OverallAnalysis:
+    """How the agents compare over all environments, by their scores."""
+
+    scores: Mapping[str, Summary]  #: estimates by agent, the best first
+    #: By two agents' labels, the probability that the first scores higher.
+    improvement: Mapping[tuple[str, str], Estimate]
+    thresholds: Floats  #: scores at which the profiles are given, shape (n,)
+    profiles: Mapping[str, Band]  #: by agent, the share of runs that score higher than each of them
+
+
+def analyse_overall(results: StudyResults) -> OverallAnalysis | None:
+    """Judge the agents over all environments; None for a single one, or without scores."""
+    study = results.study
+    labels = [environment.label for environment in study.environments]
+    if len(labels) < 2:
+        return None
+    columns = [values_over_seeds(results, label, "score") for label in labels]
+    scores = {
+        agent.label: np.column_stack([column[agent.label] for column in columns])
+        for agent in study.agents
+    }
+    if any(np.isnan(matrix).all(axis=0).any() for matrix in scores.values()):
+        return None
+    summaries = {agent: summarise(matrix, seed=RESAMPLING_SEED) for agent, matrix in scores.items()}
+    order = sorted(summaries, key=lambda agent: summaries[agent].iqm.point, reverse=True)
+    thresholds = np.linspace(0, 1, 101)
+    return OverallAnalysis(
+        scores={agent: summaries[agent] for agent in order},
+        improvement=_improvement({agent: scores[agent] for agent in order}),
+        thresholds=thresholds,
+        profiles={
+            agent: performance_profile(scores[agent], thresholds, seed=RESAMPLING_SEED)
+            for agent in order
+        },
+    )
+
+
+def _improvement(scores: Mapping[str, Floats]) -> dict[tuple[str, str], Estimate]:
+    """How probable it is that one agent scores higher than another, seen from both sides."""
+    found = {}
+    for one, two in combinations(scores, 2):
+        chance = probability_of_improvement(scores[one], scores[two], seed=RESAMPLING_SEED)
+        found[one, two] = chance
+        found[two, one] = replace(
+            chance, point=1 - chance.point, low=1 - chance.high, high=1 - chance.low
+        )
+    return found
+
+
+# --- Each environment.
 
 # Of agents that were trained on a changed environment.
 MARK = "†"
@@ -42,115 +245,80 @@ MARK = "†"
 
 @dataclass(frozen=True)
 class AgentAnalysis:
-    """How one agent did on one environment.
+    """How one agent did on one environment."""
 
-    Attributes:
-        agent: its label.
-        algo: its name in the table of agents.
-        n_runs: runs that finished.
-        n_missing: runs that did not.
-        metric: estimates of what the verdicts are about, over seeds.
-        score: the same of the final policy between the best random or constant policy (0) and the
-            optimum (1); None where those are not known.
-        final: mean return of the final policy.
-        area: mean return over the learning curve.
-        last_episodes: mean return of the last training episodes.
-        regret: on bandits, the sum over all pulls; else without a figure.
-        steps_to_threshold: when the learning curve first reached the threshold; None without one.
-        steps_to_stay: when it reached the threshold for good; likewise.
-        episodes_to_stay: likewise.
-        success_rate: of the final policy; None where the environment does not say.
-        seconds: processor time that training took; nan where older versions did not measure it.
-        on_variant: whether it was trained on a variant of the environment, whose returns are not to
-            be held against those of evaluations or the optimum.
-        changes: what training changed in the environment, as the runs recorded it, in words.
-    """
-
-    agent: str
-    algo: str
-    n_runs: int
-    n_missing: int
-    metric: Summary
+    agent: str  #: its label
+    algo: str  #: its name in the table of agents
+    n_runs: int  #: runs that finished
+    n_missing: int  #: runs that did not
+    metric: Summary  #: estimates of what the verdicts are about, over seeds
+    #: The same of the final policy between the best random or constant policy (0) and the optimum
+    #: (1); None where those are not known.
     score: Summary | None
-    final: Estimate
-    area: Estimate
-    last_episodes: Estimate
-    regret: Estimate
+    final: Estimate  #: mean return of the final policy
+    area: Estimate  #: mean return over the learning curve
+    last_episodes: Estimate  #: mean return of the last training episodes
+    regret: Estimate  #: on bandits, the sum over all pulls; else without a figure
+    #: When the learning curve first reached the threshold; None without one.
     steps_to_threshold: ThresholdSummary | None
-    episodes_to_stay: ThresholdSummary | None
-    success_rate: Estimate | None
+    episodes_to_stay: ThresholdSummary | None  #: likewise
+    success_rate: Estimate | None  #: of the final policy; None where the environment does not say
+    #: Processor time that training took; nan where older versions did not measure it.
     seconds: Estimate
+    #: Whether it was trained on a variant of the environment, whose returns are not to be held
+    #: against those of evaluations or the optimum.
     on_variant: bool = False
+    #: What training changed in the environment, as the runs recorded it, in words.
     changes: tuple[str, ...] = ()
+    #: When it reached the threshold for good; likewise.
+    steps_to_stay: ThresholdSummary | None = None
 
     @property
     def marked(self) -> str:
         """The label, with a mark where the training was on a changed environment."""
         return f"{self.agent} {MARK}" if self.changes else self.agent
 
-    steps_to_stay: ThresholdSummary | None = None
-
 
 @dataclass(frozen=True)
 class EnvironmentAnalysis:
-    """How the agents compare on one environment.
+    """How the agents compare on one environment."""
 
-    Attributes:
-        environment: its label.
-        env_id: its Gymnasium id.
-        optimum: the highest expected return that any policy has, or of a bracket what none
-            exceeds; or None.
-        baseline: that of the best random or constant policy, or None.
-        threshold: the return that counts as solved, or None.
-        margin: the difference within which agents count as equivalent.
-        exact: whether all final returns are expectations rather than means of episodes.
-        agents: the agents, the best first.
-        pairs: every two of them, the better ranked first.
-        missing: by agent, also those of which no run has finished, the runs that are not there.
-        fewest: with how few seeds any two agents can be told apart.
-        failures: by agent, the runs that failed; empty where nothing says what that is.
-        unreliable: the pairs of agents of which the first is shown to fail more often.
-        speeds: every two agents, as to which of them stays above the threshold sooner.
-        seeds: by agent, how many seeds it was to have.
-        look: which look at these runs it is.
-        optimum_at_least: the lower end of the optimum's bracket; None where there is none.
-        optima: by agent, where agents play environments whose optima differ; else empty.
-        advice: sentences on runs that failed, see `experiments.failed_runs`.
-    """
-
-    environment: str
-    env_id: str
+    environment: str  #: its label
+    env_id: str  #: its Gymnasium id
+    #: The highest expected return that any policy has, or of a bracket what none exceeds; or None.
     optimum: float | None
-    baseline: float | None
-    threshold: float | None
-    margin: float
-    exact: bool
-    agents: tuple[AgentAnalysis, ...]
-    pairs: tuple[PairComparison, ...]
+    baseline: float | None  #: that of the best random or constant policy, or None
+    threshold: float | None  #: the return that counts as solved, or None
+    margin: float  #: the difference within which agents count as equivalent
+    exact: bool  #: whether all final returns are expectations rather than means of episodes
+    agents: tuple[AgentAnalysis, ...]  #: the agents, the best first
+    pairs: tuple[PairComparison, ...]  #: every two of them, the better ranked first
+    #: By agent, also those of which no run has finished, the runs that are not there.
     missing: Mapping[str, int] = field(default_factory=dict)
-    fewest: int = FEWEST_SEEDS
+    fewest: int = FEWEST_SEEDS  #: with how few seeds any two agents can be told apart
+    #: By agent, the runs that failed; empty where nothing says what that is.
     failures: Mapping[str, FailureCount] = field(default_factory=dict)
+    #: The pairs of agents of which the first is shown to fail more often.
     unreliable: tuple[tuple[str, str], ...] = ()
+    #: Every two agents, as to which of them stays above the threshold sooner.
     speeds: tuple[SpeedComparison, ...] = ()
+    #: By agent, how many seeds it was to have.
     seeds: Mapping[str, int] = field(default_factory=dict)
-    look: Standing = field(default_factory=Standing)
+    look: Standing = field(default_factory=Standing)  #: which look at these runs it is
+    #: The lower end of the optimum's bracket; None where there is none.
     optimum_at_least: float | None = None
+    #: By agent, where agents play environments whose optima differ; else empty.
     optima: Mapping[str, float] = field(default_factory=dict)
-    advice: tuple[str, ...] = ()
+    advice: tuple[str, ...] = ()  #: sentences on runs that failed, see `experiments.analysis`
 
 
 @dataclass(frozen=True)
 class StudyAnalysis:
-    """What a study has shown.
+    """What a study has shown."""
 
-    Attributes:
-        results: the runs.
-        environments: by environment.
-        overall: over all of them; None for a single one, or where a score is not known.
-    """
-
-    results: StudyResults
-    environments: tuple[EnvironmentAnalysis, ...]
+    results: StudyResults  #: the runs
+    environments: tuple[EnvironmentAnalysis, ...]  #: by environment
+    #: Over all of them; None for a single one, or where a score is not known.
     overall: OverallAnalysis | None
 
     @property
@@ -300,3 +468,85 @@ def _recorded_changes(results: StudyResults, agent: str, environment: str) -> tu
     of_agent = (r for r in results.finished if (r.agent, r.environment) == (agent, environment))
     run = next(of_agent, None)
     return () if run is None else training_changes(TrainSpec.of_data(run.run.read_info()["spec"]))
+
+
+# --- What the agents of failed runs do instead, and what to try first: once for each agent.
+
+# Agents of an environment that advice is given on, each of which is loaded and asked.
+MOST_TOLD = 4
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """The runs of an agent that failed on an environment, told by the first of them."""
+
+    agent: str
+    n_failed: int
+    n_runs: int
+    first: PlannedRun
+
+    def sentence(self, found: tuple[str, str | None]) -> str:
+        """What the first one's agent does instead, and what to try first."""
+        of = f"{self.n_failed} of {self.n_runs} runs" if self.n_runs > 1 else "its run"
+        seed = f"; seed {self.first.seed}" if self.n_failed > 1 else ""
+        instead, try_first = found
+        then = f"; try first: {try_first}" if try_first else ""
+        return f"{self.agent} failed in {of}{seed}: {instead}{then}."
+
+
+def with_advice(analysis: StudyAnalysis) -> StudyAnalysis:
+    """The analysis with sentences on runs that failed, where something can be said of them."""
+    failures = [_failures(analysis.results, one.environment) for one in analysis.environments]
+    asked = [failure.first for several in failures for failure in several[:MOST_TOLD]]
+    answers = iter(do_aside(advice_on, asked) if asked else ())
+    environments = []
+    for one, several in zip(analysis.environments, failures, strict=True):
+        told, more = several[:MOST_TOLD], several[MOST_TOLD:]
+        found = [(failure, next(answers)) for failure in told]
+        advice = [failure.sentence(answer) for failure, answer in found if answer is not None]
+        if more:
+            names = ", ".join(f"{each.agent} ({each.n_failed} of {each.n_runs})" for each in more)
+            advice.append(f"Runs of {len(more)} more agents failed: {names}.")
+        environments.append(replace(one, advice=tuple(advice)))
+    return replace(analysis, environments=tuple(environments))
+
+
+def _failures(results: StudyResults, environment: str) -> list[_Failure]:
+    table = results.summary[results.summary["environment"] == environment]
+    runs = {
+        (run.agent, run.seed): run for run in results.finished if run.environment == environment
+    }
+    failures = []
+    for agent, rows in table.groupby("agent", sort=False):
+        has_failed = rows["score"].astype(float) < FAILED
+        # Such a policy may never end an episode; the advice looks whether it does.
+        has_failed |= rows["success_rate"].astype(float) < 1 - NEARLY_ALL
+        failed = rows[has_failed & rows["exact"].astype(bool)]
+        if not failed.empty:
+            first = runs[str(agent), int(failed["seed"].min())]
+            failures.append(_Failure(str(agent), len(failed), len(rows), first))
+    return failures
+
+
+def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]:
+    """What the agent of each run does instead, and what to try first; None for nothing to say."""
+    return [_advice_on(run) for run in runs]
+
+
+def _advice_on(planned: PlannedRun) -> tuple[str, str | None] | None:
+    from pipeline.evaluation.advice import advice
+    from pipeline.evaluation.kept_evaluators import evaluator_of
+    from pipeline.models.model_loading import load_model
+
+    run, spec = planned.run, planned.spec
+    with suppress(UserError, OSError):
+        evaluator = evaluator_of(spec)
+        if evaluator is None:
+            return None
+        agent = load_model(spec.algo, run.model_path, modules=spec.user_modules, device="cpu")
+        if evaluator.obstacle(agent):
+            return None
+        n_steps = int(run.read_info()["n_timesteps"])
+        found = advice(spec, agent, evaluator, evaluator(agent), n_steps)
+        return None if found is None else (found.instead, found.try_first)
+    return None

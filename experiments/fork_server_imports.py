@@ -9,8 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 
-from experiments.fork_server import OUR_OWN, WARM_UPS
-from experiments.task_in_child import leave_signals_to_supervisor
+from experiments.child_processes import OUR_OWN, WARM_UPS, leave_signals_to_supervisor
 from pipeline.library_loading import loading_libraries
 
 

@@ -1,19 +1,99 @@
-"""Studies that grow until their pairs are decided: the looks, settled first, and what follows."""
+"""Looks at a study that are taken and remembered, and studies that grow until all is decided."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from experiments.evidence import Evidence, evidence_on
-from experiments.looking import look_at, remember
-from experiments.looks import Design, LookLog, Looks, Standing, question_of
-from experiments.looks_file import read_looks
-from experiments.study_results import StudyResults
-from experiments.study_spec import StudySpec
+import numpy as np
+
+from experiments.analysis import Evidence, evidence_on
+from experiments.looks import (
+    Design,
+    Look,
+    LookLog,
+    Looks,
+    Question,
+    Standing,
+    question_of,
+    read_looks,
+    write_looks,
+)
+from experiments.results import StudyResults
+from experiments.study import StudySpec
+from mdp.array_types import Floats
 from pipeline.errors import UserError
 from verdicts import Growth, grow, look_sizes
+
+
+def take_looks(results: StudyResults) -> dict[str, Standing]:
+    """Look at the runs of a study, by environment, and remember it before anything is shown.
+
+    The same runs and the same question are the same look, however often it is taken.
+    """
+    log = read_looks(results.root)
+    question, standings, environments = question_of(results.study), {}, dict(log.environments)
+    for environment in results.study.environments:
+        evidence = evidence_on(results, environment.label)
+        if evidence is not None:
+            looks, standing = _taken(log.on(environment.label), evidence, question)
+            standings[environment.label] = standing
+            if looks.taken:
+                environments[environment.label] = looks
+    remember(results.root, log, LookLog(environments))
+    return standings
+
+
+def remember(root: Path, before: LookLog, after: LookLog) -> None:
+    """Write the looks at a study down, if there are any that were not."""
+    if after != before:
+        write_looks(root, after)
+
+
+def look_at(
+    evidence: Evidence, seeds: Mapping[str, int], question: Question, level: float, *, planned: bool
+) -> Look:
+    """A look at the first seeds of each agent, now."""
+    scores = {name: evidence.scores[name][:n] for name, n in seeds.items()}
+    return Look(
+        date=time.strftime("%Y-%m-%d %H:%M:%S"),
+        question=question,
+        seeds=dict(seeds),
+        runs={name: int(np.isfinite(values).sum()) for name, values in scores.items()},
+        digests={name: _digest(values) for name, values in scores.items()},
+        level=level,
+        planned=planned,
+    )
+
+
+def _taken(looks: Looks, evidence: Evidence, question: Question) -> tuple[Looks, Standing]:
+    level = looks.next_level
+    look = look_at(evidence, evidence.seeds, question, level, planned=False)
+    for place, earlier in enumerate(looks.taken):
+        if earlier.shows(look):
+            return looks, Standing(place + 1, looks.level_at(place), level)
+    if _says_nothing(evidence, level):
+        return looks, Standing(len(looks.taken) + 1, level, level, is_counted=False)
+    looks = replace(looks, taken=(*looks.taken, look))
+    return looks, Standing(len(looks.taken), level, looks.next_level)
+
+
+def _says_nothing(evidence: Evidence, level: float) -> bool:
+    """Whether so few runs claim nothing at this level, whatever they score: that is no look."""
+    there = sorted(int(np.isfinite(values).sum()) for values in evidence.scores.values())
+    return len(there) < 2 or there[-2] < evidence.fewest(level)
+
+
+def _digest(scores: Floats) -> str:
+    """The same for the same scores, but for their last bits, on every machine."""
+    text = ",".join(f"{score:.9g}" for score in scores)
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+# --- Growing: the looks are settled before the first of them.
 
 MOST_SEEDS = 50
 
@@ -23,19 +103,12 @@ Counts = dict[tuple[str, str], int]
 
 @dataclass(frozen=True)
 class Step:
-    """What the looks at an environment have come to.
+    """What the looks at an environment have come to."""
 
-    Attributes:
-        environment: its label.
-        design: the looks that were settled, and how many seeds each agent has or gets next.
-        growth: what is decided.
-        standing: the last look's, among all.
-    """
-
-    environment: str
-    design: Design
-    growth: Growth
-    standing: Standing
+    environment: str  # its label
+    design: Design  # the looks that were settled, and how many seeds each agent has or gets next
+    growth: Growth  # what is decided
+    standing: Standing  # the last look's, among all
 
     @property
     def undecided(self) -> list[tuple[str, str]]:
@@ -93,11 +166,7 @@ def grown(study: StudySpec, counts: Counts) -> StudySpec:
 
 
 def take_planned_looks(results: StudyResults) -> list[Step]:
-    """Look at every environment as was settled, and write down who gets more seeds.
-
-    Raises:
-        UserError: if runs that have been looked at are others now.
-    """
+    """Look at every environment as was settled, and write down who gets more seeds."""
     log = read_looks(results.root)
     environments, steps = dict(log.environments), []
     for environment in results.study.environments:
@@ -131,11 +200,7 @@ def _settled(study: StudySpec, looks: Looks, most: int | None) -> Design:
 
 
 def _check_same(root: Path, there: Design, now: Design) -> None:
-    """Refuse to look otherwise than was settled.
-
-    Raises:
-        UserError: naming what differs.
-    """
+    """Refuse to look otherwise than was settled, naming what differs."""
     differences = [
         f"{key} {before}, now {after}"
         for key, before, after in (
@@ -157,11 +222,7 @@ def _check_same(root: Path, there: Design, now: Design) -> None:
 
 
 def _check_runs(root: Path, looks: Looks, evidence: Evidence) -> None:
-    """Refuse runs that have been done anew since they were looked at.
-
-    Raises:
-        UserError: naming the environment.
-    """
+    """Refuse runs that have been done anew since they were looked at."""
     for there in looks.planned:
         now = look_at(evidence, there.seeds, there.question, there.level, planned=True)
         # Some may be missing now, or may have been then.

@@ -1,25 +1,30 @@
-"""One run of a study, in the process that does it."""
+"""One run of a study in the process that does it: from the beginning, or going on from a state."""
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
-from experiments.drafts import draft_path, take_over
-from experiments.planned_runs import PlannedRun
-from experiments.replaced_runs import make_room, move_aside
-from experiments.run_or_go_on import do_or_go_on
-from pipeline.file_digests import DamagedFileError
-from pipeline.files import kept_later, put_in_place, settle, sync_together
+from rich.console import Console
+
+from experiments.plan import PlannedRun
+from experiments.run_folders import (
+    claim_draft,
+    holds_state,
+    put_run_in_place,
+    take_over,
+)
+from pipeline.broken_runs import is_of_the_machine
+from pipeline.errors import UserError
+from pipeline.files import kept_later
 from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
+from pipeline.resuming.state_folder import remove_states
+from pipeline.resuming.state_keeping import StateKeeping
+from pipeline.resuming.unfinished_runs import go_on
+from pipeline.run_folder import Run
 from pipeline.signs_of_life import Heartbeat
+from pipeline.training import train
 from pipeline.user_modules import import_again
-from safe_files.regular_files import hold
-
-
-def do_planned_run(planned: PlannedRun, root: Path, command: str) -> None:
-    """As `do_run`, in a draft of this process."""
-    hold(root)
-    do_run(planned, draft_path(root, planned), command)
 
 
 def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
@@ -33,24 +38,51 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     heart.start()
     try:
         with kept_later(draft):  # what a power cut leaves of it without a state is begun anew
-            do_or_go_on(planned, draft, command)
+            _do_or_go_on(planned, draft, command)
     finally:
         heart.stop()
     put_run_in_place(planned, draft)
 
 
-def put_run_in_place(planned: PlannedRun, draft: Path) -> None:
-    """Rename a draft that is whole; another's result that is there stays, and others give way."""
-    settle(draft)
+def _do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:
+    """Do a run in its draft, to its end.
+
+    The draft is there where another process has left it: the run goes on from its state if that is
+    whole, of these very settings, and saved by these very sources, and else begins anew.
+    """
+    run = Run(draft, planned.run.env_name)
+    keeping = _to_go_on_with(planned, run)
+    if not keeping.goes_on:
+        _begin_anew(planned, run)
+    if planned.is_batch:
+        from experiments.bandits import do_batch  # with pandas, which no other run needs
+
+        do_batch(planned.spec, planned.n_runs, run, command)
+        return
+    args = {"algo": planned.spec.algo, "env": planned.spec.env_id, "seed": planned.seed}
     try:
-        planned.check_record()
-    except DamagedFileError:
-        move_aside(planned.path)
-    make_room(planned, draft.parent.parent)
-    planned.path.parent.mkdir(parents=True, exist_ok=True)
+        train(planned.spec, Console(quiet=True), args, command, run, keeping)
+    except Exception as error:
+        if not is_of_the_machine(error):
+            remove_states(run.state_path)  # the next try begins anew, maybe with other code
+        raise
+
+
+def _to_go_on_with(planned: PlannedRun, run: Run) -> StateKeeping:
+    """The state that another process has left, where there is one."""
+    anew = StateKeeping(was_cut_off=run.path.is_dir())
+    if planned.is_batch or not holds_state(run.path) or not planned.is_of(run):
+        return anew
     try:
-        put_in_place(draft, planned.path)
-    except OSError:
-        if not planned.is_finished:
-            raise
-    sync_together([], list(planned.path.parents)[:3])
+        keeping = go_on(run, StateKeeping(), str)  # the report on a run is its folder
+    except UserError:  # it is damaged, or another user's
+        return anew
+    is_ours = keeping.state is None or keeping.state.is_of_these_sources
+    return keeping if is_ours else anew
+
+
+def _begin_anew(planned: PlannedRun, run: Run) -> None:
+    claim_draft(run.path)
+    run.params_path.mkdir()
+    if planned.spec.tensorboard_log is not None:
+        shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)  # of an earlier try

@@ -61,16 +61,12 @@ def _quantity(text: str, units: dict[str, int]) -> float:
 class RunLimits:
     """What a run may take.
 
-    Attributes:
-        seconds: from the start of its process; None for no limit.
-        memory: bytes of the machine's memory; None for no limit.
-
     Raises:
         UserError: if memory cannot be measured here.
     """
 
-    seconds: float | None = None
-    memory: int | None = None
+    seconds: float | None = None  # from the start of its process; None for no limit
+    memory: int | None = None  # bytes of the machine's memory; None for no limit
 
     def __post_init__(self) -> None:
         if self.memory is not None and sys.platform == "win32":

@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from experiments.planned_runs import PlannedRun
+from experiments.plan import PlannedRun
 from mdp.code_cache import PACKAGES
 from pipeline.models.model_loading import agent_class
 from pipeline.settings.hyperparams import split

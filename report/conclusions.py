@@ -6,9 +6,14 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from experiments.analysis import MARK, AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.reliability import ON_THE_SCALE
-from experiments.study_spec import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
+from experiments.analysis import (
+    MARK,
+    ON_THE_SCALE,
+    AgentAnalysis,
+    EnvironmentAnalysis,
+    StudyAnalysis,
+)
+from experiments.study import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
 from report.pair_sentences import (
     failed_runs,
     on_unreliable,

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from PIL import Image
 
-from experiments.planned_runs import PlannedRun
-from experiments.study_spec import file_name
+from experiments.plan import PlannedRun
+from experiments.study import file_name
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError, one_line
 from pipeline.files import replacing, write_json
@@ -24,7 +24,7 @@ from pipeline.signs_of_life import Tell, tell_nobody
 from safe_files.regular_files import read_file
 
 if TYPE_CHECKING:
-    from experiments.study_results import StudyResults
+    from experiments.results import StudyResults
     from pipeline.models.model_choice import ChosenModel
 
 FILM = "episode.gif"
@@ -162,7 +162,7 @@ def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
 
 def _checkpoints(planned: PlannedRun) -> Iterator[tuple[Path, int]]:
     """The checkpoints that were due, each with the number of the episode it followed."""
-    from experiments.run_figures import read_episodes
+    from experiments.run_files import read_episodes
 
     every = planned.spec.save_every_n_episodes
     ends = read_episodes(planned.run).steps

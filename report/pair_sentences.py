@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from experiments.analysis import EnvironmentAnalysis
-from experiments.study_spec import StudySpec
+from experiments.study import StudySpec
 from report.wording import enumeration, interval, number, seeds
 from verdicts import PairComparison
 

@@ -13,8 +13,8 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
-from experiments.pull_statistics import QUANTILES, PullStatistics
-from experiments.study_spec import COSTS, StudySpec
+from experiments.bandits import QUANTILES, PullStatistics
+from experiments.study import COSTS, StudySpec
 from report.ranking_cells import Cell, bar, crossing, estimate_cell, number_cell, threshold_cell
 from report.wording import interval_alone, number
 

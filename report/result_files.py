@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from experiments.analysis import StudyAnalysis
-from experiments.study_results import StudyResults
+from experiments.results import StudyResults
 from pipeline.files import replacing, write_text
 from report.latex import LATEX
 from report.markdown import MARKDOWN

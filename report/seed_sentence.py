@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
 
-from experiments.tuning_seeds import Seeds, TuningSeeds
+from experiments.plan import Seeds, TuningSeeds
 from report.wording import enumeration
 
 MOST_NAMES = 6

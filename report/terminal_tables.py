@@ -11,8 +11,8 @@ from rich.measure import Measurement
 from rich.table import Table
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from experiments.study_spec import METRIC_WORDS, StudySpec
-from experiments.tuning_seeds import tuning_seeds
+from experiments.plan import tuning_seeds
+from experiments.study import METRIC_WORDS, StudySpec
 from report.conclusions import conclusion
 from report.pair_sentences import seeds_of
 from report.ranking_cells import Cell

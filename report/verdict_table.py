@@ -6,9 +6,9 @@ import math
 from typing import Literal
 
 from experiments.analysis import MARK, AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.study_results import StudyResults
-from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
-from experiments.tuning_seeds import tuning_seeds
+from experiments.plan import tuning_seeds
+from experiments.results import StudyResults
+from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from report.conclusions import conclusion, none_has_learnt, on_changes
 from report.markdown import MARKDOWN
 from report.markup_language import MarkupLanguage

@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import hypothesis
 import pytest
 
-from experiments.fork_server import PRELOADED
+from experiments.child_processes import PRELOADED
 from pipeline.stopping import SIGNALS
 from safe_files import regular_files
 
@@ -108,7 +108,7 @@ HOSTILE = "</script><script>document.title='taken'</script>"
 
 def small_study():
     """Three agents, one of them with a name that is an attack, on two maps with two seeds."""
-    from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 
     agents = (
         AgentSpec("Q-learning & co", "qlearning"),
@@ -176,10 +176,10 @@ def type_in_own_folder(own_folder, monkeypatch, capsys):
 @pytest.fixture(scope="session")
 def do_study():
     """Does the runs of a study that are missing, in this process, and reads its results."""
-    from experiments.drafts import draft_path
+    from experiments.plan import plan
+    from experiments.results import read_results
+    from experiments.run_folders import draft_path
     from experiments.run_in_child import do_run
-    from experiments.study_plan import plan
-    from experiments.study_results import read_results
 
     def do(study, root):
         planned = plan(study, root)
@@ -195,10 +195,10 @@ def do_study():
 def report_study(tmp_path_factory):
     """The study, all of its runs done but one, which has failed; its page and how it was asked."""
     from experiments.analysis import analyse
-    from experiments.drafts import draft_path
+    from experiments.plan import plan
+    from experiments.results import read_results
+    from experiments.run_folders import draft_path
     from experiments.run_in_child import do_run
-    from experiments.study_plan import plan
-    from experiments.study_results import read_results
     from report import films
     from report.page import film_section, write_report
     from report.series.study_series import study_series
@@ -225,8 +225,8 @@ def report_study(tmp_path_factory):
 def one_environment(report_study):
     """The same with its first environment alone."""
     from experiments.analysis import analyse
-    from experiments.study_plan import plan
-    from experiments.study_results import read_results
+    from experiments.plan import plan
+    from experiments.results import read_results
 
     study = dataclasses.replace(
         report_study.study, environments=report_study.study.environments[:1]

@@ -8,8 +8,8 @@ import pytest
 
 from commands.compare_agents import build_parser
 from commands.study_request import study_spec
-from experiments.study_files import _QUICK_VALUES, _STUDY_KEYS, read_study
-from experiments.study_plan import plan
+from experiments.plan import plan
+from experiments.study import _QUICK_VALUES, _STUDY_KEYS, read_study
 
 ROOT = Path(__file__).parent.parent
 TEXT = (ROOT / "docs" / "compare.md").read_text()

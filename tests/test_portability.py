@@ -42,8 +42,7 @@ ABSENT = ("/tmp", "/dev/", "/proc")  # noqa: S108  # nothing is written there
 
 # Where one of them stands all the same, and why.
 GUARDED = {
-    ("experiments/awaited_child.py", "os.kill"): "asks for the platform before it",
-    ("experiments/fork_server.py", "os.kill"): "asks for the platform before it",
+    ("experiments/child_processes.py", "os.kill"): "asks for the platform before it",
     ("experiments/run_limits.py", "/proc"): "refuses to measure on Windows",
     ("mdp/code_cache.py", ".chmod"): "modes are neither set nor checked on Windows",
     ("pipeline/liveness.py", "os.kill"): "asks _winapi on Windows, before it",

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.planned_runs import PlannedRun
-from experiments.run_curves import Curve
-from experiments.study_results import read_run
+from experiments.plan import PlannedRun
+from experiments.results import read_run
+from experiments.run_files import Curve
 from pipeline.errors import UserError
 from tuning.tuning_spec import Objective, TuningSpec
 from verdicts import steps_to_threshold

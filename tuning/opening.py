@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from agents import ALGORITHMS
-from experiments.study_plan import check_settings
+from experiments.plan import check_settings
 from pipeline.errors import UserError
 from safe_files.regular_files import take_up
 from tuning.judging import judged

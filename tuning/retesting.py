@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.planned_runs import PlannedRun
-from experiments.study_spec import METRICS, AgentSpec, Metric, StudySpec
+from experiments.plan import PlannedRun
+from experiments.study import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import write_text
 from tuning.entry_files import entry_text

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from experiments.launching import Launcher, RunFailure
-from experiments.planned_runs import PlannedRun
+from experiments.plan import PlannedRun
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import DISK_ERRORS

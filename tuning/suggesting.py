@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from experiments.study_spec import layered
+from experiments.study import layered
 from pipeline.errors import UserError
 from tuning.tuning_spec import TuningSpec
 

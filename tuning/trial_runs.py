@@ -8,9 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from experiments.planned_runs import PlannedRun
-from experiments.study_plan import check_settings, plan
-from experiments.study_spec import AgentSpec
+from experiments.plan import PlannedRun, check_settings, plan
+from experiments.study import AgentSpec
 from pipeline.json_text import json_text
 from tuning.tuning_spec import TuningSpec
 

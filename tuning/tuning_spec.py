@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from agents import ALGORITHMS
-from experiments.study_spec import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.json_text import plain
 

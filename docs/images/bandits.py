@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 import envs  # noqa: F401  # registers the bandits
 from agents.bandits.batch import run_batch
 from envs.bandits import log_uniformly, read_log
-from experiments.off_policy.estimators import evaluate_policy, mean_reward
-from experiments.off_policy.reward_models import cross_fit
+from experiments.off_policy.estimators import cross_fit, evaluate_policy, mean_reward
 from report.series.agent_marks import COLOURS
 
 FOLDER = Path(__file__).parent

@@ -33,56 +33,32 @@ class LocalWorkers:
 
 @dataclass(frozen=True)
 class SchedulerAddress:
-    """A scheduler that is there, by its address or by the file that has it.
+    """A scheduler that is there, by its address or by the file that has it."""
 
-    Attributes:
-        text: the address; empty where it stands in the file.
-        file: the file; None where there is none.
-    """
-
-    text: str
-    file: Path | None = None
+    text: str  # the address; empty where it stands in the file
+    file: Path | None = None  # the file; None where there is none
 
     def read(self) -> str:
-        """The address, as it is now: with ``tcp://`` or ``tls://``.
-
-        Raises:
-            UserError: if the file cannot be read, or holds none.
-        """
+        """The address, as it is now: with ``tcp://`` or ``tls://``."""
         text = self.text if self.file is None else _address_in(self.file)
         return text if "://" in text else f"tcp://{text}"
 
 
 @dataclass(frozen=True)
 class JobQueue:
-    """Workers that a queueing system starts as jobs.
+    """Workers that a queueing system starts as jobs."""
 
-    Attributes:
-        system: its name in dask-jobqueue.
-        settings: what dask-jobqueue is told of it.
-        n_cores: of each job, as many runs at once.
-        file: where that stands.
-    """
-
-    system: str
-    settings: dict[str, Any]
-    n_cores: int
-    file: Path
+    system: str  # its name in dask-jobqueue
+    settings: dict[str, Any]  # what dask-jobqueue is told of it
+    n_cores: int  # of each job, as many runs at once
+    file: Path  # where that stands
 
 
 Cluster = LocalWorkers | SchedulerAddress | JobQueue
 
 
 def read_cluster(text: str, systems: tuple[str, ...]) -> Cluster:
-    """What ``--cluster`` means.
-
-    Args:
-        text: what was typed.
-        systems: the queueing systems that there are.
-
-    Raises:
-        UserError: if it means nothing.
-    """
+    """What ``--cluster`` means, or `UserError`; ``systems`` are the queueing systems there are."""
     if text.startswith("local:"):
         number = text.removeprefix("local:")
         if number.isascii() and number.isdecimal() and 0 < int(number[:9]) <= MOST_LOCAL_WORKERS:
@@ -99,15 +75,9 @@ def read_cluster(text: str, systems: tuple[str, ...]) -> Cluster:
 
 
 def check_address(address: str, has_certificates: bool, is_told: bool) -> None:
-    """Refuse to talk to a scheduler that others may talk to.
+    """Refuse a scheduler that is open to the network, or by TLS without its certificates.
 
-    Args:
-        address: the scheduler's.
-        has_certificates: whether Dask is configured with those that TLS takes.
-        is_told: whether the user has said that an open one will do.
-
-    Raises:
-        UserError: if it is open to the network, or TLS lacks its certificates.
+    Where ``is_told``, the user has said that an open one will do.
     """
     scheme = urlsplit(address).scheme
     if scheme not in ("tcp", "tls"):

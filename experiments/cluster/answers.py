@@ -9,13 +9,22 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import struct
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+import time
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Future
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from pipeline.files import portable_name
+from experiments.launching import RunFailure
+from experiments.plan import PlannedRun
+from experiments.run_folders import claim_draft, draft_path, put_run_in_place, remove_draft
+from pipeline.errors import UserError, one_line
+from pipeline.file_digests import FIELD, RECORD, RecordedFiles
+from pipeline.files import portable_name, sync_file, sync_folders
+from pipeline.folder_lock import is_gone
 
 # The last is for a worker that can do no run at all.
 DONE, FAILED, STOPPED, UNFIT = "done", "failed", "stopped", "unfit"
@@ -35,18 +44,12 @@ class RefusedAnswerError(ValueError):
 
 @dataclass(frozen=True)
 class Answer:
-    """What a worker says of a run.
+    """What a worker says of a run."""
 
-    Attributes:
-        kind: one of `KINDS`.
-        reason: why it failed.
-        details: the same at length.
-        files: what it left, by relative name; None where it says that it lies in its place already.
-    """
-
-    kind: str
-    reason: str = ""
-    details: str = ""
+    kind: str  # one of `KINDS`
+    reason: str = ""  # why it failed
+    details: str = ""  # the same at length
+    # What it left, by relative name; None where it says that it lies in its place already.
     files: dict[str, bytes] | None = field(default=None, repr=False)
 
 
@@ -67,11 +70,7 @@ def packed(answer: Answer) -> bytes:
 
 
 def unpacked(content: object) -> Answer:
-    """The answer that bytes hold.
-
-    Raises:
-        RefusedAnswerError: if they hold none, or one with files that may not be written.
-    """
+    """The answer that bytes hold; refused if they hold none, or files that may not be written."""
     if not isinstance(content, bytes):
         raise RefusedAnswerError(f"it is a {type(content).__name__}, and not bytes")
     head, rest = _head(content)
@@ -88,11 +87,7 @@ def unpacked(content: object) -> Answer:
 
 
 def files_in(folder: Path, prefix: str) -> dict[str, bytes]:
-    """All files in a folder, by relative name after a prefix.
-
-    Raises:
-        ValueError: if they are more, or larger, than an answer takes.
-    """
+    """All files in a folder, by relative name after a prefix; ValueError if they are too many."""
     paths = sorted(p for p in folder.rglob("*") if p.is_file() and not p.is_symlink())
     size = sum(path.stat().st_size for path in paths)
     if size > LARGEST or len(paths) > MOST_FILES:
@@ -158,3 +153,150 @@ def _check_name(name: str) -> None:
     for part in parts:
         if part in ("", ".", "..") or portable_name(part, 255) != part:
             raise RefusedAnswerError(f"{name!a} would lie elsewhere")
+
+
+# --- What workers say they have done, held against what they were asked for.
+
+# Network folders show what others have written with a delay.
+SECONDS_TO_APPEAR = 10.0
+_SECONDS_BETWEEN_LOOKS = 0.25
+
+
+def check_in_place(planned: PlannedRun) -> None:
+    """Make sure that a run lies in its folder, as a worker says that shares it."""
+    until = time.monotonic() + SECONDS_TO_APPEAR
+    while not planned.is_finished:
+        if time.monotonic() > until:
+            raise RefusedAnswerError("the run is not in its folder, where a worker says it is")
+        time.sleep(_SECONDS_BETWEEN_LOOKS)
+
+
+def receive(planned: PlannedRun, root: Path, files: Mapping[str, bytes]) -> None:
+    """Put files ``run/...`` and ``tensorboard/...`` in place, if they are of this very run."""
+    run, log = _part(files, "run/"), _part(files, "tensorboard/")
+    if len(run) + len(log) != len(files) or (log and planned.spec.tensorboard_log is None):
+        raise RefusedAnswerError("it holds files of no run")
+    if is_gone(root):
+        raise RefusedAnswerError("the folder of the study is gone")
+    draft = draft_path(root, planned)
+    claim_draft(draft)
+    try:
+        _write(draft, run)
+        _check(planned, draft, set(run))
+        if planned.spec.tensorboard_log is not None:
+            shutil.rmtree(planned.spec.tensorboard_log, ignore_errors=True)
+            _write(planned.spec.tensorboard_log, log)
+        put_run_in_place(planned, draft)
+    except ValueError as error:  # a name that cannot be written
+        raise RefusedAnswerError(str(error)) from error
+    finally:
+        remove_draft(draft)
+
+
+def _part(files: Mapping[str, bytes], prefix: str) -> dict[str, bytes]:
+    return {n.removeprefix(prefix): data for n, data in files.items() if n.startswith(prefix)}
+
+
+def _write(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files for good, the record last of all."""
+    for name in sorted(files, key=lambda name: name == RECORD):
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("xb") as file:
+            file.write(files[name])
+        sync_file(path)
+    sync_folders(*{(folder / name).parent for name in files}, folder)
+
+
+def _check(planned: PlannedRun, draft: Path, names: set[str]) -> None:
+    """Make sure that a draft holds this run to its end, and nothing but what the run left."""
+    there = replace(planned, path=draft)
+    if not there.is_finished:
+        raise RefusedAnswerError("it is another run than was asked for, or not at its end")
+    try:
+        digests = there.run.read_info().get(FIELD)
+        if not isinstance(digests, dict) or digests.keys() != names:
+            raise RefusedAnswerError("its files are not those that its record lists")
+        for name in names - {RECORD}:
+            RecordedFiles(draft, digests).check(draft / name)
+    except UserError as error:
+        raise RefusedAnswerError(str(error)) from error
+
+
+# --- What has become of a run, and whose fault it was that it has not come back.
+
+MOST_TRIES = 3
+# Who did nothing wrong is sent again as often as that.
+MOST_SENDS = 50
+
+
+@dataclass
+class SentRun:
+    """A run under way.
+
+    Only a run that had begun may have to do with the end of its worker. One that merely waited
+    there, or whose worker left in good order, or whose scheduler went, is sent again without blame.
+    """
+
+    planned: PlannedRun
+    future: Future[RunFailure | None] = field(default_factory=Future)  # what its sender waits for
+    key: str = ""  # its name at the scheduler, another each time
+    task: Any = None  # what the scheduler promises
+    n_sent: int = 0  # how often it was sent
+    n_lost: int = 0  # how often the worker that had begun it was lost
+    n_refused: int = 0  # how often what came back was not the run, or none
+    worker: str | None = None  # where it has begun, as far as is known
+    reason: str = ""  # why it was last lost or refused
+
+    def begin(self, worker: str, has_left: bool) -> None:
+        """Note that a worker has begun; where another had before, that one was lost."""
+        self.lose(has_left)
+        self.worker = worker
+
+    def lose(self, has_left: bool) -> None:
+        """Note that the worker that had begun, if any, is gone; ``has_left`` if in good order."""
+        if self.worker is not None and not has_left:
+            self.n_lost += 1
+            self.reason = f"the worker that did it was lost {self.n_lost} times ({self.worker})"
+        self.worker = None
+
+    def refuse(self, reason: str) -> None:
+        """Note that something else than the run came back."""
+        self.n_refused += 1
+        self.worker = None
+        self.reason = f"{self.n_refused} times it did not come back as a run: {reason}"
+
+    @property
+    def is_given_up(self) -> bool:
+        """Whether it has been tried often enough."""
+        is_sent_too_often = self.n_sent >= MOST_SENDS
+        if is_sent_too_often and not self.reason:
+            self.reason = f"it was sent {self.n_sent} times and never came back"
+        return self.n_lost + self.n_refused >= MOST_TRIES or is_sent_too_often
+
+
+def ending_of(sent: SentRun, content: object, root: Path) -> tuple[str, str] | None:
+    """Why a run failed, in one line and at length; both empty where it is done, and in its place.
+
+    Nothing is believed of ``content``, the answer of its worker. None where the run is to be sent
+    again; a worker that can do no run at all is a `UserError`.
+    """
+    try:
+        answer = unpacked(content)
+        if answer.kind == FAILED:
+            return answer.reason or "it does not say why", answer.details
+        if answer.kind == UNFIT:
+            raise UserError(f"--cluster: {answer.reason}: start it anew, from the same folder")
+        if answer.kind == STOPPED:
+            sent.worker = None
+            return None
+        if answer.files is None:
+            check_in_place(sent.planned)
+        else:
+            receive(sent.planned, root, answer.files)
+    except RefusedAnswerError as error:
+        sent.refuse(one_line(error))
+        return None
+    except OSError as error:  # the disk is full
+        return one_line(error), ""
+    return "", ""

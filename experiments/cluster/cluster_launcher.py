@@ -18,16 +18,13 @@ from distributed.scheduler import KilledWorker
 
 from experiments.child_processes import NO_LIMITS
 from experiments.cluster.addresses import Cluster, JobQueue, LocalWorkers
-from experiments.cluster.clusters import Replace, opened
-from experiments.cluster.connections import Connection
-from experiments.cluster.endings import Ending, ending_of
-from experiments.cluster.orders import LEAVING, Probe, RunOrder, probing, version
-from experiments.cluster.sent_runs import SentRun
+from experiments.cluster.answers import SentRun, ending_of
+from experiments.cluster.schedulers import Connection, Replace, opened
 from experiments.cluster.tasks import do_order
-from experiments.cluster.working import Supervisors
-from experiments.drafts import run_name
-from experiments.launching import Launcher, RunFailure
-from experiments.planned_runs import PlannedRun
+from experiments.cluster.working import LEAVING, Probe, RunOrder, Supervisors, probing, version
+from experiments.launching import Launcher, RunFailure, ended
+from experiments.plan import PlannedRun
+from experiments.run_folders import run_name
 from experiments.run_limits import RunLimits
 from pipeline.errors import UserError, one_line
 from pipeline.signs_of_life import Heartbeat
@@ -85,14 +82,7 @@ def cluster_launcher(
 
 
 class ClusterLauncher:
-    """The driver's side of a cluster.
-
-    Args:
-        probe: lies in the study's folder.
-        command: the command that asked for the study.
-        limits: what each run may take.
-        n_wanted: how many workers there will be at least.
-    """
+    """The driver's side of a cluster, of which there will be ``n_wanted`` workers at least."""
 
     connection: Connection
 
@@ -180,7 +170,7 @@ class ClusterLauncher:
         with self._lock:
             self._sent.pop(sent.key, None)
             if sent.is_given_up:
-                self._settle(sent, Ending(sent.reason))
+                self._settle(sent, sent.reason)
                 return
             sent.n_sent += 1
             sent.key = f"{run_name(sent.planned)}-{secrets.token_hex(8)}"
@@ -216,7 +206,7 @@ class ClusterLauncher:
             else:
                 ending = ending_of(sent, content, self._probe.root)
                 if ending is not None:
-                    self._settle(sent, ending)
+                    self._settle(sent, *ending)
                     return
         elif task.status == "error":
             error = task.exception()
@@ -230,11 +220,11 @@ class ClusterLauncher:
             self.connection.lose(task.client)
         self._send(sent)
 
-    def _settle(self, sent: SentRun, ending: Ending) -> None:
+    def _settle(self, sent: SentRun, reason: str, details: str = "") -> None:
         """Tell whoever waits for a run that it is done, or how it failed."""
         with self._lock:
             self._sent.pop(sent.key, None)
-        failure = ending.written_down(sent.planned, self._probe.root)
+        failure = ended(sent.planned, self._probe.root, reason, details or f"{reason}\n")
         with contextlib.suppress(Exception):
             sent.task.release()
         if not sent.future.done():
@@ -256,7 +246,7 @@ class ClusterLauncher:
                     self._receivers.submit(self._guarded, sent, self._give_up)
 
     def _give_up(self, sent: SentRun) -> None:
-        self._settle(sent, Ending(sent.reason))
+        self._settle(sent, sent.reason)
         with contextlib.suppress(Exception):
             sent.task.cancel()
 

@@ -7,14 +7,7 @@ from __future__ import annotations
 
 
 def do_order(order: bytes) -> bytes:
-    """Do a run on the worker that calls this.
-
-    Args:
-        order: see `experiments.cluster.orders`.
-
-    Returns:
-        See `experiments.cluster.answers`.
-    """
+    """Do the run of an `experiments.cluster.working.RunOrder`; the answer is of `.answers`."""
     from experiments.cluster.working import answer_to
 
     return answer_to(order)

@@ -13,13 +13,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from envs.bandits import LoggedData
 from experiments.off_policy.estimators import (
+    CrossFit,
     PolicyTerms,
     check_rewards,
+    cross_fit,
     evaluate_policy,
     terms_as_logged,
 )
 from experiments.off_policy.policy_files import PolicyFile, find_policy, read_logged
-from experiments.off_policy.reward_models import CrossFit, cross_fit
 from mdp.array_types import Floats
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.asked_policies import policy_matrix, why_not_exact
@@ -29,47 +30,32 @@ from pipeline.user_modules import UserModule
 
 @dataclass(frozen=True)
 class LoggedPolicy:
-    """A trained agent, to be judged on a log.
+    """A trained agent, to be judged on a log."""
 
-    Attributes:
-        name: its path, as it was given.
-        agent: as it was loaded.
-        log: the log that it was trained on, or None if it was not, or if that is not known.
-    """
-
-    name: str
-    agent: BaseAlgorithm
+    name: str  # its path, as it was given
+    agent: BaseAlgorithm  # as it was loaded
+    # The log that it was trained on, or None if it was not, or if that is not known.
     log: Path | None
 
 
 @dataclass(frozen=True)
 class Judged:
-    """One row of the comparison.
+    """One row of the comparison."""
 
-    Attributes:
-        name: of the policy.
-        terms: of its estimates.
-        is_given: whether it is one of the policies asked about, and no alternative to them.
-    """
-
-    name: str
-    terms: PolicyTerms
+    name: str  # of the policy
+    terms: PolicyTerms  # of its estimates
+    # Whether it is one of the policies asked about, and no alternative to them.
     is_given: bool = False
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Policies judged on one log.
+    """Policies judged on one log."""
 
-    Attributes:
-        data: the log.
-        rows: the policies asked about; then each arm shown to everybody, and the log's own policy.
-        notes: what has to be known to read the figures.
-    """
-
-    data: LoggedData
+    data: LoggedData  # the log
+    # The policies asked about; then each arm shown to everybody, and the log's own policy.
     rows: tuple[Judged, ...]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...]  # what has to be known to read the figures
 
 
 def read_policy(path: Path, modules: Iterable[UserModule] = ()) -> LoggedPolicy:

@@ -18,18 +18,12 @@ _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wra
 
 @dataclass(frozen=True)
 class PolicyFile:
-    """The zip of a trained agent, read and not yet loaded.
+    """The zip of a trained agent, read and not yet loaded."""
 
-    Attributes:
-        name: its path, as it was given.
-        algo: name of the agent.
-        model: the zip.
-        log: the log that it was trained on, or None if it was not, or if that is not known.
-    """
-
-    name: str
-    algo: str
-    model: ModelFile
+    name: str  # its path, as it was given
+    algo: str  # name of the agent
+    model: ModelFile  # the zip
+    # The log that it was trained on, or None if it was not, or if that is not known.
     log: Path | None
 
 

@@ -33,7 +33,7 @@ from safe_files.limits import MAX_ARCHIVE_BYTES
 from safe_files.regular_files import hold, read_file
 
 RUNS = "runs"
-SETTINGS = "study.yml"  # written beside the page, see `experiments.study_files`
+SETTINGS = "study.yml"  # written beside the page, see `experiments.study`
 _RUN = re.compile(r".*_\d+", re.DOTALL)  # not ``<run>.damaged-1``
 _PAGE = "report.html"
 _SHOWN = (_PAGE, "learning/*/*.html", "verdicts.*", "summary.csv", "curves.csv.gz", "figures/*")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from experiments.study_spec import file_name
+from experiments.study import file_name
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.figures.bandit_figures import (
     draw_arms,

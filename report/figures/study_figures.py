@@ -17,9 +17,8 @@ from matplotlib.ticker import (
     PercentFormatter,
 )
 
-from experiments.analysis import EnvironmentAnalysis
-from experiments.overall_analysis import OverallAnalysis
-from experiments.study_spec import COSTS, METRIC_WORDS
+from experiments.analysis import EnvironmentAnalysis, OverallAnalysis
+from experiments.study import COSTS, METRIC_WORDS
 from mdp.array_types import Floats
 from pipeline.pictures.learning_curve import symlog_ticks
 from report.figures.figure_style import (

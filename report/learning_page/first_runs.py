@@ -14,9 +14,9 @@ from rich.console import Console
 
 from experiments.analysis import StudyAnalysis
 from experiments.child_processes import TaskFailedError, local_executor, supervise
-from experiments.planned_runs import PlannedRun
+from experiments.plan import PlannedRun
+from experiments.run_files import difference
 from experiments.run_limits import RunLimits
-from experiments.same_training import difference
 from pipeline.errors import UserError
 from pipeline.plain_runs import is_plain
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping

@@ -6,7 +6,7 @@ import json
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 
-from experiments.planned_runs import PlannedRun
+from experiments.plan import PlannedRun
 from pipeline.files import write_json
 from report.learning_page.learning_assembly import MOST_BYTES, page_version
 from report.page.sections import LearningPage

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.pull_statistics import PullStatistics
+from experiments.bandits import PullStatistics
 from report.page.sections import Report, Section
 from report.series.curve_series import Curve
 from report.series.posteriors import Belief

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from envs.known_models import transition_model
 from envs.layout import GridLayout, grid_layout
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from experiments.planned_runs import PlannedRun
-from experiments.run_figures import read_value_maps
+from experiments.plan import PlannedRun
+from experiments.run_files import read_value_maps
 from pipeline.environments import make_single_env
 from report.page.sections import Report, Section, layout_data
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from experiments.overall_analysis import OverallAnalysis
-from experiments.study_spec import COSTS, METRIC_WORDS, StudySpec
+from experiments.analysis import EnvironmentAnalysis, OverallAnalysis, StudyAnalysis
+from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from report.conclusions import conclusion, on_changes, places_without_a_run
 from report.latex import LATEX
 from report.markdown import MARKDOWN

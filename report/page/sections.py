@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from envs.layout import GridLayout
 from experiments.analysis import StudyAnalysis
-from experiments.planned_runs import PlannedRun
+from experiments.plan import PlannedRun
 from pipeline.signs_of_life import Tell, tell_nobody
 from report.series.study_series import StudySeries
 from verdicts import Estimate

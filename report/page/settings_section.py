@@ -6,11 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from experiments.looks_file import read_looks
-from experiments.planned_runs import PlannedRun
-from experiments.run_versions import mixed_versions
-from experiments.study_results import StudyResults
-from experiments.tuning_seeds import tuning_seeds
+from experiments.looks import read_looks
+from experiments.plan import PlannedRun, tuning_seeds
+from experiments.results import StudyResults
+from experiments.run_files import mixed_versions
 from report.look_sentences import look_sentences
 from report.page.markup import setting
 from report.page.sections import Report, Section

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from experiments.study_spec import StudySpec
+from experiments.study import StudySpec
 
 # Okabe and Ito's colours, told apart by colour-blind readers too. The page's style sheet has them
 # as well, with others for a dark theme.

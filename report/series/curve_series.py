@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from experiments.analysis import EnvironmentAnalysis
-from experiments.seed_values import curves_by_agent, mean_curve
-from experiments.study_results import StudyResults
+from experiments.results import StudyResults, curves_by_agent, mean_curve
 from mdp.array_types import Floats
 
 KINDS = ("evaluation", "training")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pandas as pd
 
-from experiments.run_figures import read_episodes
-from experiments.study_results import StudyResults
+from experiments.results import StudyResults
+from experiments.run_files import read_episodes
 
 
 def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:

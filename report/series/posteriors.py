@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
-from experiments.pull_statistics import PullStatistics
-from experiments.study_results import StudyResults
+from experiments.bandits import PullStatistics
+from experiments.results import StudyResults
 from mdp.array_types import Floats, Ints
 
 N_POINTS = 241

@@ -10,8 +10,8 @@ import gymnasium as gym
 import numpy as np
 
 from experiments.analysis import EnvironmentAnalysis
-from experiments.pull_statistics import QUANTILES, PullStatistics
-from experiments.study_results import StudyResults
+from experiments.bandits import QUANTILES, PullStatistics
+from experiments.results import StudyResults
 from mdp.array_types import Floats, Ints
 from pipeline.environments import make_single_env
 from report.series.curve_series import Curve

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from experiments.analysis import EnvironmentAnalysis
-from experiments.seed_values import values_over_seeds
-from experiments.study_results import StudyResults
-from experiments.study_spec import AgentSpec, symbol
+from experiments.results import StudyResults, values_over_seeds
+from experiments.study import AgentSpec, symbol
 from mdp.array_types import Floats, Ints
 from report.series.curve_series import Curve, linear_up_to
 from verdicts import Estimate

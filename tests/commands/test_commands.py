@@ -20,8 +20,8 @@ from commands import compare_agents
 from commands.study_request import study_spec
 from commands.train_flags import build_parser
 from commands.train_request import train_spec
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
 from pipeline.environments import training_kwargs
 from pipeline.errors import UserError

@@ -495,9 +495,9 @@ from commands.compare_agents import main
 from commands.parsing import run_command
 
 if __name__ == "__main__":
-    from experiments import child_processes, fork_server
+    from experiments import child_processes
 
-    fork_server.context = multiprocessing.get_context("spawn")
+    child_processes.context = multiprocessing.get_context("spawn")
     run_command(main)
 """
 

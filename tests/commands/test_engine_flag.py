@@ -14,7 +14,7 @@ from commands.engine_lines import about, search_line, study_line, training_line
 from commands.study_request import study_spec
 from commands.train_request import train_spec
 from commands.tune_request import tuning_spec
-from experiments.study_plan import plan
+from experiments.plan import plan
 from pipeline.engine_outlook import EngineOutlook, planned_outlook
 from pipeline.errors import UserError
 from pipeline.packing.model_card import card

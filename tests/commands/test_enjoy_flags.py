@@ -7,8 +7,8 @@ from collections import Counter
 
 import pytest
 
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import Run
 
 LAKE = ["--algo", "random", "--env", "FrozenLake-v1"]

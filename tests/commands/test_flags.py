@@ -9,8 +9,8 @@ from commands import compare_agents, enjoy_agent, train_agent
 from commands.enjoy_request import model_request
 from commands.study_request import study_spec
 from commands.train_request import train_spec
-from experiments.study_plan import plan
-from experiments.study_spec import StudySpec
+from experiments.plan import plan
+from experiments.study import StudySpec
 from pipeline.environments import training_changes
 from pipeline.errors import UserError
 from pipeline.train_spec import TrainSpec

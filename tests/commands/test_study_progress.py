@@ -13,8 +13,8 @@ from commands.study_progress import StudyProgress
 from commands.terminal import TextConsole
 from commands.tune_progress import TuningProgress
 from experiments.launching import RunFailure
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import signs_of_life
 
 

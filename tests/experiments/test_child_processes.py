@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments import child_processes, fork_server
+from experiments import child_processes
 from experiments.child_processes import (
     StoppedError,
     TaskDiedError,
@@ -89,7 +89,7 @@ def clean_up(folder):
 def method(request, monkeypatch):
     """Children of Linux, and those of Windows and macOS."""
     context = multiprocessing.get_context(request.param)
-    monkeypatch.setattr(fork_server, "context", context)
+    monkeypatch.setattr(child_processes, "context", context)
     # Another test may have stopped everything.
     monkeypatch.setattr(child_processes, "_stopping", threading.Event())
     return request.param
@@ -111,17 +111,17 @@ def light_server(method, monkeypatch):
     if method == "spawn":
         yield
         return
-    preloaded, heavy = fork_server.PRELOADED, fork_server.server_pid()
-    fork_server.end_server()
-    monkeypatch.setattr(fork_server, "PRELOADED", [])
+    preloaded, heavy = child_processes.PRELOADED, child_processes.server_pid()
+    child_processes.end_server()
+    monkeypatch.setattr(child_processes, "PRELOADED", [])
 
     def is_there():
-        fork_server.start_server()
-        return fork_server.server_pid() != heavy
+        child_processes.start_server()
+        return child_processes.server_pid() != heavy
 
     wait_for(is_there)  # one with threads is not gone as soon as it is a zombie
     yield
-    fork_server.end_server()
+    child_processes.end_server()
     multiprocessing.set_forkserver_preload(preloaded)
 
 
@@ -276,8 +276,8 @@ def test_when_the_server_is_killed_all_go_on(chores, tmp_path, method, caplog):
             supervise, chores.write_and_wait, str(tmp_path), "first", clean_up=nothing
         )
         wait_for(lambda: list(tmp_path.glob("waiting_*")))
-        server = fork_server.server_pid()
-        fork_server.end_server()
+        server = child_processes.server_pid()
+        child_processes.end_server()
         wait_for(lambda: not is_alive(server) or is_zombie(server))
         assert executor.submit(supervise, chores.add, 1, 1, clean_up=nothing).result()[0] == 2
         (tmp_path / "go").touch()
@@ -297,7 +297,7 @@ def test_a_stop_does_not_wait_for_a_server_that_imports(chores, tmp_path, method
     if method == "spawn":
         return
     with local_executor(1) as executor:
-        os.kill(fork_server.server_pid(), signal.SIGSTOP)
+        os.kill(child_processes.server_pid(), signal.SIGSTOP)
         future = executor.submit(supervise, chores.add, 1, 1, clean_up=nothing)
         wait_for(child_processes._lock.locked)
         began = time.monotonic()
@@ -334,11 +334,11 @@ DRIVER = """
 import multiprocessing, sys
 from functools import partial
 import study_chores
-from experiments import child_processes, fork_server
+from experiments import child_processes
 
 if __name__ == "__main__":
     method, folder = sys.argv[1:]
-    fork_server.context = multiprocessing.get_context(method)
+    child_processes.context = multiprocessing.get_context(method)
     child_processes.supervise(
         study_chores.wait, folder, clean_up=partial(study_chores.clean_up, folder)
     )
@@ -367,7 +367,7 @@ def test_only_linux_forks(monkeypatch, platform, expected):
     if platform == "win32":
         monkeypatch.setitem(sys.modules, "multiprocessing.forkserver", None)
         monkeypatch.delattr(signal, "pthread_sigmask")
-    loaded = runpy.run_path(fork_server.__file__)
+    loaded = runpy.run_path(child_processes.__file__)
     assert loaded["START_METHOD"] == expected
     assert loaded["context"].get_start_method() == expected
     if platform != "linux":

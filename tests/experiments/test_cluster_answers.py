@@ -2,14 +2,32 @@
 
 import hashlib
 import json
+import shutil
 import struct
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.cluster import answers
-from experiments.cluster.answers import Answer, RefusedAnswerError, files_in, packed, unpacked
+from experiments.cluster.answers import (
+    MOST_SENDS,
+    Answer,
+    RefusedAnswerError,
+    SentRun,
+    check_in_place,
+    files_in,
+    packed,
+    receive,
+    unpacked,
+)
+from experiments.cluster.working import Probe, RunOrder, probing
+from experiments.plan import plan
+from experiments.run_folders import draft_path
+from experiments.run_in_child import do_run
+from experiments.run_limits import RunLimits
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 
 FILES = {"run/run.json": b"{}", "run/a/b.zip": b"\0\1", "tensorboard/x": b""}
 
@@ -128,3 +146,146 @@ def test_there_are_bounds_on_what_is_sent_and_taken(tmp_path, monkeypatch):
         files_in(tmp_path, "run/")
     with pytest.raises(RefusedAnswerError, match="too large"):
         unpacked(content)
+
+
+# --- What comes back of a run is put in place if it is that very run, whole, and nothing else.
+
+LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 20})
+
+
+def runs_of(root, tensorboard=False):
+    agents = (AgentSpec("mine", "qlearning"),)
+    return plan(StudySpec("s", "S", agents, (LAKE,), n_seeds=2, tensorboard=tensorboard), root)
+
+
+@pytest.fixture(scope="module")
+def done(tmp_path_factory):
+    """What a worker sends of the first run, by name."""
+    root = tmp_path_factory.mktemp("worker")
+    run = runs_of(root)[0]
+    do_run(run, draft_path(root, run), "c")
+    return files_in(run.path, "run/")
+
+
+def test_a_run_is_put_in_place_to_the_last_bit(tmp_path, done):
+    run = runs_of(tmp_path)[0]
+    receive(run, tmp_path, done)
+    assert run.is_finished
+    assert files_in(run.path, "run/") == done
+    assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+    check_in_place(run)
+
+
+def lacking(name):
+    return lambda files: {key: data for key, data in files.items() if key != name}
+
+
+def unfinished(files):
+    record = json.loads(files["run/run.json"])
+    del record["files"]
+    return {**files, "run/run.json": json.dumps({**record, "state": "running"}).encode()}
+
+
+LIES = {
+    "no record": lacking("run/run.json"),
+    "no evaluations": lacking("run/evaluations.npz"),
+    "unfinished": unfinished,
+    "a stray file": lambda files: {**files, "run/more.txt": b"x"},
+    "other content": lambda files: {**files, "run/evaluations.npz": b"x"},
+    "an empty record": lambda files: {**files, "run/run.json": b"{}"},
+    "a changed record": lambda files: {
+        **files,
+        "run/run.json": files["run/run.json"].replace(b"seconds", b"secondS"),
+    },
+    "a file elsewhere": lambda files: {**files, "elsewhere/x": b"x"},
+    "a log": lambda files: {**files, "tensorboard/x": b"x"},
+    "no file name": lambda files: {**files, "run/\ud800": b"x"},
+    "nothing": lambda files: {},
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_whatever_else_comes_is_refused_and_leaves_nothing(tmp_path, done, lie):
+    with pytest.raises(RefusedAnswerError):
+        receive(runs_of(tmp_path)[0], tmp_path, LIES[lie](done))
+    assert not tmp_path.exists() or not list(tmp_path.rglob("*"))
+
+
+def test_another_run_is_refused(tmp_path, done):
+    other = runs_of(tmp_path)[1]
+    with pytest.raises(RefusedAnswerError, match="another run"):
+        receive(other, tmp_path, done)
+
+
+def test_logs_go_to_their_own_folder(tmp_path, done):
+    run = runs_of(tmp_path, tensorboard=True)[0]
+    record = json.loads(done["run/run.json"])
+    assert record["spec"]["tensorboard_log"] is None
+    run.spec.tensorboard_log.mkdir(parents=True)
+    (run.spec.tensorboard_log / "old").touch()
+    receive(run, tmp_path, {**done, "tensorboard/events": b"x"})
+    assert [path.name for path in run.spec.tensorboard_log.iterdir()] == ["events"]
+
+
+def test_a_run_that_is_said_to_be_there_has_to_be(tmp_path, monkeypatch):
+    monkeypatch.setattr(answers, "SECONDS_TO_APPEAR", 0.0)
+    with pytest.raises(RefusedAnswerError, match="not in its folder"):
+        check_in_place(runs_of(tmp_path)[0])
+
+
+def test_a_shared_folder_is_known_by_what_lies_in_it(tmp_path):
+    with probing(tmp_path) as probe:
+        assert probe.is_there
+        assert not replace(probe, content="x").is_there
+        assert not replace(probe, root=tmp_path / "x").is_there
+    assert not list(tmp_path.iterdir())
+
+
+def test_apart_paths_stay_within_the_workers_folder(tmp_path):
+    def order(root):
+        run = runs_of(root, tensorboard=True)[0]
+        return RunOrder(run, "c", RunLimits(), Probe(tmp_path, root, "n", "c"), "t", "v").apart()
+
+    relative = order(tmp_path.relative_to(tmp_path) / "logs" / "s")
+    assert relative.planned.path.parts[:3] == ("logs", "s", "runs")
+    for root in (tmp_path, tmp_path.relative_to(tmp_path) / ".." / "s"):
+        found = order(root)
+        assert found.planned.path.parts[:2] == ("study", "runs")
+        assert found.planned.spec.tensorboard_log.parts[:2] == ("study", "tensorboard")
+        assert found.probe.root.parts == ("study",)
+    shutil.rmtree(tmp_path)
+
+
+@pytest.fixture
+def sent(tmp_path):
+    return SentRun(runs_of(tmp_path)[0])
+
+
+def test_a_run_that_had_begun_is_blamed_for_its_workers_end(sent):
+    for worker in "abc":
+        sent.begin(worker, has_left=False)
+        assert not sent.is_given_up
+    sent.begin("d", has_left=False)
+    assert sent.is_given_up
+    assert sent.reason == "the worker that did it was lost 3 times (c)"
+
+
+def test_one_that_waited_or_whose_worker_left_is_not(sent):
+    for number in range(MOST_SENDS - 1):
+        sent.n_sent += 1
+        sent.begin(str(number), has_left=True)
+        sent.lose(has_left=True)
+        sent.lose(has_left=False)  # where it has not begun
+    assert not sent.is_given_up
+    sent.n_sent += 1
+    assert sent.is_given_up
+    assert "never came back" in sent.reason
+
+
+def test_answers_that_are_refused_count(sent):
+    for _ in range(3):
+        assert not sent.is_given_up
+        sent.begin("a", has_left=False)
+        sent.refuse("nonsense")
+    assert sent.is_given_up
+    assert sent.reason == "3 times it did not come back as a run: nonsense"

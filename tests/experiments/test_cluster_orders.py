@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from experiments.child_processes import NO_LIMITS
-from experiments.cluster.orders import Probe, RunOrder
+from experiments.cluster.working import Probe, RunOrder
+from experiments.plan import plan
 from experiments.run_limits import RunLimits
-from experiments.study_files import find_study, read_study
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, find_study, read_study
 from pipeline.settings.hyperparams import split
 from pipeline.user_modules import UserModule
 

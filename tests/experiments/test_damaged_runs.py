@@ -10,22 +10,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 
 import compare
 from commands.places import Place
 from commands.study_output import repair, run_study
-from experiments.bandit_results import STATISTICS_FILE
-from experiments.drafts import draft_path
+from experiments.bandits import STATISTICS_FILE
 from experiments.launching import local_launcher
-from experiments.repair import move_damaged_aside
-from experiments.run_figures import read_value_maps
+from experiments.plan import plan
+from experiments.results import read_results, read_run
+from experiments.run_files import read_episodes, read_evaluations, read_value_maps
+from experiments.run_folders import draft_path, move_damaged_aside
 from experiments.run_in_child import do_run
-from experiments.study_plan import plan
-from experiments.study_results import read_results, read_run
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.file_digests import DamagedFileError
 from pipeline.run_files import PULLS_FILE
+from pipeline.run_folder import Run
 
 STEPS = {"n_timesteps": 60}
 WAREHOUSE = EnvironmentSpec("grid", "Warehouse-v0", STEPS)
@@ -300,3 +302,70 @@ def test_a_sample_of_the_campaign(tmp_path):
                     total += ends
     assert set(total) == {campaign["REFUSED"], campaign["RIGHT"]}
     assert min(total.values()) > 90
+
+
+# --- The files of a run's figures, where they have not the form that a run gives them.
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "#{}",
+        "#{}\n",
+        "r,l,t\n1,2,3\n",
+        "#{}\nr,l\n1,2\n",
+        "#{}\nr,l,t\n1,2\n",
+        "#{}\nr,l,t\nnan,2,3\n",
+        "#{}\nr,l,t\n1,0,3\n",
+        "#{}\nr,l,t\n1,two,3\n",
+        "#{}\nr,l,t\n1e999,2,3\n",
+        "#{}\nr,l,t\n1,2,3\n1,2\n",
+        "#{}\nr,l,t\n1,2,\n",
+        "#{}\nr,l,t\n1_0,2,3\n",
+        "#{}\nr,l,t\nNA,2,3\n",
+        '#{}\nr,l,t\n1,2,3\n"1,2,3\n',
+        "#{}\n\0\0\xff\n",
+    ],
+)
+def test_a_monitor_file_of_no_form(tmp_path, text):
+    path = tmp_path / "0.monitor.csv"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(DamagedFileError, match=r"0\.monitor\.csv is damaged: ") as error:
+        read_episodes(Run(tmp_path, "x"))
+    assert "\n" not in str(error.value)
+
+
+def test_a_monitor_file_without_episodes(tmp_path):
+    (tmp_path / "0.monitor.csv").write_text('#{"t_start": 0}\nr,l,t\n')
+    assert read_episodes(Run(tmp_path, "x")).returns.size == 0
+
+
+@given(st.lists(st.floats(-1e300, 1e300), min_size=1, max_size=20))
+def test_episodes_are_read_to_the_last_bit_whatever_stands_beside_them(tmp_path_factory, returns):
+    path = tmp_path_factory.mktemp("run") / "0.monitor.csv"
+    rows = [f'"left, or\nright",0.5,{value!r},3' for value in returns]
+    path.write_text("\n".join(['#{"t_start": 0}', "way,t,r,l", *rows, ""]))
+    episodes = read_episodes(Run(path.parent, "x"))
+    assert episodes.returns.tolist() == returns
+    assert episodes.steps.tolist() == [3 * n for n in range(1, len(returns) + 1)]
+    assert set(episodes.seconds.tolist()) == {0.5}
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"timesteps": [1]},
+        {"timesteps": [1], "results": [1.0]},
+        {"timesteps": [1, 2], "results": [[1.0]]},
+        {"timesteps": [1], "results": [[np.nan]]},
+        {"timesteps": [2, 1], "results": [[1.0], [1.0]]},
+        {"timesteps": [-1], "results": [[1.0]]},
+        {"timesteps": ["1"], "results": [[1.0]]},
+    ],
+)
+def test_evaluations_of_no_form(tmp_path, arrays):
+    run = Run(tmp_path, "x")
+    np.savez(run.evaluations_path, **arrays)
+    with pytest.raises(DamagedFileError, match=r"evaluations\.npz is damaged: "):
+        read_evaluations(run)

@@ -13,14 +13,14 @@ from experiments.growing import (
     grown,
     settle,
     settled_looks,
+    take_looks,
     take_planned_looks,
 )
-from experiments.looking import take_looks
-from experiments.looks_file import FILE, read_looks
-from experiments.run_curves import CURVE_COLUMNS
-from experiments.study_plan import plan
-from experiments.study_results import RUN_COLUMNS, StudyResults
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.looks import FILE, read_looks
+from experiments.plan import plan
+from experiments.results import RUN_COLUMNS, StudyResults
+from experiments.run_files import CURVE_COLUMNS
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from report.conclusions import conclusion
 from verdicts import level_of_look

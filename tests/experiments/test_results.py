@@ -13,12 +13,18 @@ from PIL import Image
 
 from commands.terminal import TextConsole
 from experiments.analysis import analyse
-from experiments.early_results import EarlyResults
-from experiments.run_curves import CURVE_COLUMNS
-from experiments.seed_values import curves_by_agent, mean_curve, values_over_seeds
-from experiments.study_plan import plan
-from experiments.study_results import RUN_COLUMNS, read_results, threshold_of
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.launching import EarlyResults
+from experiments.plan import plan
+from experiments.results import (
+    RUN_COLUMNS,
+    curves_by_agent,
+    mean_curve,
+    read_results,
+    threshold_of,
+    values_over_seeds,
+)
+from experiments.run_files import CURVE_COLUMNS
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.run_folder import FINISHED
 from report.conclusions import conclusion, places_without_a_run
 from report.figures.figure_files import write_figures

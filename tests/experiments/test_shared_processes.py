@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from experiments import child_processes, fork_server
+from experiments import child_processes
 from experiments.child_processes import (
     StoppedError,
     TaskDiedError,
@@ -27,13 +27,12 @@ from experiments.child_processes import (
     stop_all,
     supervise,
 )
-from experiments.drafts import draft_path
-from experiments.execution import execute
-from experiments.launching import local_launcher
+from experiments.launching import execute, local_launcher
+from experiments.plan import plan
+from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.evaluation import kept_evaluators
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.plain_runs import is_plain
@@ -65,7 +64,7 @@ def runs_of(root, n_seeds=2, agents=AGENTS, environments=ENVIRONMENTS):
 @pytest.fixture(scope="module", autouse=True)
 def server():
     """One that has imported the libraries, so that no child has to."""
-    fork_server.start_server()
+    child_processes.start_server()
 
 
 @pytest.fixture(autouse=True)
@@ -161,7 +160,7 @@ def test_a_stop_ends_those_that_work_and_those_that_wait(chores):
 
 @pytest.mark.parametrize("method", ["spawn"])
 def test_it_is_the_same_where_nothing_forks(chores, method, monkeypatch):
-    monkeypatch.setattr(fork_server, "context", multiprocessing.get_context(method))
+    monkeypatch.setattr(child_processes, "context", multiprocessing.get_context(method))
     assert shared(chores.who) == shared(chores.who)
 
 

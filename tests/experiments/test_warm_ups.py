@@ -8,8 +8,8 @@ import pytest
 import agents
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from experiments import warm_ups
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.plan import plan
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from mdp.machine_code import inlined
 from pipeline.user_modules import UserModule
 

@@ -11,9 +11,9 @@ import pytest
 from selenium import webdriver
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.run_curves import CURVE_COLUMNS
-from experiments.study_results import RUN_COLUMNS, StudyResults
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.results import RUN_COLUMNS, StudyResults
+from experiments.run_files import CURVE_COLUMNS
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report import films
 from tests.report.browsing import BROWSER, DRIVER, FLAGS
 from verdicts import Estimate, PairComparison, Summary, ThresholdSummary

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from experiments.pull_statistics import PullStatistics
+from experiments.bandits import PullStatistics
 from report.figures.bandit_figures import (
     draw_arms,
     draw_belief,

@@ -11,7 +11,7 @@ import pytest
 from scipy import integrate
 
 from experiments.analysis import analyse
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.figures.figure_files import write_figures
 from report.page import bandit_section, write_report
 from report.page.sections import Report

@@ -8,8 +8,8 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
-from experiments.overall_analysis import OverallAnalysis
-from experiments.pull_statistics import PullStatistics
+from experiments.analysis import OverallAnalysis
+from experiments.bandits import PullStatistics
 from report.figures import figure_style
 from report.figures.figure_files import write_figures
 from report.series.agent_marks import agent_marks

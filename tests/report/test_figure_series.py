@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.pull_statistics import pull_statistics
-from experiments.study_spec import AgentSpec
+from experiments.bandits import pull_statistics
+from experiments.study import AgentSpec
 from report.series.curve_series import learning_curves, linear_up_to
 from report.series.pull_series import arm_series, mean_regret, regret_of_runs
 from report.series.run_series import best_of, grids, run_series, sweeps

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from experiments.overall_analysis import OverallAnalysis
+from experiments.analysis import OverallAnalysis
 from report.figures.figure_files import write_figures
 from report.figures.figure_style import line_style
 from report.figures.study_figures import (

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from experiments.pull_statistics import pull_statistics
+from experiments.bandits import pull_statistics
 from report.conclusions import conclusion
 from report.terminal_tables import print_analysis, print_episodes_table
 from verdicts import FailureCount, PairComparison, ThresholdSummary

@@ -17,12 +17,11 @@ import pytest
 import compare
 from agents import load_algorithm
 from envs.warehouse import WarehouseEnv
-from experiments.run_figures import read_episodes
+from experiments.plan import plan
+from experiments.results import read_results
+from experiments.run_files import read_episodes
 from experiments.run_in_child import do_run
-from experiments.study_files import read_study
-from experiments.study_plan import plan
-from experiments.study_results import read_results
-from experiments.study_spec import QuickSpec
+from experiments.study import QuickSpec, read_study
 from mdp import value_iteration
 from pipeline.models.model_loading import load_model
 from pipeline.preparation import algorithm_kwargs

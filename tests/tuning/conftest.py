@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 from optuna.storages import InMemoryStorage
 
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from tuning import searching
 from tuning.judging import RunOutcome
 from tuning.opening import OpenTuning

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from experiments.run_curves import Curve
-from experiments.study_results import RunResults
+from experiments.results import RunResults
+from experiments.run_files import Curve
 from pipeline.errors import UserError
 from tuning import judging
 from tuning.judging import UnjudgedError, judged, outcome_of

@@ -2,26 +2,34 @@
 
 import os
 import platform
+import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from experiments import drafts, run_in_child
-from experiments.drafts import (
+from experiments import run_folders
+from experiments.plan import plan
+from experiments.run_files import mixed_versions
+from experiments.run_folders import (
+    check_settings_kept,
     claim_draft,
     draft_path,
+    in_the_way,
     leave_drafts,
     make_folder,
+    move_replaced_aside,
     remove_dead_drafts,
     remove_draft,
     take_over,
 )
 from experiments.run_in_child import do_run
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline import liveness
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline import files, liveness
+from pipeline.errors import UserError
+from pipeline.run_folder import FINISHED
 
 HERE = platform.node()
 RUN = "qlearning@lake_1"
@@ -44,7 +52,7 @@ def owner_of(pid):
     mark = liveness.mark()
     stat = Path(f"/proc/{pid}/stat")
     began = stat.read_text().rpartition(")")[2].split()[19] if stat.exists() else 1
-    return f"{pid}-{began}-{drafts._place(mark)}"
+    return f"{pid}-{began}-{run_folders._place(mark)}"
 
 
 def let_pass(draft, seconds):
@@ -112,7 +120,7 @@ def test_each_draft_is_judged_by_itself(tmp_path, dead_pid, live_pid):
 
 
 def test_a_draft_is_kept_for_a_run_that_is_still_to_do(tmp_path, dead_pid):
-    draft = draft_of(tmp_path, f"{dead_pid}-2-{drafts._place(liveness.mark())}")
+    draft = draft_of(tmp_path, f"{dead_pid}-2-{run_folders._place(liveness.mark())}")
     remove_dead_drafts(tmp_path, {RUN})
     assert draft.is_dir()
     leave_drafts(tmp_path, RUN)
@@ -141,7 +149,7 @@ def test_the_next_process_takes_over_what_a_dead_one_has_left(tmp_path, dead_pid
     draft_of(tmp_path, live_pid, state=True)
     assert not take_over(own)
     assert not own.exists()
-    stateless = draft_of(tmp_path, f"{dead_pid}-2-{drafts._place(liveness.mark())}")
+    stateless = draft_of(tmp_path, f"{dead_pid}-2-{run_folders._place(liveness.mark())}")
     left = draft_of(tmp_path, dead_pid, state=True)
     assert take_over(own)
     assert not left.exists()
@@ -233,7 +241,7 @@ def test_no_file_of_a_run_is_open_when_it_is_renamed_into_place(
         assert (draft / "run.json").is_file()
 
     still_open = []
-    monkeypatch.setattr(run_in_child, "put_in_place", note)
+    monkeypatch.setattr(run_folders, "put_in_place", note)
     env = EnvironmentSpec(env_id, env_id, {"n_timesteps": 60})
     study = StudySpec("s", "S", (AgentSpec(algo, algo),), (env,), n_seeds=1)
     (planned,) = plan(study, tmp_path)
@@ -302,3 +310,136 @@ def test_a_folder_that_can_never_be_made_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "mkdir", never)
     with pytest.raises(FileNotFoundError, match="never"):
         make_folder(tmp_path / "a")
+
+
+# --- Finished runs of other settings: named, kept, and moved aside when that is asked for.
+
+LAKE = EnvironmentSpec("lake", "FrozenLake-v1", {"n_timesteps": 20})
+ARMS = EnvironmentSpec("arms", "BernoulliBandit-v0", {"n_timesteps": 20})
+
+
+def study_of(algo="qlearning", environment=LAKE, n_seeds=2, **settings):
+    agent = AgentSpec("mine", algo, settings)
+    return StudySpec("s", "S", (agent,), (environment,), n_seeds=n_seeds)
+
+
+@pytest.fixture
+def done(tmp_path, do_study):
+    do_study(study_of(), tmp_path)
+    return tmp_path
+
+
+def contents(folder):
+    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.json")}
+
+
+def test_other_settings_are_refused_by_name(done):
+    planned = plan(study_of(gamma=0.5), done)
+    before = contents(done)
+    words = (
+        f"{done}: 2 finished runs have other settings (gamma: 0.995 there, 0.5 now): --name NAME"
+    )
+    with pytest.raises(UserError, match=f"^{re.escape(words)} .*, --replace "):
+        check_settings_kept(planned, done)
+    assert contents(done) == before
+
+
+def test_of_many_differences_three_are_named(done):
+    study = replace(
+        study_of(gamma=0.5, learning_rate=0.2, initial_q=2.0), eval_freq=7, eval_episodes=3
+    )
+    with pytest.raises(UserError, match=r"; and 2 more\)"):
+        check_settings_kept(plan(study, done), done)
+
+
+@pytest.mark.parametrize("n_seeds", [1, 2, 5])
+def test_more_or_fewer_seeds_go_without_a_word(done, n_seeds):
+    planned = plan(study_of(n_seeds=n_seeds), done)
+    check_settings_kept(planned, done)
+    assert move_replaced_aside(planned, done) == ([], None)
+    assert [run.is_finished for run in planned] == [True, True, False, False, False][:n_seeds]
+
+
+def test_what_is_moved_aside_is_whole_and_each_time_elsewhere(done, do_study):
+    before = contents(done / "runs")
+    for number, gamma in enumerate((0.5, 0.6), start=1):
+        study = study_of(gamma=gamma)
+        planned = plan(study, done)
+        moved, place = move_replaced_aside(planned, done)
+        assert (moved, place) == (planned, done / "replaced" / str(number))
+        assert contents(place) == before
+        check_settings_kept(planned, done)
+        do_study(study, done)
+        before = contents(done / "runs")
+
+
+def test_a_batch_of_more_seeds_takes_the_place_of_one_of_fewer(tmp_path, do_study):
+    do_study(study_of("ucb", ARMS), tmp_path)
+    planned = plan(study_of("ucb", ARMS, n_seeds=3), tmp_path)
+    check_settings_kept(planned, tmp_path)
+    assert in_the_way(planned) == planned
+    assert move_replaced_aside(planned, tmp_path) == (planned, tmp_path / "replaced" / "1")
+    do_study(study_of("ucb", ARMS), tmp_path)
+    planned = plan(study_of("ucb", replace(ARMS, settings={"n_timesteps": 30})), tmp_path)
+    with pytest.raises(UserError, match=r"1 finished run has other settings \(n_timesteps"):
+        check_settings_kept(planned, tmp_path)
+
+
+def test_first_runs_with_checkpoints_take_the_place_of_those_without(done):
+    planned = plan(replace(study_of(), render_every=2), done)
+    check_settings_kept(planned, done)
+    assert in_the_way(planned) == planned[:1]
+
+
+def test_a_run_that_was_cut_off_is_kept_and_an_empty_folder_is_not(done):
+    planned = plan(study_of(n_seeds=4), done)
+    planned[0].run.update_info(state="interrupted")
+    planned[2].path.mkdir()
+    check_settings_kept(planned, done)
+    assert move_replaced_aside(planned, done) == (planned[:1], done / "replaced" / "1")
+    assert not planned[2].path.exists()
+
+
+def test_another_driver_deletes_nothing_either(done):
+    """Programs of a user's own take no lock, and come without being checked."""
+    (run, _) = plan(study_of(gamma=0.5), done)
+    before = contents(run.path)
+    do_run(run, draft_path(done, run), "c")
+    assert run.is_finished
+    assert contents(done / "replaced" / "1" / "mine" / "lake_1") == before
+
+
+def test_versions_that_differ_are_named():
+    infos = [{"versions": {"torch": "2.1", "numpy": "2.0"}}] * 2
+    assert mixed_versions(infos) == mixed_versions([]) == mixed_versions([{}]) == ""
+    infos = [*infos, {"versions": {"torch": "2.2", "numpy": "2.0"}, "n_runs": 9}]
+    expected = "runs were done with different versions: torch 2.1 (2 runs), 2.2 (9 runs)"
+    assert mixed_versions(infos) == expected
+
+
+# --- What the disk has of a run of a study, and when.
+
+
+def test_a_draft_is_on_the_disk_before_it_has_its_name(monkeypatch, tmp_path):
+    """After a power cut no folder of a run may be there whose files are not."""
+    house = EnvironmentSpec("house", "Warehouse-v0", {"n_timesteps": 200})
+    agent = AgentSpec("table", "qlearning", tuned=False)
+    [run] = plan(StudySpec("s", "S", (agent,), (house,), n_seeds=1), tmp_path)
+    events = []
+    fsync, put = os.fsync, run_folders.put_in_place
+
+    def synced(number):
+        events.append(Path(f"/proc/self/fd/{number}").readlink().name)
+        fsync(number)
+
+    def named(*args):
+        events.append("named")
+        put(*args)
+
+    monkeypatch.setattr(files.os, "fsync", synced)
+    monkeypatch.setattr(run_folders, "put_in_place", named)
+    do_run(run, run_folders.draft_path(tmp_path, run), "")
+    assert run.run.read_info()["state"] == FINISHED
+    place = events.index("named")
+    assert {path.name for path in run.path.rglob("*")} <= set(events[:place])
+    assert run.path.parent.name in events[place:]

@@ -10,10 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents import ALGORITHMS
-from experiments import study_files
-from experiments.study_files import find_study, read_study, swept, write_study
-from experiments.study_plan import plan
-from experiments.study_spec import METRICS, AgentSpec, QuickSpec, file_name, layered
+from experiments import study
+from experiments.plan import plan
+from experiments.study import (
+    METRICS,
+    AgentSpec,
+    QuickSpec,
+    file_name,
+    find_study,
+    layered,
+    read_study,
+    swept,
+    write_study,
+)
 from pipeline.environments import training_changes
 from pipeline.errors import UserError
 from pipeline.files import portable_name
@@ -376,7 +385,7 @@ def test_ordinary_labels_keep_the_folders_that_they_had(label):
 
 def test_a_shipped_study_is_found_by_its_name(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    shipped = Path(study_files.__file__).resolve().parents[1] / "studies" / "mine-maze.yml"
+    shipped = Path(study.__file__).resolve().parents[1] / "studies" / "mine-maze.yml"
     for given_name in ("mine-maze", "mine-maze.yml", "studies/mine-maze.yml", "./mine-maze.yml"):
         assert find_study(given_name) == shipped
     assert read_study(shipped).name == "mine-maze"
@@ -427,7 +436,7 @@ def test_limits_that_are_none(tmp_path, line):
         read_study(path)
 
 
-SHIPPED = Path(study_files.__file__).parents[1] / "studies"
+SHIPPED = Path(study.__file__).parents[1] / "studies"
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.rglob("*.yml")), ids=lambda path: path.stem)

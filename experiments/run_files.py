@@ -1,13 +1,15 @@
-"""The figures that one finished run left, each file held against its digest and its form.
+"""The files that one finished run left, each held against its digest and its form.
 
-Runs of earlier versions recorded no digests: of these a file counts that has the form.
+Runs of earlier versions recorded no digests: of these a file counts that has the form. All that
+reads here raises `DamagedFileError` for a file that is missing, changed, or holds anything else.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,11 +18,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from experiments.plan import PlannedRun
 from mdp.array_types import Floats
 from pipeline.array_files import read_arrays
 from pipeline.errors import one_line
 from pipeline.file_digests import DamagedFileError
 from pipeline.run_folder import Run
+from safe_files.archives import read_members
+from safe_files.refusals import UnsafeFileError
 
 LARGEST_FIGURE = 1e300
 _FORMER_BASELINE = "best_blind"  # what earlier versions called it
@@ -42,25 +47,15 @@ _COLUMNS = ["r", "l", "t"]  # return, length, seconds since the beginning
 
 @dataclass(frozen=True)
 class Episodes:
-    """The training episodes of a run in the order in which they ended.
+    """The training episodes of a run in the order in which they ended."""
 
-    Attributes:
-        steps: environment steps done by then, over all environments, shape (n,).
-        returns: undiscounted returns, shape (n,).
-        seconds: time since the beginning, shape (n,).
-    """
-
-    steps: Floats
-    returns: Floats
-    seconds: Floats
+    steps: Floats  # environment steps done by then, over all environments, shape (n,)
+    returns: Floats  # undiscounted returns, shape (n,)
+    seconds: Floats  # time since the beginning, shape (n,)
 
 
 def read_episodes(run: Run) -> Episodes:
-    """The training episodes that Monitor wrote down.
-
-    Raises:
-        DamagedFileError: if a file of them is missing or changed, or holds anything else.
-    """
+    """The training episodes that Monitor wrote down."""
     files = run.files
     paths = files.matching("*.monitor.csv")
     if not paths:
@@ -101,11 +96,7 @@ def _table_of(content: bytes) -> Floats:
 
 
 def read_evaluations(run: Run) -> tuple[Floats, Floats]:
-    """Steps and mean returns of the evaluations during training, each of shape (n_evaluations,).
-
-    Raises:
-        DamagedFileError: if their file is missing or changed, or holds anything else.
-    """
+    """Steps and mean returns of the evaluations during training, each of shape (n_evaluations,)."""
     files = run.files
     for path in files.matching(run.evaluations_path.name):
         arrays = read_arrays(path, files.read(path))
@@ -123,15 +114,7 @@ def read_evaluations(run: Run) -> tuple[Floats, Floats]:
 
 
 def read_outcome(run: Run, required: tuple[str, ...]) -> dict[str, Any]:
-    """What ``run.json`` says came out, in which ``final`` maps names to figures.
-
-    Args:
-        run: the run.
-        required: the names of figures that have to be there.
-
-    Raises:
-        DamagedFileError: if it is damaged, or says anything else.
-    """
+    """What ``run.json`` says came out, with ``required`` names; ``final`` maps names to figures."""
     info = run.read_info()
     final = info.get("final")
     if not (final is None or isinstance(final, dict)):
@@ -170,11 +153,7 @@ def _is_figure(value: object) -> bool:
 
 
 def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
-    """The maps that a run kept, as `pipeline.evaluation.value_maps` writes them.
-
-    Raises:
-        DamagedFileError: if their file is missing or changed, or holds anything else.
-    """
+    """The maps that a run kept, as `pipeline.evaluation.value_maps` writes them."""
     path = run.value_maps_path
     arrays = read_arrays(path, run.files.read(path))
     lacking = [name for name in _MAPS if name not in arrays]
@@ -196,3 +175,127 @@ def read_value_maps(run: Run) -> dict[str, NDArray[Any]]:
     if not all(np.isfinite(array).all() for array in (steps, values, best_values)):
         raise DamagedFileError(path, "is damaged: it holds what is no finite number")
     return arrays
+
+
+# --- Learning curves.
+
+TRAINING_POINTS = 100
+
+# Columns of `StudyResults.curves`. Each row is an evaluation, or the mean of some episodes of
+# training at the end of the last.
+CURVE_COLUMNS = (
+    "agent",
+    "environment",
+    "seed",
+    "kind",  # "evaluation" or "training"
+    "step",
+    "episode",
+    "seconds",
+    "value",  # return
+)
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A learning curve of one run."""
+
+    labels: dict[str, Any]  # the columns of `CURVE_COLUMNS` that are the same all along
+    figures: dict[str, Floats]  # the other columns, each of shape (n,)
+
+
+def joined(curves: Sequence[Curve]) -> pd.DataFrame:
+    """The curves below each other."""
+    if not curves:
+        return pd.DataFrame(columns=CURVE_COLUMNS)
+    lengths = [len(curve.figures["step"]) for curve in curves]
+    columns: dict[str, Any] = {
+        name: np.repeat([curve.labels[name] for curve in curves], lengths)
+        for name in curves[0].labels
+    }
+    columns |= {
+        name: np.concatenate([curve.figures[name] for curve in curves])
+        for name in curves[0].figures
+    }
+    return pd.DataFrame(columns, columns=list(CURVE_COLUMNS))
+
+
+def _curve(planned: PlannedRun, kind: str, figures: dict[str, Floats]) -> Curve:
+    labels = {"agent": planned.agent, "environment": planned.environment}
+    return Curve({**labels, "seed": planned.seed, "kind": kind}, figures)
+
+
+def evaluation_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
+    """Mean returns of the evaluations during training."""
+    steps, returns = read_evaluations(planned.run)
+    seconds = np.interp(
+        steps, np.insert(episodes.steps, 0, 0.0), np.insert(episodes.seconds, 0, 0.0)
+    )
+    columns = {
+        "step": steps,
+        "episode": np.searchsorted(episodes.steps, steps, side="right").astype(np.float64),
+        "seconds": seconds,
+        "value": returns,
+    }
+    return _curve(planned, "evaluation", columns)
+
+
+def training_curve(planned: PlannedRun, episodes: Episodes) -> Curve:
+    """Means over blocks of episodes, so that no run has more than `TRAINING_POINTS`."""
+    n = len(episodes.returns)
+    block = max(-(-n // TRAINING_POINTS), 1)
+    ends = np.minimum(np.arange(block, n + block, block), n)
+    starts = np.arange(0, n, block)
+    sums = np.add.reduceat(episodes.returns, starts) if n else np.empty(0)
+    columns = {
+        "step": episodes.steps[ends - 1],
+        "episode": ends.astype(np.float64),
+        "seconds": episodes.seconds[ends - 1],
+        "value": sums / (ends - starts),
+    }
+    return _curve(planned, "training", columns)
+
+
+# --- Runs beside each other.
+
+
+def difference(run: Run, other: Run) -> str:
+    """In what two finished runs differ; empty where they are the same to the last bit."""
+    if _tensors(run) != _tensors(other):
+        return "the agent"
+    one, another = read_episodes(run), read_episodes(other)
+    if not (_same(one.steps, another.steps) and _same(one.returns, another.returns)):
+        return "the episodes"
+    if not all(map(_same, read_evaluations(run), read_evaluations(other))):
+        return "the evaluations"
+    return ""
+
+
+def _same(one: np.ndarray, other: np.ndarray) -> bool:
+    return one.tobytes() == other.tobytes()
+
+
+def _tensors(run: Run) -> dict[str, bytes]:
+    """What the agent at the end has learnt, as its zip holds it."""
+    try:
+        members = read_members(run.files.read(run.model_path))
+    except UnsafeFileError as error:
+        raise DamagedFileError(run.model_path, str(error)) from error
+    return {name: content for name, content in members.items() if name.endswith(".pth")}
+
+
+def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
+    """Which versions differ between the ``run.json`` of runs, in a line; empty where none does."""
+    counts: dict[str, Counter[str]] = {}
+    for info in infos:
+        for package, version in info.get("versions", {}).items():
+            counts.setdefault(package, Counter())[version] += info.get("n_runs", 1)
+    mixed = [
+        f"{package} {', '.join(_counted(*item) for item in sorted(found.items()))}"
+        for package, found in counts.items()
+        if len(found) > 1
+    ]
+    return f"runs were done with different versions: {'; '.join(mixed)}" if mixed else ""
+
+
+def _counted(version: str, n_runs: int) -> str:
+    return f"{version} ({n_runs} run{'' if n_runs == 1 else 's'})"

@@ -1,36 +1,188 @@
-"""Studies from YAML files: read strictly, mistakes named with file and line."""
+"""What a study is asked to do, as one immutable value, and its YAML file.
+
+Files are read strictly; mistakes are named with file and line.
+"""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import yaml
 
 from agents import ALGORITHMS
 from experiments import run_limits
-from experiments.study_spec import (
-    AS_IT_COMES,
-    AgentSpec,
-    EnvironmentSpec,
-    Metric,
-    QuickSpec,
-    StudySpec,
-    file_name,
-    layered,
-    symbol,
-)
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, shown, unknown
-from pipeline.files import write_text
+from pipeline.files import LONGEST_NAME, portable_name, write_text
 from pipeline.json_text import plain
 from pipeline.map_contents import with_maps_read
 from pipeline.settings.coercion import coerce
+from pipeline.settings.hyperparam_entries import override
 from pipeline.settings.strict_yaml import key_lines, read_yaml
+from pipeline.user_modules import UserModule
+
+Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]
+METRICS = get_args(Metric)
+
+METRIC_WORDS: dict[str, str] = {
+    "final": "return of the final policy",
+    "best": "return of the best policy during training",
+    "area": "mean return over the learning curve",
+    "training": "mean return of all training episodes",
+    "last_episodes": "mean return of the last 100 training episodes",
+    "regret": "regret of a run",
+}
+
+# Of these the lower is the better.
+COSTS = ("regret",)
+
+
+# These are of training episodes, the others of evaluations.
+OF_TRAINING = ("training", "last_episodes")
+
+
+# Settings that map names to values: such mappings are merged name by name.
+MERGED = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
+
+
+# What settings change in the environment for training alone; with these it is as it comes.
+AS_IT_COMES: dict[str, Any] = {"train_env_kwargs": None, "train_env_wrapper": None}
+
+
+def layered(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings with ``changes`` made to them."""
+    merged = {
+        key: {**settings[key], **changes[key]}
+        for key in MERGED
+        if isinstance(settings.get(key), dict) and isinstance(changes.get(key), dict)
+    }
+    return override(settings, {**changes, **merged})
+
+
+# What settings are called in labels and on axes: as the field writes them.
+_SYMBOLS = {
+    "learning_rate": "α",
+    "gamma": "γ",
+    "exploration_initial_eps": "ε",
+    "trace_decay": "λ",
+    "gae_lambda": "λ",
+    "kappa": "κ",
+    "initial_q": "initial Q",
+}
+# In names of files, on the other hand.
+_SPELT = {"α": "alpha", "γ": "gamma", "ε": "epsilon", "λ": "lambda", "κ": "kappa"}
+
+
+def symbol(setting: str) -> str:
+    """A setting as labels and axes call it: the field's letter, or else its own name."""
+    return _SYMBOLS.get(setting, setting)
+
+
+def file_name(label: str, longest: int = LONGEST_NAME) -> str:
+    """The label as the name of a folder, of ``longest`` bytes at most."""
+    label = re.sub(r"(\w) = ", lambda found: f"{_SPELT.get(found[1], found[1])}=", label)
+    return portable_name(re.sub(r"[^\w.=+,-]+", "_", label).strip("_.") or "_", longest)
+
+
+@dataclass(frozen=True)
+class AgentSpec:
+    """One of the agents that are compared."""
+
+    label: str  #: what it is called in tables and figures
+    algo: str  #: its name in the table of agents
+    #: Hyperparameters, which change those of its file.
+    settings: dict[str, Any] = field(default_factory=dict)
+    #: Whether to begin with the entry of ``hyperparams/<algo>.yml``; otherwise with the defaults of
+    #: its constructor.
+    tuned: bool = True
+    #: A file of hyperparameters to begin with, instead of that one; None for that one.
+    conf_file: Path | None = None
+    summary: str = ""  #: a few words on it, for the report
+    #: The place in a study file that asks for it, for error messages.
+    where: str = field(default="", compare=False)
+    group: str = ""  #: for one of a sweep, the label that its members share
+    swept: dict[str, Any] = field(default_factory=dict)  #: its values of what is swept
+
+
+@dataclass(frozen=True)
+class EnvironmentSpec:
+    """One of the environments that they are compared on."""
+
+    label: str  #: what it is called in tables and figures
+    env_id: str  #: its Gymnasium id
+    #: Hyperparameters of every agent here, such as ``env_kwargs`` and ``n_timesteps``, which change
+    #: those of the agents' files.
+    settings: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class QuickSpec:
+    """How a study is cut down for a first look."""
+
+    seeds: int = 2  #: how many seeds then
+    budget: float = 0.1  #: share of each run's steps or episodes
+
+
+@dataclass(frozen=True)
+class StudySpec:
+    """A study: every agent on every environment with every seed."""
+
+    name: str  #: the name of its folder
+    title: str  #: one line on what it asks
+    agents: tuple[AgentSpec, ...]  #: what is compared
+    environments: tuple[EnvironmentSpec, ...]  #: where
+    n_seeds: int = 10  #: how many seeds there are
+    description: str = ""  #: what it asks, and what is known beforehand
+    #: Environment steps between two evaluations, or None for twenty in a run.
+    eval_freq: int | None = None
+    eval_episodes: int = 20  #: episodes of each evaluation that has to be sampled
+    metric: Metric = "final"  #: what the verdicts are about
+    #: Difference of the metric within which two agents count as equivalent; None for 2 % of the way
+    #: from the best random or constant policy to the optimum, where that is known.
+    margin: float | None = None
+    #: Return that counts as solved; None for 95 % of that way, or else what the environment has
+    #: registered.
+    threshold: float | None = None
+    #: Episodes in each row of the table of training returns; 0 for no table.
+    episodes_table: int = 0
+    quick: QuickSpec = field(default_factory=QuickSpec)  #: how it is cut down for a first look
+    is_quick: bool = False  #: whether it has been
+    #: Names of modules of the user's, whose classes settings may name.
+    gym_packages: tuple[str, ...] = ()
+    user_modules: tuple[UserModule, ...] = ()  #: the same, as another process can import them
+    tensorboard: bool = False  #: whether each run writes a TensorBoard log
+    render_every: int = 0  #: episodes between two that are filmed; 0 for no films
+    #: Whether the page links to others that play the first training of each agent.
+    learning_pages: bool = False
+    #: The formats that figures are written in: "png", "svg", "pdf".
+    figures: Sequence[str] = ("png", "svg")
+    run_timeout: float | None = None  #: seconds that each run may take; None for no limit
+    run_memory: int | None = None  #: bytes of memory that each run may take; None for no limit
+    source: Path | None = None  #: the file that it was read from, or None
+    first_seed: int = 0  #: the first of them; the others follow it
+
+    @property
+    def seeds(self) -> range:
+        """The seeds."""
+        return range(self.first_seed, self.first_seed + self.n_seeds)
+
+    def quickened(self) -> StudySpec:
+        """The study with few seeds and a small budget, in a folder of its own."""
+        return replace(
+            self,
+            name=f"{self.name}-quick",
+            n_seeds=min(self.quick.seeds, self.n_seeds),
+            is_quick=True,
+        )
+
+
+# --- Study files.
 
 # The studies that come with the project.
 _SHIPPED = Path(__file__).resolve().parents[1] / "studies"

@@ -2,24 +2,35 @@
 
 import contextlib
 import errno
+import heapq
 import json
 import os
 import threading
 from concurrent.futures import Future
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
-from experiments import execution, launching, run_or_go_on
+from agents import ALGORITHMS
+from agents.algorithm_entries import AlgorithmEntry
+from experiments import launching, run_in_child
 from experiments.child_processes import NO_LIMITS, StoppedError, TaskFailedError
-from experiments.drafts import draft_path, leave_drafts, run_name
-from experiments.execution import WINDOW, execute
-from experiments.launching import available_cores, failure_log
+from experiments.launching import (
+    WINDOW,
+    TimeLeft,
+    available_cores,
+    execute,
+    expected_seconds,
+    failure_log,
+)
+from experiments.plan import plan
+from experiments.run_folders import draft_path, leave_drafts, run_name
 from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
-from experiments.study_plan import plan
-from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.resuming.saved_states import SavedState
 from pipeline.resuming.state_keeping import StateKeeping
@@ -105,7 +116,7 @@ def test_what_a_run_failed_by_says_whether_the_next_try_goes_on(
         (draft / "state" / "odd.state").touch()
         raise error from cause
 
-    monkeypatch.setattr(run_or_go_on, "train", fail)
+    monkeypatch.setattr(run_in_child, "train", fail)
     with pytest.raises(type(error)):
         do_run(planned, draft, "compare.py s.yml")
     leave_drafts(tmp_path, run_name(planned))
@@ -117,9 +128,9 @@ def test_a_study_goes_on_from_states_of_its_own_sources_alone(tmp_path, monkeypa
     planned, _ = runs_of(tmp_path)
     left = StateKeeping(state=SavedState(None, {"sources": sources}), goes_on=True)
     for name, value in (("holds_state", True), ("go_on", left)):
-        monkeypatch.setattr(run_or_go_on, name, lambda *_, value=value: value)
+        monkeypatch.setattr(run_in_child, name, lambda *_, value=value: value)
     monkeypatch.setattr(type(planned), "is_of", lambda *_: True)
-    found = run_or_go_on._to_go_on_with(planned, planned.run)
+    found = run_in_child._to_go_on_with(planned, planned.run)
     assert found.goes_on == (sources != "older")
 
 
@@ -194,7 +205,7 @@ class Growing:
 
 
 def test_runs_are_handed_over_in_windows_as_wide_as_there_are_workers(tmp_path, monkeypatch):
-    monkeypatch.setattr(execution, "SECONDS_BETWEEN_LOOKS", 0.01)
+    monkeypatch.setattr(launching, "SECONDS_BETWEEN_LOOKS", 0.01)
     runs, launcher, told = runs_of(tmp_path, n_seeds=12), Growing(), []
 
     def listen(run, failure):
@@ -231,7 +242,8 @@ def test_a_failure_whose_details_cannot_be_written_is_told_and_the_others_go_on(
 
     monkeypatch.setattr(launching, "write_text", full)
     monkeypatch.setattr(launching, "supervise", failing)
-    failure = launching._supervised(runs_of(tmp_path)[0], tmp_path, "compare.py", RunLimits())
+    with launchers_on(InPlace(), tmp_path)() as launcher:
+        failure = launcher.submit(runs_of(tmp_path)[0]).result()
     assert failure.reason.startswith(reason)
     assert failure.log is None
 
@@ -246,3 +258,112 @@ def test_what_is_done_meanwhile_is_done_once_after_the_first_runs_are_handed_ove
     where = contextlib.nullcontext(launcher)
     execute(runs, tmp_path, lambda: where, lambda run, failure: None, meanwhile)
     assert given_then == [2 * WINDOW]
+
+
+# --- How long a study may still take, held against simulated times.
+
+# What a run takes by agent, in seconds; environments change it twofold.
+TAKES = {"qlearning": 0.5, "sarsa": 0.6, "dqn": 40.0, "double_dqn": 90.0, "ppo": 25.0}
+ENVIRONMENTS = {"FrozenLake-v1": 0.7, "FrozenLake8x8-v1": 1.0, "Taxi-v4": 1.4, "CliffWalking-v1": 1}
+
+
+def runs_to_time(n_seeds):
+    return plan(
+        StudySpec(
+            "s",
+            "S",
+            tuple(AgentSpec(algo, algo) for algo in TAKES),
+            tuple(EnvironmentSpec(name, name, {"n_timesteps": 9}) for name in ENVIRONMENTS),
+            n_seeds=n_seeds,
+        ),
+        Path("nowhere"),
+    )
+
+
+def played(runs, takes, n_workers, expected, shares):
+    """The estimate by the truth, where so many of the runs have ended."""
+    left, now, n_ended, estimates = TimeLeft(runs, expected), 0.0, 0, {}
+    waiting, under_way = list(enumerate(runs)), []
+    left.start(now, n_workers)
+    for _ in range(n_workers):
+        number, run = waiting.pop(0)
+        heapq.heappush(under_way, (takes[number], number, run))
+    while under_way:
+        now, _, run = heapq.heappop(under_way)
+        n_ended += 1
+        left.end(run, now)
+        left.start(now, n_workers)
+        if waiting:
+            number, run = waiting.pop(0)
+            heapq.heappush(under_way, (now + takes[number], number, run))
+        for share in shares:
+            if share not in estimates and n_ended >= share * len(runs):
+                estimates[share] = (now, left.seconds(now, n_workers))
+    return {share: guess / (now - at) for share, (at, guess) in estimates.items()}
+
+
+@pytest.mark.parametrize("n_seeds", [3, 10])
+@pytest.mark.parametrize("n_workers", [1, 2, 8])
+@pytest.mark.parametrize("off", [0.6, 1.0, 1.7, 4.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_after_a_tenth_of_the_runs_it_is_right_within_a_factor_of_two(
+    n_seeds, n_workers, off, seed
+):
+    """Also where all take more or less than was expected, as on a busy machine."""
+    runs, rng = runs_to_time(n_seeds), np.random.default_rng(seed)
+    usual = [TAKES[run.agent] * ENVIRONMENTS[run.environment] for run in runs]
+    takes = [time * rng.uniform(0.8, 1.25) for time in usual]
+    expected = {
+        (run.agent, run.environment): time / off * rng.uniform(0.8, 1.25)
+        for run, time in zip(runs, usual, strict=True)
+    }
+    found = played(runs, takes, n_workers, expected, (0.1, 0.25, 0.5))
+    assert all(0.5 < ratio < 2 for ratio in found.values()), found
+
+
+def test_equal_runs_of_which_nothing_is_known():
+    runs = [run for run in runs_to_time(10) if run.agent == "qlearning"]
+    found = played(runs, [3.0] * len(runs), 2, {}, (0.1, 0.5))
+    assert found == pytest.approx({0.1: 1, 0.5: 1}, rel=0.1)
+
+
+def test_a_run_may_take_the_whole_time_that_is_left():
+    slow, *fast = [run for run in runs_to_time(3) if run.environment == "Taxi-v4"][:4]
+    expected = {(run.agent, run.environment): 1.0 for run in fast}
+    left = TimeLeft([slow, *fast], {**expected, (slow.agent, slow.environment): 100.0})
+    left.start(0.0, 8)
+    for run in fast:
+        left.end(run, 1.0)
+    assert left.seconds(10.0, 8) == pytest.approx(90)
+    # Nobody knows how long, once it has taken longer.
+    assert 0 < left.seconds(1000.0, 8) <= 250
+
+
+def test_runs_may_end_in_another_order():
+    first, *_, last = runs_to_time(3)
+    left = TimeLeft([first, last], {})
+    left.start(0.0, 1)
+    left.end(last, 5.0)
+    left.start(5.0, 1)
+    left.end(last, 6.0)  # told twice
+    left.end(first, 7.0)
+    assert left.seconds(7.0, 1) == 0
+
+
+def test_expectations_go_by_agent_and_budget():
+    table, network = runs_to_time(1)[0].spec, runs_to_time(1)[2].spec
+    assert (table.algo, network.algo) == ("qlearning", "dqn")
+    assert expected_seconds(table) < expected_seconds(network) < expected_seconds(network, 60.0)
+
+
+def test_nothing_is_said_while_an_agent_of_the_users_has_not_ended_a_run(monkeypatch):
+    """Nobody knows whether it is compiled."""
+    monkeypatch.setitem(ALGORITHMS, "own", AlgorithmEntry("own:Own", "own"))
+    runs = [replace(run, spec=replace(run.spec, algo="own")) for run in runs_to_time(3)[:12]]
+    left = TimeLeft(runs, {})
+    left.start(0.0, 1)
+    assert left.seconds(1.0, 1) is None
+    for n, run in enumerate(runs[: len(ENVIRONMENTS) * len(TAKES)], start=1):
+        left.end(run, 2.0 * n)
+        left.start(2.0 * n, 1)
+    assert left.seconds(24.0, 1) == pytest.approx(0.0)

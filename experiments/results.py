@@ -10,77 +10,67 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from experiments.bandit_results import batch_rows, read_pulls, run_regret
-from experiments.planned_runs import PlannedRun
-from experiments.pull_statistics import PullStatistics
-from experiments.run_curves import Curve, evaluation_curve, joined, training_curve
-from experiments.run_figures import (
+from experiments.bandits import PullStatistics, batch_rows, read_pulls, run_regret
+from experiments.plan import PlannedRun
+from experiments.run_files import (
+    TRAINING_POINTS,
+    Curve,
     Episodes,
+    evaluation_curve,
+    joined,
     read_episodes,
     read_outcome,
     read_value_maps,
+    training_curve,
 )
-from experiments.study_spec import StudySpec
+from experiments.study import StudySpec
 from mdp.array_types import Floats
 from pipeline.file_digests import DamagedFileError
 from pipeline.signs_of_life import Tell, tell_nobody
-from verdicts import area_under_curve, steps_to_stay, steps_to_threshold
+from verdicts import (
+    Band,
+    area_under_curve,
+    curve_band,
+    on_grid,
+    shared_grid,
+    steps_to_stay,
+    steps_to_threshold,
+)
 
 LAST_EPISODES = 100
 
 
 @dataclass(frozen=True)
 class LeftOut:
-    """A run that is there, and counts for nothing, since a file of it is damaged.
+    """A run that is there, and counts for nothing, since a file of it is damaged."""
 
-    Attributes:
-        planned: the run.
-        reason: which file, and what of it, in one line.
-    """
-
-    planned: PlannedRun
-    reason: str
+    planned: PlannedRun  #: the run
+    reason: str  #: which file, and what of it, in one line
 
 
 @dataclass(frozen=True)
 class RunResults:
-    """What one finished run, or one batch of them, has to say.
+    """What one finished run, or one batch of them, has to say."""
 
-    Attributes:
-        rows: of the summary, see `RUN_COLUMNS`.
-        curves: its learning curves.
-    """
-
-    rows: list[dict[str, Any]]
-    curves: list[Curve] = field(default_factory=list)
+    rows: list[dict[str, Any]]  #: of the summary, see `RUN_COLUMNS`
+    curves: list[Curve] = field(default_factory=list)  #: its learning curves
 
 
 @dataclass(frozen=True)
 class StudyResults:
-    """A study and its runs.
+    """A study and its runs."""
 
-    Attributes:
-        study: what was asked for.
-        root: its folder.
-        summary: one row for each finished run, see `RUN_COLUMNS`.
-        curves: learning curves of all runs, see `CURVE_COLUMNS`.
-        planned: all runs of the study, also those that failed.
-        pulls: on bandits, figures by pull, by labels of agent and environment.
-        left_out: the runs that are damaged.
-        n_unchecked: how many runs recorded no digests, so that damage in them may go unseen.
-        finished: the runs that the results are of.
-        failures: of runs that have just failed, the details, by their folders.
-    """
-
-    study: StudySpec
-    root: Path
-    summary: pd.DataFrame
-    curves: pd.DataFrame
-    planned: tuple[PlannedRun, ...]
+    study: StudySpec  #: what was asked for
+    root: Path  #: its folder
+    summary: pd.DataFrame  #: one row for each finished run, see `RUN_COLUMNS`
+    curves: pd.DataFrame  #: learning curves of all runs, see `CURVE_COLUMNS`
+    planned: tuple[PlannedRun, ...]  #: all runs of the study, also those that failed
+    #: On bandits, figures by pull, by labels of agent and environment.
     pulls: Mapping[tuple[str, str], PullStatistics] = field(default_factory=dict)
-    left_out: tuple[LeftOut, ...] = ()
-    n_unchecked: int = 0
-    finished: tuple[PlannedRun, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()  #: the runs that are damaged
+    n_unchecked: int = 0  #: how many runs recorded no digests, so that damage in them may go unseen
+    finished: tuple[PlannedRun, ...] = ()  #: the runs that the results are of
+    #: Of runs that have just failed, the details, by their folders.
     failures: Mapping[Path, str] = field(default_factory=dict)
 
 
@@ -265,3 +255,54 @@ def _summary_row(
 def _episodes_by(episodes: Episodes, step: float) -> float:
     reached = np.searchsorted(episodes.steps, step, side="right")
     return float(reached) if np.isfinite(step) else step
+
+
+# --- Agents over their seeds.
+
+RESAMPLING_SEED = 0  # the same runs give the same figures
+CURVE_POINTS = TRAINING_POINTS  # no run has more of training; a figure shows no more of them
+
+
+def values_over_seeds(results: StudyResults, environment: str, column: str) -> dict[str, Floats]:
+    """A column of the summary by agent, shape (n_seeds,); NaN where a run is missing."""
+    table = results.summary
+    table = table[table["environment"] == environment]
+    pivot = table.pivot(index="seed", columns="agent", values=column)
+    pivot = pivot.reindex(
+        index=results.study.seeds, columns=[a.label for a in results.study.agents]
+    )
+    return {str(agent): pivot[agent].to_numpy(dtype=np.float64, na_value=np.nan) for agent in pivot}
+
+
+def curves_by_agent(
+    results: StudyResults, environment: str
+) -> dict[tuple[str, str], list[pd.DataFrame]]:
+    """The learning curve of each run on an environment, by agent and kind."""
+    table = results.curves
+    table = table[table["environment"] == environment]
+    found: dict[tuple[str, str], list[pd.DataFrame]] = {}
+    for (agent, kind, _), rows in table.groupby(["agent", "kind", "seed"]):
+        found.setdefault((str(agent), str(kind)), []).append(rows)
+    return found
+
+
+def mean_curve(curves: Sequence[pd.DataFrame], by: str) -> tuple[Floats, Band] | None:
+    """The mean learning curve of an agent over its seeds.
+
+    Args:
+        curves: those of its runs, from `curves_by_agent`.
+        by: ``"step"``, ``"episode"`` or ``"seconds"``.
+
+    Returns:
+        The points, shape (n,), and the mean there with its interval; None without any run, or where
+        one ended before the first point of another.
+    """
+    runs = [
+        (rows[by].to_numpy(dtype=np.float64), rows["value"].to_numpy(dtype=np.float64))
+        for rows in curves
+    ]
+    if not runs or max(points[0] for points, _ in runs) > min(points[-1] for points, _ in runs):
+        return None
+    grid = shared_grid([points for points, _ in runs], CURVE_POINTS)
+    values = np.array([on_grid(points, returns, grid) for points, returns in runs])
+    return grid, curve_band(values, seed=RESAMPLING_SEED)

@@ -1,0 +1,442 @@
+"""Runs on bandits: done as one batch for each agent, and their figures pull by pull.
+
+All that reads here raises `DamagedFileError` for a file that is missing, changed, or holds anything
+else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from experiments.plan import PlannedRun
+from experiments.run_files import read_outcome
+from mdp.array_types import AnyInts, Floats, Ints
+from pipeline.array_files import read_arrays
+from pipeline.environments import make_single_env
+from pipeline.file_digests import DamagedFileError
+from pipeline.files import replacing
+from pipeline.run_files import PULLS_FILE
+from pipeline.run_folder import FINISHED, Run
+from pipeline.run_record import recorded_machine, recorded_versions, write_settings
+from pipeline.train_spec import TrainSpec
+
+if TYPE_CHECKING:
+    from agents.bandits.batch_result import BatchResult
+
+QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
+FIRST_PULLS = 100  # kept one by one; of later ones fewer and fewer, `MAX_POINTS` in all
+MAX_POINTS = 300
+
+
+@dataclass(frozen=True)
+class PullStatistics:
+    """Figures over the runs of one agent on one bandit, and the totals of each run.
+
+    Regret is the best expected reward less that of the arm pulled. Simple regret is that of
+    recommending the arm pulled most so far (Bubeck, Munos and Stoltz, 2009), in each context.
+    """
+
+    pulls: Ints  # the pulls that the figures are given at, counted from 1, shape (n_points,)
+    reward: Floats  # mean reward of a pull since the point before, shape (n_points,)
+    optimal: Floats  # share of those pulls that were of a best arm, shape (n_points,)
+    regret: Floats  # mean regret of those pulls, shape (n_points,)
+    cumulative_regret: Floats  # mean sum of the regrets up to the point, shape (n_points,)
+    cumulative_regret_sem: Floats  # its standard error over runs, shape (n_points,)
+    cumulative_regret_quantiles: Floats  # over runs, see `QUANTILES`, shape (n_quantiles, n_points)
+    simple_regret: Floats  # mean over runs, shape (n_points,)
+    total_reward: Floats  # of each run, shape (n_runs,)
+    total_regret: Floats  # of each run, shape (n_runs,)
+    # Share of the pulls that went to each arm, by context, shape (n_contexts, n_arms).
+    shares: Floats
+    # Mean regret of a pull, by context and arm; nan where it was never pulled, shape (n_contexts,
+    # n_arms).
+    context_regret: Floats
+    # Mean of the final estimates over runs, shape (n_contexts, n_arms); empty where the agent has
+    # none.
+    estimates: Floats
+    estimates_std: Floats  # their standard deviation over runs, likewise
+    true_means: Floats  # of the arms, where all runs have the same, likewise; else empty
+    moments: Ints  # pulls after which posteriors were kept, shape (n_moments,)
+    # Of the first run's arms: parameters of Beta distributions, or mean and standard deviation,
+    # shape (n_moments, n_contexts, n_arms, 2); else empty.
+    posteriors: Floats
+
+    def save(self, path: Path) -> None:
+        """Write all arrays to a NumPy archive."""
+        arrays: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(self)}
+        with replacing(path) as file:
+            np.savez(file, allow_pickle=False, **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> PullStatistics:
+        """Read what `save` wrote.
+
+        Raises:
+            DamagedFileError: if the file is missing or changed, or holds anything else.
+        """
+        arrays = read_arrays(path, Run(path.parent, "").files.read(path))
+        names = [field.name for field in fields(cls)]
+        lacking = [name for name in names if name not in arrays]
+        if lacking:
+            raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
+        statistics = cls(**{name: arrays[name] for name in names})
+        if not statistics._is_of_one_shape():
+            raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+        return statistics
+
+    def _is_of_one_shape(self) -> bool:
+        """Whether the arrays have the shapes that the class says."""
+        n_points, n_runs = self.pulls.size, self.total_reward.size
+        shapes = {
+            (n_points,): (
+                self.pulls,
+                self.reward,
+                self.optimal,
+                self.regret,
+                self.cumulative_regret,
+                self.cumulative_regret_sem,
+                self.simple_regret,
+            ),
+            (len(QUANTILES), n_points): (self.cumulative_regret_quantiles,),
+            (n_runs,): (self.total_reward, self.total_regret),
+            self.shares.shape: (self.shares, self.context_regret),
+        }
+        fits = all(array.shape == shape for shape, arrays in shapes.items() for array in arrays)
+        return (
+            fits
+            and self.shares.ndim == 2
+            and n_points > 0
+            # An agent that sees no contexts has one row of estimates for all of them.
+            and self.estimates.shape == self.estimates_std.shape
+            and self.estimates.ndim == self.true_means.ndim == 2
+            and self.posteriors.ndim == 4
+            and (not self.posteriors.size or self.posteriors.shape[0] == self.moments.size)
+        )
+
+
+def points_of(n_pulls: int) -> Ints:
+    """The pulls to give figures at: the first one by one, later ones ever further apart."""
+    if n_pulls <= MAX_POINTS:
+        return np.arange(1, n_pulls + 1)
+    first = np.arange(1, FIRST_PULLS + 1)
+    rest = np.geomspace(FIRST_PULLS + 1, n_pulls, MAX_POINTS - FIRST_PULLS)
+    return np.unique(np.concatenate([first, rest.round().astype(np.int64)]))
+
+
+def pull_statistics(
+    arms: AnyInts,
+    rewards: NDArray[np.floating[Any]],
+    regrets: Floats,
+    contexts: AnyInts | None,
+    n_arms: int,
+    n_contexts: int = 1,
+    estimates: Floats | None = None,
+    true_means: Floats | None = None,
+    moments: tuple[int, ...] = (),
+    posteriors: Floats | None = None,
+) -> PullStatistics:
+    """Sum up runs; arrays have a row for each run and a column for each pull.
+
+    Args:
+        arms: what was pulled, shape (n_runs, n_pulls).
+        rewards: what it gave, likewise.
+        regrets: of each pull, likewise.
+        contexts: what the arm was chosen in, likewise; None where there is but one.
+        n_arms: how many arms there are.
+        n_contexts: how many contexts.
+        estimates: of each run at its end, shape (n_runs, n_contexts, n_arms).
+        true_means: of the arms, where all runs have the same, shape (n_contexts, n_arms).
+        moments: after how many pulls posteriors were kept.
+        posteriors: shape (n_runs, n_moments, n_contexts, n_arms, 2).
+    """
+    points = points_of(arms.shape[1])
+    at = points - 1
+    cumulative = np.cumsum(regrets, axis=1)
+    cells = arms.astype(np.int64) + n_arms * (0 if contexts is None else contexts.astype(np.int64))
+    size = n_arms * n_contexts
+    counts = np.bincount(cells.ravel(), minlength=size).reshape(n_contexts, n_arms)
+    sums = np.bincount(cells.ravel(), weights=regrets.ravel(), minlength=size)
+    empty = np.empty((0, 0))
+    with np.errstate(invalid="ignore"):
+        context_regret = sums.reshape(n_contexts, n_arms) / counts
+        shares = counts / counts.sum(axis=1, keepdims=True)
+    n_runs = len(arms)
+    mean, std = _mean_and_std(empty[None] if estimates is None else estimates)
+    return PullStatistics(
+        pulls=points,
+        reward=_mean_since_last(rewards.mean(axis=0, dtype=np.float64), points),
+        optimal=_mean_since_last((regrets == 0.0).mean(axis=0), points),
+        regret=_mean_since_last(regrets.mean(axis=0), points),
+        cumulative_regret=cumulative[:, at].mean(axis=0),
+        cumulative_regret_sem=cumulative[:, at].std(axis=0, ddof=min(1, n_runs - 1)) / n_runs**0.5,
+        cumulative_regret_quantiles=np.quantile(cumulative[:, at], QUANTILES, axis=0),
+        simple_regret=_simple_regret(cells, regrets, at, (n_contexts, n_arms)),
+        total_reward=rewards.sum(axis=1, dtype=np.float64),
+        total_regret=cumulative[:, -1],
+        shares=shares,
+        context_regret=context_regret,
+        estimates=mean,
+        estimates_std=std,
+        true_means=empty if true_means is None else true_means,
+        moments=np.array(moments, dtype=np.int64),
+        posteriors=np.empty((0, 0, 0, 2)) if posteriors is None else posteriors[0],
+    )
+
+
+def _mean_and_std(estimates: Floats) -> tuple[Floats, Floats]:
+    """Over runs, leaving out nan; nan where no run has a figure."""
+    is_known = ~np.isnan(estimates)
+    with np.errstate(invalid="ignore"):
+        n_known = is_known.sum(axis=0)
+        mean = np.where(is_known, estimates, 0.0).sum(axis=0) / n_known
+        squares = np.where(is_known, estimates - mean, 0.0) ** 2
+        return mean, np.sqrt(squares.sum(axis=0) / n_known)
+
+
+def _mean_since_last(by_pull: Floats, points: Ints) -> Floats:
+    """Means over the pulls from one point, not included, to the next."""
+    sums = np.cumsum(by_pull)[points - 1]
+    return np.asarray(np.diff(sums, prepend=0.0) / np.diff(points, prepend=0))
+
+
+def _simple_regret(cells: Ints, regrets: Floats, at: Ints, shape: tuple[int, int]) -> Floats:
+    """Mean over runs of what recommending the arm pulled most so far falls short by.
+
+    ``cells`` number context and arm, shape (n_runs, n_pulls); ``at`` are pulls counted from 0;
+    ``shape`` holds the numbers of contexts and arms.
+    """
+    n_runs, rows = len(cells), np.arange(len(cells))
+    counts = np.zeros((n_runs, shape[0] * shape[1]))
+    sums = np.zeros_like(counts)
+    result, begin = np.empty(len(at)), 0
+    for index, last in enumerate(at.tolist()):
+        for pull in range(begin, last + 1):
+            counts[rows, cells[:, pull]] += 1
+            sums[rows, cells[:, pull]] += regrets[:, pull]
+        begin = last + 1
+        by_context = counts.reshape(n_runs, *shape)
+        most = by_context.argmax(axis=2)[..., None]
+        n_most = np.take_along_axis(by_context, most, axis=2)[..., 0]
+        regret_of_most = np.take_along_axis(sums.reshape(n_runs, *shape), most, axis=2)[..., 0]
+        # Contexts count as often as they were seen.
+        weights = by_context.sum(axis=2) / (last + 1)
+        result[index] = (weights * regret_of_most / np.maximum(n_most, 1)).sum(axis=1).mean()
+    return result
+
+
+# --- Results of batches, and of runs of their own.
+
+STATISTICS_FILE = "pull_statistics.npz"
+_PULLS = ("arms", "rewards", "regrets")  # what figures are made of, beside contexts
+
+
+def read_pulls(finished: Sequence[PlannedRun]) -> dict[tuple[str, str], PullStatistics]:
+    """Figures by pull of all runs on bandits."""
+    batches = [run for run in finished if run.is_batch]
+    pulls = {
+        (run.agent, run.environment): PullStatistics.load(run.path / STATISTICS_FILE)
+        for run in batches
+    }
+    one_by_one: dict[tuple[str, str], list[PlannedRun]] = {}
+    for run in finished:
+        if run.run.files.matching(PULLS_FILE):
+            one_by_one.setdefault((run.agent, run.environment), []).append(run)
+    for labels, runs in one_by_one.items():
+        pulls[labels] = stacked_statistics(runs[0].spec, [run.path for run in runs])
+    return pulls
+
+
+def batch_rows(planned: PlannedRun) -> list[dict[str, Any]]:
+    """A row of the summary for each run of a batch."""
+    info = read_outcome(planned.run, ("seconds",))
+    cpu_seconds = info.get("cpu_seconds")
+    path = planned.path / STATISTICS_FILE
+    pulls = PullStatistics.load(path)
+    if pulls.total_reward.size != planned.n_runs or info["seconds"] is None:
+        raise DamagedFileError(path, "is damaged: it is not of as many runs")
+    shared = {
+        "agent": planned.agent,
+        "algo": planned.spec.algo,
+        "environment": planned.environment,
+        "env_id": planned.spec.env_id,
+        "n_timesteps": planned.spec.hyperparams.n_timesteps,
+        "n_episodes": 1,
+        "seconds": info["seconds"] / planned.n_runs,
+        "cpu_seconds": None if cpu_seconds is None else cpu_seconds / planned.n_runs,
+        "engine": info.get("engine"),
+        "path": str(planned.path),
+    }
+    return [
+        {
+            **shared,
+            "seed": seed,
+            "training": reward,
+            "last_episodes": reward,
+            "regret": regret,
+        }
+        for seed, (reward, regret) in enumerate(
+            zip(pulls.total_reward.tolist(), pulls.total_regret.tolist(), strict=True),
+            start=planned.seed,
+        )
+    ]
+
+
+def run_regret(planned: PlannedRun) -> float | None:
+    """The regret of a run of its own, or None where it was on no bandit."""
+    files = planned.run.files
+    if not files.matching(PULLS_FILE):
+        return None
+    if files.digests is None:
+        check_pulls(planned.spec, planned.path)
+    pulls = read_run(planned.path, planned.spec.hyperparams.n_timesteps)
+    return float(pulls["regrets"].sum())
+
+
+def read_run(folder: Path, n_timesteps: int | None) -> dict[str, NDArray[Any]]:
+    """The pulls of a run of its own in the order of time, each of shape (n_pulls,).
+
+    Agents that collect whole rollouts go on beyond ``n_timesteps``; that is left out.
+    """
+    return {name: array.T.ravel()[:n_timesteps] for name, array in _pulls(folder).items()}
+
+
+def _pulls(folder: Path) -> dict[str, NDArray[Any]]:
+    path = folder / PULLS_FILE
+    arrays = read_arrays(path, Run(folder, "").files.read(path))
+    lacking = [name for name in _PULLS if name not in arrays]
+    if lacking:
+        raise DamagedFileError(path, f"is damaged: it lacks {lacking[0]}")
+    shape = arrays["arms"].shape
+    if len(shape) != 2 or not arrays["arms"].size:
+        raise DamagedFileError(path, "is damaged: it has not one row for each environment")
+    if any(array.shape != shape for array in arrays.values()):
+        raise DamagedFileError(path, "is damaged: its arrays do not fit each other")
+    for name in ("arms", "contexts"):
+        numbers = arrays.get(name)
+        if numbers is not None and (numbers.dtype.kind not in "iu" or (numbers < 0).any()):
+            raise DamagedFileError(path, f"is damaged: {name} are no numbers from 0 on")
+    return arrays
+
+
+def check_pulls(spec: TrainSpec, folder: Path) -> None:
+    """Make sure that what a run pulled is there in the environment of its spec."""
+    pulls = read_run(folder, spec.hyperparams.n_timesteps)
+    with closing(make_single_env(spec)) as env:
+        bandit: Any = env.unwrapped
+        sizes = {"arms": bandit.n_arms, "contexts": bandit.n_contexts}
+    for name, size in sizes.items():
+        if size > 0 and name in pulls and pulls[name].max() >= size:
+            raise DamagedFileError(folder / PULLS_FILE, f"is damaged: {name} are of another bandit")
+
+
+def stacked_statistics(spec: TrainSpec, folders: list[Path]) -> PullStatistics:
+    """The same for runs that were done one by one, from the pulls in their folders."""
+    runs = [read_run(folder, spec.hyperparams.n_timesteps) for folder in folders]
+    n_pulls = min(len(run["arms"]) for run in runs)
+    stacked = {name: np.stack([run[name][:n_pulls] for run in runs]) for name in runs[0]}
+    return _statistics_on(spec, *(stacked.get(name) for name in (*_PULLS, "contexts")))
+
+
+def _statistics_on(
+    spec: TrainSpec, arms: Any, rewards: Any, regrets: Any, contexts: Any, **more: Any
+) -> PullStatistics:
+    """Figures of pulls on the bandit of a spec, see `pull_statistics`."""
+    with closing(make_single_env(spec)) as env:
+        bandit: Any = env.unwrapped
+        n_arms, n_contexts = bandit.n_arms, max(bandit.n_contexts, 1)
+        is_known = bandit.n_contexts > 0 and not _is_drifting(bandit)
+        more["true_means"] = true_means(env)
+    contexts = contexts if n_contexts > 1 else None
+    found = pull_statistics(arms, rewards, regrets, contexts, n_arms, n_contexts, **more)
+    # No arm can be recommended where the worth of arms moves, or goes by a vector.
+    nowhere = np.full_like(found.simple_regret, np.nan)
+    return found if is_known else replace(found, simple_regret=nowhere)
+
+
+def true_means(env: gym.Env[Any, Any]) -> Floats | None:
+    """Means of the arms by context, shape (n_contexts, n_arms), where each run has the same."""
+    bandit: Any = env.unwrapped
+    moves = getattr(bandit, "redraws", False) or _is_drifting(bandit)
+    means = getattr(bandit, "means", None)
+    return None if moves or means is None else np.array(means, dtype=np.float64)
+
+
+def _is_drifting(bandit: Any) -> bool:
+    return bool(getattr(bandit, "drift_std", 0.0) > 0)
+
+
+# --- All runs of an agent as one batch: each a fresh agent and one episode.
+
+
+def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
+    """Do ``n_runs`` runs, from the spec's seed on, and leave their statistics in the run folder."""
+    from mdp.machine_code import compile_timer
+    from mdp.work_time import WorkTime
+
+    started = WorkTime.now()
+    with compile_timer() as time_compiling:
+        result, engine = _run(spec, n_runs)
+    _check_rewards(result, spec.seed)
+    statistics = _statistics_on(
+        spec,
+        result.arms,
+        result.rewards,
+        result.regrets,
+        result.contexts,
+        estimates=result.estimates,
+        moments=result.moments,
+        posteriors=result.posteriors,
+    )
+    statistics.save(run.path / STATISTICS_FILE)
+    write_settings(run, spec, command)
+    run.end(
+        state=FINISHED,
+        env_name=run.env_name,
+        spec=spec.as_data(),
+        n_runs=n_runs,
+        n_timesteps=len(result.arms[0]),
+        versions=recorded_versions(),
+        machine=recorded_machine(),
+        engine=engine,
+        **(WorkTime.now() - started - time_compiling()).as_data(),
+    )
+
+
+def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
+    # Imported where runs are done: it takes seconds, and whoever reads results needs nothing of it.
+    from agents.bandits.batch import run_batch
+    from agents.bandits.one_by_one import run_one_by_one
+    from agents.compiled.compile_envs import NotCompilable
+    from pipeline.preparation import algorithm_kwargs
+
+    arguments: tuple[Any, ...] = (
+        spec.algo,
+        algorithm_kwargs(spec),
+        spec.env_id,
+        spec.hyperparams.env_kwargs,
+        range(spec.seed, spec.seed + n_runs),
+        spec.hyperparams.n_timesteps,
+    )
+    try:
+        return run_batch(*arguments), "compiled batch"
+    except NotCompilable as reason:
+        return run_one_by_one(*arguments), f"one by one: {reason}"
+
+
+def _check_rewards(result: BatchResult, first_seed: int) -> None:
+    """Refuse rewards that are not finite, before anything is judged by them."""
+    from pipeline.finite_numbers import NotFiniteError, is_finite
+
+    for seed, rewards in enumerate(result.rewards, start=first_seed):
+        if not is_finite(rewards):
+            pull = int(np.argmin(np.isfinite(rewards)))
+            what = f"reward of seed {seed} at step {pull + 1:,}"
+            raise NotFiniteError(what, float(rewards[pull]))

@@ -1,0 +1,463 @@
+"""From a study to the runs that it takes: one for each agent, environment and seed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+from unicodedata import normalize
+
+from agents import ALGORITHMS
+from envs.known_models import time_limit
+from experiments.study import (
+    AS_IT_COMES,
+    MERGED,
+    AgentSpec,
+    EnvironmentSpec,
+    StudySpec,
+    file_name,
+    layered,
+)
+from pipeline.agent_checks import check_algorithm, check_fit
+from pipeline.auto_settings import resolved_spec, training_follows
+from pipeline.environments import check_env_id, make_single_env, usual_kwargs
+from pipeline.errors import UserError
+from pipeline.file_digests import DamagedFileError
+from pipeline.json_text import plain
+from pipeline.map_contents import with_maps_read
+from pipeline.memory_limits import check_pulls
+from pipeline.models.model_loading import agent_class
+from pipeline.run_files import environment_name
+from pipeline.run_folder import FINISHED, ReadRun, Run
+from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams, seeds_tuned_on
+from pipeline.settings.hyperparams import Hyperparams, split
+from pipeline.train_spec import TrainSpec, completed
+
+# What a run of the same settings may differ in: where it is written, what is shown meanwhile, and
+# where the modules lie that its names come from.
+_MAY_DIFFER = (
+    "origins",
+    "log_folder",
+    "tensorboard_log",
+    "gym_packages",
+    "user_modules",
+    "save_every_n_episodes",
+    "verbose",
+    "progress",
+    "log_interval",
+    "pictures",
+)
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run of a study."""
+
+    agent: str  #: label of the agent
+    environment: str  #: label of the environment
+    seed: int  #: its seed
+    spec: TrainSpec  #: what to train
+    path: Path  #: its folder, there once it has finished
+    #: Whether it stands for all seeds of a bandit agent, of which ``seed`` is the first.
+    is_batch: bool = False
+    n_runs: int = 1  #: how many runs it stands for
+
+    @property
+    def run(self) -> Run:
+        """The run folder."""
+        return Run(self.path, environment_name(self.spec.env_id))
+
+    def read(self) -> ReadPlannedRun:
+        """The same, for what is asked of its folder from now on: the record is read once."""
+        return ReadPlannedRun(**{field.name: getattr(self, field.name) for field in fields(self)})
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the folder holds this very run, to its end; what else it holds is not read."""
+        info = _info(self.run)
+        if info.get("state") != FINISHED or info.get("n_runs", 1) != self.n_runs:
+            return False
+        recorded, wanted = _recorded(info), self.spec.save_every_n_episodes
+        return _identity(recorded) == _identity(self.spec.as_data()) and (
+            wanted < 1 or self.is_batch or recorded["save_every_n_episodes"] == wanted
+        )
+
+    def is_of(self, run: Run) -> bool:
+        """Whether what a folder was begun with is this very run."""
+        info = _info(run)
+        return bool(info and _identity(_recorded(info)) == _identity(self.spec.as_data()))
+
+    @property
+    def differences(self) -> dict[str, tuple[Any, Any]]:
+        """By name, the settings of a finished run in this folder beside those that are asked for.
+
+        Empty where they are the same: then a run is done again because it lacks something, such as
+        checkpoints, or in a batch the seeds that are new.
+        """
+        info = _info(self.run)
+        if info.get("state") != FINISHED:
+            return {}
+        there = _by_name(_identity(_recorded(info)))
+        now = _by_name(_identity(self.spec.as_data()))
+        return {
+            name: (there.get(name), now.get(name))
+            for name in {**there, **now}
+            if there.get(name) != now.get(name)
+        }
+
+    @property
+    def is_to_do(self) -> bool:
+        """Whether there is no such run; one that is damaged is there."""
+        if self.is_finished:
+            return False
+        try:
+            self.check_record()
+        except DamagedFileError:
+            return False
+        return True
+
+    def check_record(self) -> None:
+        """Make sure that the folder, where there is one, says which run it holds.
+
+        Raises:
+            DamagedFileError: if its ``run.json`` is missing or damaged.
+        """
+        path = self.run.info_path
+        if not (self.path.is_dir() and any(self.path.iterdir())):
+            return
+        if not path.exists():
+            raise DamagedFileError(path, "is missing")
+        if not self.run.recorded_spec():
+            raise DamagedFileError(path, "is damaged: it does not say what was asked for")
+
+
+@dataclass(frozen=True)
+class ReadPlannedRun(PlannedRun):
+    """One that goes by what its folder said when it was first asked."""
+
+    @cached_property
+    def run(self) -> Run:
+        """The run folder."""
+        return ReadRun(self.path, environment_name(self.spec.env_id))
+
+
+def _info(run: Run) -> dict[str, Any]:
+    """The record of a run; empty where it is damaged."""
+    try:
+        return run.read_info()
+    except DamagedFileError:
+        return {}
+
+
+def _identity(spec: Mapping[str, Any]) -> Any:
+    kept = {key: value for key, value in spec.items() if key not in _MAY_DIFFER}
+    return plain(kept)
+
+
+def _recorded(info: Mapping[str, Any]) -> dict[str, Any]:
+    spec = info.get("spec")
+    return completed(spec if isinstance(spec, dict) else {})
+
+
+def _by_name(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as they are called, hyperparameters among them."""
+    settings = dict(identity)
+    hyperparams = settings.pop("hyperparams", None)
+    return {**settings, **(hyperparams if isinstance(hyperparams, dict) else {})}
+
+
+# --- The plan of a study.
+
+MOST_RUNS = 1_000_000
+
+# What a batch can follow, besides the agent's own arguments.
+_BATCH_SETTINGS = ("n_timesteps", "env_kwargs", "algorithm")
+
+
+def plan(
+    study: StudySpec, root: Path, counts: Mapping[tuple[str, str], int] | None = None
+) -> list[PlannedRun]:
+    """All runs of a study, those of one seed together, so that agents can be compared early.
+
+    Args:
+        study: the study.
+        root: its folder.
+        counts: by labels of agent and environment, with how many of the seeds; with all of them,
+            where it is not said.
+
+    Raises:
+        UserError: if an agent cannot be trained so, or does not fit an environment.
+    """
+    _check_number(study)
+    _check_folders("agents", [(agent.label, file_name(agent.label)) for agent in study.agents])
+    _check_folders(
+        "environments",
+        [(e.label, _environment_folder(e.label, e.env_id)) for e in study.environments],
+    )
+    specs = {}
+    for environment in study.environments:
+        check_env_id(environment.env_id)
+        for agent in study.agents:
+            with _naming_the_place(agent):
+                spec = _train_spec(study, agent, environment)
+                check_fit(spec)
+            specs[agent.label, environment.label] = spec
+    batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
+    n_seeds = {labels: (counts or {}).get(labels, study.n_seeds) for labels in specs}
+    for labels in batches:
+        check_pulls(
+            n_seeds[labels], specs[labels].hyperparams.n_timesteps or 0, " on ".join(labels)
+        )
+    return [
+        _planned_run(study, root, *labels, seed, spec, n_seeds[labels] if labels in batches else 0)
+        for seed in study.seeds
+        for labels, spec in specs.items()
+        if seed == study.first_seed
+        or (labels not in batches and seed - study.first_seed < n_seeds[labels])
+    ]
+
+
+def _check_number(study: StudySpec) -> None:
+    n_agents, n_environments = len(study.agents), len(study.environments)
+    n_runs = n_agents * n_environments * study.n_seeds
+    if n_runs > MOST_RUNS:
+        raise UserError(
+            f"{study.name}: {n_agents:,} agents on {n_environments:,} environments with "
+            f"{study.n_seeds:,} seeds are {n_runs:,} runs; a study has {MOST_RUNS:,} at most"
+        )
+
+
+def _planned_run(
+    study: StudySpec,
+    root: Path,
+    agent: str,
+    environment: str,
+    seed: int,
+    spec: TrainSpec,
+    n_in_batch: int,
+) -> PlannedRun:
+    # From 1, since 0 asks the tools of rl_zoo3 for the newest run.
+    folder = _environment_folder(environment, spec.env_id)
+    place = Path(file_name(agent), f"{folder}_{seed + 1}")
+    spec = replace(
+        spec,
+        seed=seed,
+        tensorboard_log=root / "tensorboard" / place if study.tensorboard else None,
+        save_every_n_episodes=study.render_every if seed == study.first_seed else -1,
+    )
+    path, is_batch = root / "runs" / place, n_in_batch > 0
+    return PlannedRun(agent, environment, seed, spec, path, is_batch, max(n_in_batch, 1))
+
+
+def _environment_folder(label: str, env_id: str) -> str:
+    """The label as a file name; where it is the id itself, as `train.py` writes that."""
+    return file_name(environment_name(label) if label == env_id else label)
+
+
+def check_settings(study: StudySpec, planned: Sequence[PlannedRun]) -> None:
+    """Make sure that the agents can be made with their settings, which takes the libraries.
+
+    Raises:
+        UserError: if one cannot.
+    """
+    from pipeline.preparation import algorithm_kwargs
+    from pipeline.settings import components
+
+    agents = {agent.label: agent for agent in study.agents}
+    for run in planned:
+        if run.seed == study.first_seed:
+            with _naming_the_place(agents[run.agent]):
+                algorithm_kwargs(run.spec)
+                callbacks = run.spec.hyperparams.callback
+                components.callbacks(callbacks, run.spec.gym_packages, run.path)
+
+
+@contextmanager
+def _naming_the_place(agent: AgentSpec) -> Iterator[None]:
+    """Say in mistakes where the study asks for the agent."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{agent.where}: {error}" if agent.where else str(error)) from error
+
+
+def _check_folders(what: str, places: Sequence[tuple[str, str]]) -> None:
+    """Refuse labels that are the same, or would have the same folder."""
+    taken: dict[str, str] = {}
+    for label, folder in places:
+        # Some file systems do not tell upper from lower case, nor "ä" from "a" with two dots.
+        key = normalize("NFC", folder.casefold())
+        first = taken.get(key)
+        if first is not None:
+            raise UserError(
+                f"{what}: {first!r} and {label!r} would share the folder {folder}: "
+                "give them labels that differ in letters or digits"
+            )
+        taken[key] = label
+
+
+def _is_batch(spec: TrainSpec) -> bool:
+    """Whether the runs of a spec go as one batch: bandit agents as they are, for one episode."""
+    entry, special = ALGORITHMS[spec.algo], spec.hyperparams
+    untouched = Hyperparams()
+    if not (entry.for_bandits and entry.package is None) or special.n_timesteps is None:
+        return False
+    if entry.family != "bandits" and not _is_compiled_bandit(spec.algo):
+        return False
+    env = make_single_env(spec)
+    episode = time_limit(env) or 0
+    env.close()
+    if special.n_timesteps > episode:
+        return False
+    return all(
+        getattr(special, name) == getattr(untouched, name)
+        for name in vars(untouched)
+        if name not in _BATCH_SETTINGS
+    )
+
+
+def _is_compiled_bandit(algo: str) -> bool:
+    """Whether an agent of the user's is of our bandit agents' kind."""
+    from agents.bandits.linear_bandits import LinearBanditAgent
+    from agents.bandits.table_bandit import TableBandit
+
+    return issubclass(agent_class(algo), TableBandit | LinearBanditAgent)
+
+
+def _train_spec(study: StudySpec, agent: AgentSpec, environment: EnvironmentSpec) -> TrainSpec:
+    check_algorithm(agent.algo)
+    raw, gave_way = _raw_hyperparams(agent, environment)
+    place = f"{agent.label} on {environment.label}"
+    # A field of the study that has the name of one of the run goes there as it is.
+    named = {key.name for key in fields(TrainSpec)} & {key.name for key in fields(StudySpec)}
+    spec = resolved_spec(
+        with_maps_read(environment.env_id, raw),
+        place,
+        origins=gave_way,
+        algo=agent.algo,
+        env_id=environment.env_id,
+        seed=0,
+        verbose=0,
+        pictures=False,
+        **{name: getattr(study, name) for name in named},
+    )
+    if spec.hyperparams.n_timesteps is None and spec.hyperparams.n_episodes is None:
+        raise UserError(f"{place}: how long to train? give n_timesteps or n_episodes")
+    if study.is_quick:
+        raw = _shortened(spec.saved_hyperparams, study.quick.budget)
+        spec = replace(spec, hyperparams=split(raw, place), saved_hyperparams=raw)
+    return spec
+
+
+def _raw_hyperparams(
+    agent: AgentSpec, environment: EnvironmentSpec
+) -> tuple[dict[str, Any], dict[str, str] | None]:
+    """The agent's file, changed by the environment's settings, and these by the agent's own."""
+    raw: dict[str, Any] = {}
+    own = layered(environment.settings, agent.settings)
+    if agent.tuned or agent.conf_file is not None:
+        try:
+            kwargs = own.get("env_kwargs")
+            raw = read_hyperparams(agent.algo, environment.env_id, agent.conf_file, kwargs)
+        except NoEntryError:
+            if not (agent.settings or environment.settings):
+                raise
+    # What the environment's settings take away is gone before the agent's own come.
+    kept = {
+        key: value for key, value in raw.items() if environment.settings.get(key, key) is not None
+    }
+    return training_follows(layered(kept, own), own)
+
+
+def _shortened(raw: Mapping[str, Any], share: float) -> dict[str, Any]:
+    return {
+        key: max(round(value * share), 1) if key in ("n_timesteps", "n_episodes") else value
+        for key, value in raw.items()
+    }
+
+
+# --- Which of its seeds the settings of a study were tuned on, as far as anybody says.
+
+# How long a run is, and on what: nothing that an agent would be tuned in.
+_NO_TUNING = {"n_timesteps", "n_episodes", "env_kwargs", "eval_env_kwargs", "policy", "engine"}
+
+Seeds = frozenset[int]
+
+
+@dataclass(frozen=True)
+class TuningSeeds:
+    """Where the settings of a study come from, and which of its seeds they were tuned on."""
+
+    #: By agent, the seeds of the study that its settings in ``hyperparams/`` were tuned on; of
+    #: agents whose constructor's defaults are taken too, which are none.
+    shipped: Mapping[str, Seeds]
+    files: Mapping[str, Seeds]  #: likewise by the name of a file of the user's that says so
+    unknown: tuple[str, ...]  #: agents with settings of which nobody says what they were tuned on
+    #: Agents whose settings were tuned with other arguments of the environment.
+    elsewhere: tuple[str, ...] = ()
+
+
+def tuning_seeds(study: StudySpec) -> TuningSeeds:
+    """Find out for all agents of a study on all of its environments."""
+    shipped: dict[str, Seeds] = {}
+    files: dict[str, Seeds] = {}
+    unknown: dict[str, None] = {}
+    elsewhere: dict[str, None] = {}
+    known = lru_cache(maxsize=None)(_said)
+    for agent, environment in _pairs(study):
+        tuned_on = known(agent.algo, environment.env_id, agent.conf_file)
+        begins_with_defaults = not (agent.tuned or agent.conf_file)
+        own = layered(environment.settings, agent.settings)
+        as_it_comes = {key for key in AS_IT_COMES if own.get(key) is None}
+        if {*own} - _NO_TUNING - as_it_comes or tuned_on is None:
+            unknown[agent.group or agent.label] = None
+        if tuned_on is None:
+            continue
+        seen = () if begins_with_defaults else tuned_on
+        if seen and _is_changed(agent, environment):
+            elsewhere[agent.group or agent.label] = None
+            continue
+        place, name = _source(agent, shipped, files)
+        shared = frozenset(seed for seeds in seen for seed in study.seeds if seed in seeds)
+        place[name] = place.get(name, frozenset()) | shared
+    return TuningSeeds(shipped, files, tuple(unknown), tuple(elsewhere))
+
+
+def _is_changed(agent: AgentSpec, environment: EnvironmentSpec) -> bool:
+    """Whether the study has arguments of the environment that the entry does not have."""
+    own = layered(environment.settings, agent.settings)
+    places = agent.algo, environment.env_id, agent.conf_file
+    entry = read_hyperparams(*places, own.get("env_kwargs"))
+    if entry != read_hyperparams(*places):  # that of the same environment by another name
+        del own["env_kwargs"]
+    merged = layered(entry, own)
+    usual = usual_kwargs(environment.env_id)
+
+    def meant(settings: Mapping[str, Any], key: str) -> Any:
+        value = settings.get(key) or {}
+        return {**usual, **value} if key in MERGED else value
+
+    keys = [key for key in (*MERGED, "train_env_wrapper") if key in own]
+    return any(meant(merged, key) != meant(entry, key) for key in keys)
+
+
+def _said(algo: str, env_id: str, conf_file: Path | None) -> tuple[range, ...] | None:
+    try:
+        return seeds_tuned_on(algo, env_id, conf_file)
+    except UserError:  # a file that was there when the runs were planned
+        return None
+
+
+def _pairs(study: StudySpec) -> Iterator[tuple[AgentSpec, EnvironmentSpec]]:
+    return ((agent, place) for agent in study.agents for place in study.environments)
+
+
+def _source(
+    agent: AgentSpec, shipped: dict[str, Seeds], files: dict[str, Seeds]
+) -> tuple[dict[str, Seeds], str]:
+    if agent.conf_file is None:
+        return shipped, agent.algo
+    return files, Path(agent.conf_file).name
