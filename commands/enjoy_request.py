@@ -10,7 +10,7 @@ from commands.parsing import check_device
 from pipeline.errors import UserError
 from pipeline.models.model_choice import ModelRequest
 from pipeline.models.model_finding import Which
-from pipeline.settings.literals import parse_assignments
+from pipeline.settings.values import parse_assignments
 from pipeline.user_modules import import_typed
 
 

@@ -15,8 +15,8 @@ from pipeline.auto_settings import resolved_spec, training_follows
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.map_contents import with_logs_located, with_maps_read
-from pipeline.settings.hyperparam_entries import NoEntryError, override, read_hyperparams
-from pipeline.settings.literals import parse_assignments
+from pipeline.settings.hyperparams import NoEntryError, override, read_hyperparams
+from pipeline.settings.values import parse_assignments
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_typed
 

@@ -29,8 +29,8 @@ from pipeline.errors import UserError, shown, unknown
 from pipeline.files import write_text
 from pipeline.json_text import plain
 from pipeline.map_contents import with_maps_read
-from pipeline.settings.coercion import coerce
-from pipeline.settings.strict_yaml import key_lines, read_yaml
+from pipeline.settings.values import coerce
+from pipeline.settings.yaml import key_lines, read_yaml
 
 # The studies that come with the project.
 _SHIPPED = Path(__file__).resolve().parents[1] / "studies"

@@ -21,8 +21,7 @@ from pipeline.map_contents import with_maps_read
 from pipeline.memory_limits import check_pulls
 from pipeline.models.model_loading import agent_class
 from pipeline.run_files import environment_name
-from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
-from pipeline.settings.hyperparams import Hyperparams, split
+from pipeline.settings.hyperparams import Hyperparams, NoEntryError, read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 
 MOST_RUNS = 1_000_000

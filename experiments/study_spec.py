@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from pipeline.files import LONGEST_NAME, portable_name
-from pipeline.settings.hyperparam_entries import override
+from pipeline.settings.hyperparams import override
 from pipeline.user_modules import UserModule
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]

@@ -18,7 +18,7 @@ from experiments.study_spec import (
 )
 from pipeline.environments import usual_kwargs
 from pipeline.errors import UserError
-from pipeline.settings.hyperparam_entries import read_hyperparams, seeds_tuned_on
+from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
 
 # How long a run is, and on what: nothing that an agent would be tuned in.
 _NO_TUNING = {"n_timesteps", "n_episodes", "env_kwargs", "eval_env_kwargs", "policy", "engine"}

@@ -48,13 +48,14 @@ from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.run_files import environment_name
 from pipeline.run_folder import Run
-from pipeline.settings.action_noise import action_noise, check_action_noise
-from pipeline.settings.algorithm_kwargs import (
+from pipeline.settings.components import (
+    action_noise,
     build_algorithm_kwargs,
+    check_action_noise,
     default_policy,
     needs_policy,
 )
-from pipeline.settings.constructor_arguments import algorithm_parameters
+from pipeline.settings.values import algorithm_parameters
 from pipeline.signs_of_life import can_move
 from pipeline.train_spec import TrainSpec
 from pipeline.training_callbacks import (

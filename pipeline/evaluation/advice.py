@@ -27,7 +27,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation
-from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.train_spec import TrainSpec
 
 SOLVED = 0.5  # a score of planning from which on it may be recommended

@@ -35,8 +35,7 @@ from pipeline.models.normalization import Statistics, normalising, read_statisti
 from pipeline.models.recorded_runs import RecordedRun, recorded_run, run_around
 from pipeline.module_records import check_recorded
 from pipeline.run_folder import Run
-from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.settings.hyperparams import NoEntryError, read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule
 

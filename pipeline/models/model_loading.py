@@ -20,7 +20,7 @@ from pipeline.models.model_zips import (
 )
 from pipeline.models.recorded_runs import read_recorded
 from pipeline.run_folder import Run
-from pipeline.settings.constructor_arguments import algorithm_parameters
+from pipeline.settings.values import algorithm_parameters
 from pipeline.user_modules import UserModule
 
 if TYPE_CHECKING:

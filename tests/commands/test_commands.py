@@ -26,7 +26,7 @@ from pipeline import files
 from pipeline.environments import training_kwargs
 from pipeline.errors import UserError
 from pipeline.filming import FRAMES_PER_SECOND, check_film_path, write_film
-from pipeline.settings import hyperparam_entries
+from pipeline.settings import hyperparams
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
@@ -404,7 +404,7 @@ def test_a_file_of_one_default_entry_is_enough(type_command, monkeypatch, tmp_pa
     folder = tmp_path / "hyperparams"
     folder.mkdir()
     (folder / "qlearning.yml").write_text("default:\n  n_timesteps: 60\n  policy: QTablePolicy\n")
-    monkeypatch.setattr(hyperparam_entries, "_FOLDER", folder)
+    monkeypatch.setattr(hyperparams, "_FOLDER", folder)
     code, out, err = type_command("train.py", "--list")
     assert (code, err) == (0, "")
     assert "qlearning" in out

@@ -19,29 +19,28 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError
-from pipeline.settings.action_noise import action_noise, check_action_noise
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
-from pipeline.settings.coercion import ScheduleSpec, coerce, parse_schedule
-from pipeline.settings.constructor_arguments import (
-    RANGES,
-    algorithm_parameters,
-    constructor_parameters,
-)
-from pipeline.settings.hyperparam_entries import (
-    NoEntryError,
-    entry_names,
-    override,
-    read_hyperparams,
-)
+from pipeline.settings.components import action_noise, build_algorithm_kwargs, check_action_noise
 from pipeline.settings.hyperparams import (
     SPECIAL_KEYS,
     ComponentSpec,
     Hyperparams,
+    NoEntryError,
     check_algorithm_kwargs,
+    entry_names,
+    override,
+    read_hyperparams,
     split,
 )
-from pipeline.settings.literals import DottedName
-from pipeline.settings.strict_yaml import parse_yaml, read_yaml
+from pipeline.settings.values import (
+    RANGES,
+    DottedName,
+    ScheduleSpec,
+    algorithm_parameters,
+    coerce,
+    constructor_parameters,
+    parse_schedule,
+)
+from pipeline.settings.yaml import parse_yaml, read_yaml
 from tests.peers.peer_environment import peer_folder
 
 ZOO = peer_folder("rl_zoo3") / "hyperparams"

@@ -25,8 +25,8 @@ from pipeline.models.normalization import with_normalised_rewards
 from pipeline.models.recorded_runs import recorded_run, run_around, run_of
 from pipeline.playing import play_episodes, playing_env
 from pipeline.run_folder import Run
-from pipeline.settings.hyperparam_entries import NoEntryError
-from pipeline.settings.strict_yaml import read_saved_settings
+from pipeline.settings.hyperparams import NoEntryError
+from pipeline.settings.yaml import read_saved_settings
 
 CONFIG = OrderedDict(
     [

@@ -31,8 +31,7 @@ from pipeline.resuming.unfinished_runs import (
 )
 from pipeline.run_folder import Run
 from pipeline.run_lock import at_work_on
-from pipeline.settings.hyperparam_entries import override, read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.settings.hyperparams import override, read_hyperparams, split
 from pipeline.training import carry_out, prepare, train
 from pipeline.user_modules import import_typed
 from snapshots.recording import Snapshot

@@ -4,7 +4,7 @@ import pytest
 
 from agents import ALGORITHMS
 from pipeline.errors import UserError
-from pipeline.settings.hyperparam_entries import (
+from pipeline.settings.hyperparams import (
     NoEntryError,
     entry_names,
     read_hyperparams,

@@ -26,7 +26,7 @@ from experiments.study_spec import QuickSpec
 from mdp import value_iteration
 from pipeline.models.model_loading import load_model
 from pipeline.preparation import algorithm_kwargs
-from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparams import read_hyperparams
 from tuning.search_spaces import read_search_space
 
 ROOT = Path(compare.__file__).parent
