@@ -51,7 +51,7 @@ def resume_run(args: argparse.Namespace, stop: StopRequest) -> int:
         UserError: if there is none, it cannot go on, or another process is at work on it.
     """
     _check_given(args)
-    from pipeline.models.recorded_runs import run_in
+    from pipeline.models.find import run_in
     from pipeline.user_modules import import_typed
 
     if args.resume:

@@ -14,7 +14,7 @@ from pipeline.agent_checks import check_algorithm, check_fit, with_engine
 from pipeline.auto_settings import resolved_spec, training_follows
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
-from pipeline.map_contents import with_logs_located, with_maps_read
+from pipeline.environments import with_logs_located, with_maps_read
 from pipeline.settings.hyperparams import NoEntryError, override, read_hyperparams
 from pipeline.settings.values import parse_assignments
 from pipeline.train_spec import TrainSpec
@@ -36,7 +36,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     raw = with_logs_located(args.env, with_maps_read(args.env, raw))
     trained_agent = None
     if args.trained_agent:
-        from pipeline.models.continuation import agent_to_continue
+        from pipeline.models.choose import agent_to_continue
 
         trained_agent = agent_to_continue(Path(args.trained_agent))
     # A flag that has the name of a field goes there as it is.

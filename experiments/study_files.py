@@ -28,7 +28,7 @@ from pipeline.environments import check_env_id
 from pipeline.errors import UserError, shown, unknown
 from pipeline.files import write_text
 from pipeline.json_text import plain
-from pipeline.map_contents import with_maps_read
+from pipeline.environments import with_maps_read
 from pipeline.settings.values import coerce
 from pipeline.settings.yaml import key_lines, read_yaml
 

@@ -17,9 +17,9 @@ from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.auto_settings import resolved_spec, training_follows
 from pipeline.environments import check_env_id, make_single_env
 from pipeline.errors import UserError
-from pipeline.map_contents import with_maps_read
+from pipeline.environments import with_maps_read
 from pipeline.memory_limits import check_pulls
-from pipeline.models.model_loading import agent_class
+from pipeline.models.load import agent_class
 from pipeline.run_files import environment_name
 from pipeline.settings.hyperparams import Hyperparams, NoEntryError, read_hyperparams, split
 from pipeline.train_spec import TrainSpec

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
-from pipeline.models.model_loading import agent_class
+from pipeline.models.load import agent_class
 from pipeline.settings.components import default_policy
 from pipeline.settings.hyperparams import Hyperparams, check_algorithm_kwargs, split
 from pipeline.settings.values import algorithm_parameters, constructor_parameters

@@ -31,7 +31,7 @@ from pipeline.callbacks import (
 )
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.evaluation_callback import EvaluationCallback
-from pipeline.models.companions import statistics_path
+from pipeline.models.find import statistics_path
 from pipeline.run_folder import Run
 
 TINY_DQN = {

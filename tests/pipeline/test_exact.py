@@ -8,10 +8,9 @@ from gymnasium import spaces
 from agents import load_algorithm
 from mdp import policy_return, value_iteration
 from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation import asked_policies
-from pipeline.evaluation.asked_policies import policy_matrix
+from pipeline.evaluation import policies
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.last_policy import OfLastPolicy
+from pipeline.evaluation.policies import OfLastPolicy, policy_matrix
 from pipeline.evaluation.sampled import Yardstick, evaluate
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -215,8 +214,8 @@ def test_what_takes_longer_than_playing_is_said(monkeypatch):
     evaluator = exact_evaluator(spec)
     agents = {name: briefly_trained(name, spec) for name in ("qlearning", "dqn", "random")}
     assert [evaluator.obstacle(agent) for agent in agents.values()] == ["", "", ""]
-    monkeypatch.setattr(asked_policies, "MOST_NUMBERS", 100 * 100 - 1)
-    monkeypatch.setattr(asked_policies, "MOST_AT_RANDOM", 100 * 60 - 1)
+    monkeypatch.setattr(policies, "MOST_NUMBERS", 100 * 100 - 1)
+    monkeypatch.setattr(policies, "MOST_AT_RANDOM", 100 * 60 - 1)
     assert evaluator.obstacle(agents["qlearning"]) == ""
     assert evaluator.obstacle(agents["dqn"]).startswith("to ask a network about 100 states")
     assert evaluator.obstacle(agents["random"]).startswith("random actions come to too many")
@@ -228,7 +227,7 @@ def test_a_network_is_asked_in_parts_where_states_are_many(name, monkeypatch):
     spec = spec_of("Warehouse")
     evaluator, agent = exact_evaluator(spec), briefly_trained(name, spec)
     at_once = [evaluator(agent, sure) for sure in (True, False)]
-    monkeypatch.setattr(asked_policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
+    monkeypatch.setattr(policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
     for sure, expected in zip((True, False), at_once, strict=True):
         assert evaluator(agent, sure).mean_return == pytest.approx(expected.mean_return, rel=1e-5)
 
@@ -260,9 +259,9 @@ def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
         assert len(agent.policy.q_tables) == tables
         agent.policy.q_tables.numpy()[:] = rng.normal(size=(tables, 16, 4)).round(1)
         expected, _ = agent.predict(states, deterministic=True)
-        assert (asked_policies.best_actions(agent, states) == expected).all()
+        assert (policies.best_actions(agent, states) == expected).all()
     contrary = Contrary(env="FrozenLake-v1")
-    assert (asked_policies.best_actions(contrary, states) == 3).all()
+    assert (policies.best_actions(contrary, states) == 3).all()
 
 
 def test_what_an_unknown_agent_samples_from_is_not_guessed():

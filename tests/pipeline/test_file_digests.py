@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError, digests_of, read_record, sealed
-from pipeline.models.recorded_runs import check_digest
+from pipeline.models.find import check_digest
 from pipeline.run_folder import Run
 
 

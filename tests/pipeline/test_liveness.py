@@ -12,7 +12,7 @@ from pipeline import liveness
 from pipeline.errors import UserError
 from pipeline.leftovers import remove_leftovers
 from pipeline.liveness import is_alive, mark
-from pipeline.models.model_finding import model_of
+from pipeline.models.find import model_of
 from pipeline.run_folder import INTERRUPTED, RUNNING, Run
 
 

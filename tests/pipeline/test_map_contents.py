@@ -4,7 +4,7 @@ import gymnasium as gym
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.map_contents import with_logs_located, with_maps_read
+from pipeline.environments import with_logs_located, with_maps_read
 
 ROWS = ["S..", ".#.", "..G"]
 

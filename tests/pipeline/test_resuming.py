@@ -16,7 +16,7 @@ from rich.console import Console
 from agents import ALGORITHMS
 from pipeline.auto_settings import resolved_spec
 from pipeline.errors import UserError
-from pipeline.evaluation import evaluation_shares
+from pipeline.evaluation import sampled
 from pipeline.file_digests import LOCK
 from pipeline.resuming import saved_states
 from pipeline.resuming.log_positions import cut_back, log_positions
@@ -107,7 +107,7 @@ TRAININGS = [
 @pytest.fixture(autouse=True)
 def short_evaluations(monkeypatch):
     """As many steps as a test can wait for, shared out as ever."""
-    monkeypatch.setattr(evaluation_shares, "STEPS_IN_ANY_CASE", 600)
+    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 600)
 
 
 class CutOffError(BaseException):

@@ -24,7 +24,7 @@ from experiments.study_plan import plan
 from experiments.study_results import read_results
 from experiments.study_spec import QuickSpec
 from mdp import value_iteration
-from pipeline.models.model_loading import load_model
+from pipeline.models.load import load_model
 from pipeline.preparation import algorithm_kwargs
 from pipeline.settings.hyperparams import read_hyperparams
 from tuning.search_spaces import read_search_space

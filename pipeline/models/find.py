@@ -1,4 +1,6 @@
-"""What a folder says of the agent in it: a run of ours, one of rl_zoo3, or a model hub's download.
+"""Which files are a model and what belongs to it, and what their folder says of the agent.
+
+A folder is a run of ours, one of rl_zoo3, or a model hub's download:
 
 | who wrote it | what is read |
 |---|---|
@@ -9,19 +11,23 @@
 The first that is there counts, and what ``args.yml`` says of ``env_kwargs`` replaces those of
 ``config.yml``, as in rl_zoo3, whose ``enjoy`` does not read ``eval_env_kwargs`` either. Nothing in
 these files is run, and no module is imported because they ask for it.
+
+Statistics of VecNormalize and replay buffers lie beside the zip under the names that
+Stable-Baselines3's CheckpointCallback gives them, or where rl_zoo3 and model hubs have them.
 """
 
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.errors import UserError
 from pipeline.file_digests import RECORD, DamagedFileError, read_record
 from pipeline.run_files import environment_name
-from pipeline.run_folder import Run
+from pipeline.run_folder import INTERRUPTED, Run
 from pipeline.settings.yaml import read_saved_settings
 from safe_files.regular_files import read_file
 
@@ -185,3 +191,136 @@ def _text(value: object) -> str | None:
 
 def _texts(value: object) -> tuple[str, ...]:
     return tuple(item for item in value if isinstance(item, str)) if isinstance(value, list) else ()
+
+
+_CHECKPOINT = re.compile(r"(.+)_(\d+)_steps")
+_REPLAY_BUFFER = "replay_buffer.pkl"
+
+
+def statistics_path(model: Path) -> Path:
+    """Where the statistics of a model's own moment lie.
+
+    ``best_model_vecnormalize.pkl`` for ``best_model.zip``, ``rl_model_vecnormalize_<n>_steps.pkl``
+    for ``rl_model_<n>_steps.zip``.
+    """
+    return _companion(model, "vecnormalize")
+
+
+def replay_buffer_path(model: Path) -> Path:
+    """Where the replay buffer of a checkpoint's moment lies, named likewise."""
+    return _companion(model, "replay_buffer")
+
+
+def final_replay_buffer_path(folder: Path) -> Path:
+    """Where the replay buffer of a run's end lies, as rl_zoo3 has it."""
+    return folder / _REPLAY_BUFFER
+
+
+def statistics_of(model: Path, params_path: Path | None) -> Path | None:
+    """The statistics that belong to a model, or None where there are none.
+
+    Args:
+        model: the zip.
+        params_path: the folder of its run's settings, if it has one.
+
+    Returns:
+        The first that there is of: those of its own moment; ``vecnormalize.pkl`` of its run's end;
+        ``vec_normalize.pkl`` or ``vecnormalize.pkl`` beside it, as model hubs have them.
+    """
+    settings = [] if params_path is None else [params_path / "vecnormalize.pkl"]
+    beside = [model.with_name(name) for name in ("vec_normalize.pkl", "vecnormalize.pkl")]
+    return _first(statistics_path(model), *settings, *beside)
+
+
+def replay_buffer_of(model: Path) -> Path | None:
+    """The replay buffer that belongs to a model: of its own moment, or else its run's last one."""
+    return _first(replay_buffer_path(model), model.with_name(_REPLAY_BUFFER))
+
+
+def _companion(model: Path, kind: str) -> Path:
+    checkpoint = _CHECKPOINT.fullmatch(model.stem)
+    if checkpoint is None:
+        return model.with_name(f"{model.stem}_{kind}.pkl")
+    prefix, n_steps = checkpoint.groups()
+    return model.with_name(f"{prefix}_{kind}_{n_steps}_steps.pkl")
+
+
+def _first(*paths: Path) -> Path | None:
+    return next((path for path in paths if path.is_file()), None)
+
+
+Which = Literal["final", "best", "last checkpoint"] | int
+
+# Zips in a run folder or on a model hub that are not the agent at the end of training.
+_OTHER_ZIPS = ("best_model.zip", "train_eval_metrics.zip")
+
+
+def model_at(path: Path, which: Which = "final") -> Path:
+    """The zip that a path means.
+
+    Args:
+        path: a zip, with or without its suffix, or a run folder.
+        which: of a run folder, the agent at the end of training, the best, that of the last
+            checkpoint, or that of the checkpoint after so many steps.
+
+    Raises:
+        UserError: if there is none, or ``which`` asks for another than the path names.
+    """
+    with_suffix = path.with_name(f"{path.name}.zip") if path.name else path
+    if path.is_dir() and (os.path.lexists(path / RECORD) or not with_suffix.is_file()):
+        return model_of(run_in(path), which)
+    if which != "final":
+        raise UserError(
+            f"{path} is one model: give its folder for --load-best, --load-checkpoint or "
+            "--load-last-checkpoint"
+        )
+    path = with_suffix if with_suffix.is_file() else path
+    if not path.exists():
+        raise UserError(f"no such model file: {path}")
+    return path
+
+
+def model_of(run: Run, which: Which = "final") -> Path:
+    """The zip of a run.
+
+    Raises:
+        UserError: if the run holds none.
+    """
+    path = _path_in(run, which)
+    if not path.exists():
+        known = ", ".join(path.stem.split("_")[-2] for path in run.checkpoints())
+        reason = "its training may not have ended"
+        if run.state == INTERRUPTED:
+            reason = "its training was cut off before it was written"
+        if isinstance(which, int) and known:
+            reason = f"there are checkpoints after {known} steps"
+        raise UserError(f"{run.path} holds no {path.name}: {reason}")
+    return path
+
+
+def _path_in(run: Run, which: Which) -> Path:
+    if not run.path.is_dir():
+        raise UserError(f"{run.path} is no run folder")
+    if isinstance(which, int):
+        return run.checkpoint_path(which)
+    if which == "best":
+        return run.best_model_path
+    if which == "last checkpoint":
+        checkpoints = run.checkpoints()
+        if not checkpoints:
+            raise UserError(f"{run.path} holds no checkpoint: train with --save-freq")
+        return checkpoints[-1]
+    return run.model_path if run.env_name else _only_model(run)
+
+
+def _only_model(run: Run) -> Path:
+    """The one zip of a folder that does not name its environment."""
+    models = [
+        path
+        for path in sorted(run.path.glob("*.zip"))
+        if path.name not in _OTHER_ZIPS and path not in run.checkpoints()
+    ]
+    if len(models) != 1:
+        held = ", ".join(path.name for path in models) or "no model"
+        raise UserError(f"{run.path} is no run folder, and holds {held}: name the zip")
+    return models[0]
