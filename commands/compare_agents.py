@@ -193,7 +193,7 @@ def _compare(args: argparse.Namespace) -> int:
     from experiments.fork_server import end_server
     from experiments.run_limits import RunLimits
     from experiments.study_plan import plan
-    from pipeline.folder_lock import folder_lock, told_if_gone
+    from pipeline.locks import folder_lock, told_if_gone
     from safe_files.regular_files import take_up
 
     go_on_unread()

@@ -12,9 +12,8 @@ from typing import Any
 from commands.parsing import check_device, check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit, with_engine
 from pipeline.auto_settings import resolved_spec, training_follows
-from pipeline.environments import check_env_id
+from pipeline.environments import check_env_id, with_logs_located, with_maps_read
 from pipeline.errors import UserError
-from pipeline.environments import with_logs_located, with_maps_read
 from pipeline.settings.hyperparams import NoEntryError, override, read_hyperparams
 from pipeline.settings.values import parse_assignments
 from pipeline.train_spec import TrainSpec

@@ -49,7 +49,7 @@ def _tune(args: argparse.Namespace) -> int:
 
             how.place(root).get_ready([shipped_run(tuning, root)])
             from commands.tune_driving import drive
-            from pipeline.folder_lock import told_if_gone
+            from pipeline.locks import told_if_gone
             from tuning.opening import open_tuning
             from tuning.trial_storage import failing_in_a_line
 

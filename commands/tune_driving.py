@@ -24,7 +24,7 @@ from commands.tune_progress import TuningProgress
 from experiments.drafts import remove_dead_drafts
 from experiments.early_results import EarlyResults
 from experiments.study_plan import plan
-from pipeline.folder_lock import FolderInUseError, folder_lock
+from pipeline.locks import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning
 from tuning.record import FILE as RECORD

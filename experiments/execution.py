@@ -13,7 +13,7 @@ from queue import Empty, SimpleQueue
 from experiments.drafts import remove_dead_drafts, run_name
 from experiments.launching import Launcher, Launchers, RunFailure
 from experiments.planned_runs import PlannedRun
-from pipeline.folder_lock import FolderGoneError, is_gone
+from pipeline.locks import FolderGoneError, is_gone
 
 # Runs that are handed over at a time, for each that is done at once: enough that no worker waits
 # for the next, and few enough that a hundred thousand are no burden to whoever does them.

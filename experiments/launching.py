@@ -30,7 +30,7 @@ from experiments.run_limits import RunLimits
 from experiments.study_spec import file_name
 from pipeline.errors import one_line
 from pipeline.files import write_text
-from pipeline.folder_lock import is_gone
+from pipeline.locks import is_gone
 from pipeline.plain_runs import is_plain
 
 

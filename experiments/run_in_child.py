@@ -10,7 +10,7 @@ from experiments.replaced_runs import make_room, move_aside
 from experiments.run_or_go_on import do_or_go_on
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import kept_later, put_in_place, settle, sync_together
-from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
+from pipeline.locks import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.signs_of_life import Heartbeat
 from pipeline.user_modules import import_again
 from safe_files.regular_files import hold

@@ -24,11 +24,10 @@ from experiments.study_spec import (
     layered,
     symbol,
 )
-from pipeline.environments import check_env_id
+from pipeline.environments import check_env_id, with_maps_read
 from pipeline.errors import UserError, shown, unknown
 from pipeline.files import write_text
 from pipeline.json_text import plain
-from pipeline.environments import with_maps_read
 from pipeline.settings.values import coerce
 from pipeline.settings.yaml import key_lines, read_yaml
 

@@ -15,9 +15,8 @@ from experiments.planned_runs import PlannedRun
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.auto_settings import resolved_spec, training_follows
-from pipeline.environments import check_env_id, make_single_env
+from pipeline.environments import check_env_id, make_single_env, with_maps_read
 from pipeline.errors import UserError
-from pipeline.environments import with_maps_read
 from pipeline.memory_limits import check_pulls
 from pipeline.models.load import agent_class
 from pipeline.run_files import environment_name

@@ -7,9 +7,9 @@ from contextlib import ExitStack, suppress
 from pipeline.errors import UserError, one_line
 from pipeline.exhaustion import exhaustion
 from pipeline.files import DISK_ERRORS
-from pipeline.folder_lock import FolderGoneError, is_gone
 from pipeline.foreign_exits import exits_as_mistakes
 from pipeline.library_errors import LibraryError
+from pipeline.locks import FolderGoneError, is_gone
 from pipeline.preparation import Training
 from pipeline.run_folder import INTERRUPTED
 from pipeline.worker_processes import close_environments

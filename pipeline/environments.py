@@ -5,33 +5,26 @@ from __future__ import annotations
 import inspect
 import shlex
 import sys
-from collections.abc import Callable
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import reduce
 from pathlib import Path
 from typing import Any
+
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
-import envs
+
 from agents import ALGORITHMS
 from envs.action_masks import has_masks
-from envs.wrappers import ActionMasks
-from pipeline.errors import UserError
-from pipeline.errors import one_line
-from pipeline.errors import shown
-from pipeline.errors import unknown
-from pipeline.memory_limits import check_environments
-from pipeline.memory_limits import check_frame_stack
-from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import import_again
-from pipeline.worker_processes import shield_workers
-from collections.abc import Iterable
-from collections.abc import Iterator
-from contextlib import contextmanager
 from envs.bandits.replay import ReplayBandit
 from envs.grid import GridWorld
 from envs.grid_map import read_rows
-
+from envs.wrappers import ActionMasks
+from pipeline.errors import UserError, one_line, shown, unknown
+from pipeline.memory_limits import check_environments, check_frame_stack
+from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import import_again
+from pipeline.worker_processes import shield_workers
 
 # Where neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
 # policy that runs in a circle would never end.

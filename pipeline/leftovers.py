@@ -11,7 +11,7 @@ from pathlib import Path
 from pipeline.errors import UserError
 from pipeline.file_digests import LOCK, RECORD
 from pipeline.files import drafts_in
-from pipeline.liveness import is_alive
+from pipeline.locks import is_alive
 from pipeline.module_records import COPIES
 from pipeline.run_files import environment_name
 from pipeline.run_folder import PROCESS, ROOM, RUNNING, Run, numbered_runs

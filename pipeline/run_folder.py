@@ -36,7 +36,7 @@ from pipeline.files import (
     sync_together,
     write_json,
 )
-from pipeline.liveness import is_alive, mark
+from pipeline.locks import is_alive, mark
 from pipeline.run_files import RunFiles, environment_name
 from safe_files.regular_files import hold
 

@@ -10,8 +10,7 @@ from functools import partial
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.folder_lock import folder_lock
-from pipeline.liveness import is_alive
+from pipeline.locks import folder_lock, is_alive
 from pipeline.run_folder import PROCESS, RUNNING, Run
 from safe_files.regular_files import take_up
 

@@ -17,8 +17,8 @@ from experiments.planned_runs import PlannedRun
 from pipeline.errors import UserError
 from pipeline.file_digests import DamagedFileError
 from pipeline.files import DISK_ERRORS
-from pipeline.folder_lock import FolderGoneError, is_gone
 from pipeline.json_text import plain
+from pipeline.locks import FolderGoneError, is_gone
 from tuning.judging import RunOutcome, UnjudgedError, judged, outcome_of
 from tuning.suggesting import Suggestions
 from tuning.trial_queue import (

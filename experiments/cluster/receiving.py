@@ -14,7 +14,7 @@ from experiments.planned_runs import PlannedRun
 from pipeline.errors import UserError
 from pipeline.file_digests import FIELD, RECORD, RecordedFiles
 from pipeline.files import sync_file, sync_folders
-from pipeline.folder_lock import is_gone
+from pipeline.locks import is_gone
 
 # Network folders show what others have written with a delay.
 SECONDS_TO_APPEAR = 10.0

@@ -21,8 +21,8 @@ from typing import IO, Any
 from pipeline.errors import UserError, one_line, visible
 from pipeline.file_digests import LOCK, RECORD
 from pipeline.files import replacing
-from pipeline.folder_lock import folder_lock
 from pipeline.json_text import json_text
+from pipeline.locks import folder_lock
 from pipeline.models.find import run_in
 from pipeline.module_records import COPIES
 from pipeline.packing.model_card import fenced, plain_text, to_type

@@ -22,7 +22,7 @@ from pipeline.files import (
     write_json,
     write_text,
 )
-from pipeline.folder_lock import folder_lock
+from pipeline.locks import folder_lock
 
 
 def names(folder):

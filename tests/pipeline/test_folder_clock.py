@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from pipeline.folder_clock import remove_remains
+from pipeline.locks import remove_remains
 
 REMAINS = f".x.{16 * '0'}.tmp"
 GRAVE = f".lock.{32 * 'a'}.dead.tmp"

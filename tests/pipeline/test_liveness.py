@@ -8,10 +8,10 @@ import sys
 
 import pytest
 
-from pipeline import liveness
+from pipeline import locks
 from pipeline.errors import UserError
 from pipeline.leftovers import remove_leftovers
-from pipeline.liveness import is_alive, mark
+from pipeline.locks import is_alive, mark
 from pipeline.models.find import model_of
 from pipeline.run_folder import INTERRUPTED, RUNNING, Run
 
@@ -19,7 +19,7 @@ from pipeline.run_folder import INTERRUPTED, RUNNING, Run
 @pytest.fixture(scope="module")
 def dead():
     """The mark of a process that is no more."""
-    code = "import json; from pipeline.liveness import mark; print(json.dumps(mark()))"
+    code = "import json; from pipeline.locks import mark; print(json.dumps(mark()))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     return json.loads(done.stdout)
 
@@ -31,7 +31,7 @@ def test_this_process_is_alive_and_one_that_has_ended_is_not(dead):
 
 def test_one_that_has_ended_and_is_not_yet_waited_for_is_not():
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
-        record = {**mark(), "pid": process.pid, "began": liveness._ticks_at_begin(process.pid)}
+        record = {**mark(), "pid": process.pid, "began": locks._ticks_at_begin(process.pid)}
         assert is_alive(record) is True
         process.kill()
         os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
@@ -67,12 +67,12 @@ def test_of_what_is_no_mark_nothing_is_known(record):
 
 
 def test_a_process_that_is_hidden_is_asked_for_by_its_number(dead, monkeypatch):
-    monkeypatch.setattr(liveness, "_ticks_at_begin", lambda pid: None)
+    monkeypatch.setattr(locks, "_ticks_at_begin", lambda pid: None)
     assert (is_alive({**mark(), "began": 5}), is_alive(dead)) == (True, False)
 
 
 def test_without_proc_host_and_number_have_to_do(dead, monkeypatch):
-    monkeypatch.setattr(liveness, "_BOOT", "/nowhere")
+    monkeypatch.setattr(locks, "_BOOT", "/nowhere")
     assert is_alive(mark()) is True
     assert is_alive({**mark(), "pid": dead["pid"]}) is False
     assert is_alive({**mark(), "host": "elsewhere"}) is None
@@ -83,7 +83,7 @@ def test_a_name_with_brackets_and_spaces_is_read_over(tmp_path):
     program = tmp_path / "a) Z (b"
     program.symlink_to(sys.executable)
     with subprocess.Popen([str(program), "-c", "input()"], stdin=subprocess.PIPE) as process:
-        assert liveness._ticks_at_begin(process.pid) > 0
+        assert locks._ticks_at_begin(process.pid) > 0
         process.communicate(b"\n")
 
 

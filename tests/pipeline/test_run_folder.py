@@ -12,7 +12,7 @@ import pytest
 
 from pipeline import run_folder
 from pipeline.errors import UserError
-from pipeline.liveness import mark
+from pipeline.locks import mark
 from pipeline.run_files import environment_name
 from pipeline.run_folder import NoRunError, Run, numbered_runs
 

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from pipeline.errors import UserError
 from pipeline.file_digests import LOCK
-from pipeline.liveness import mark
+from pipeline.locks import mark
 from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.packing.pack_files import check_pack, unpacked
 from pipeline.packing.study_packs import is_study, pack_study

@@ -11,13 +11,12 @@ import time
 
 import pytest
 
-from pipeline import folder_lock as locks
-from pipeline import liveness
+from pipeline import locks
 from pipeline.errors import UserError
 from pipeline.file_digests import LOCK
-from pipeline.folder_lock import FolderInUseError, folder_lock
+from pipeline.locks import FolderInUseError, folder_lock
 
-FOREIGN = {**liveness.mark(), "host": "elsewhere", "machine": "other", "boot": "other"}
+FOREIGN = {**locks.mark(), "host": "elsewhere", "machine": "other", "boot": "other"}
 FOREIGN |= {"token": "t", "since": "2026-01-01 00:00:00"}
 
 
@@ -44,7 +43,7 @@ def test_inside_nobody_else_is_let_in_and_afterwards_nothing_is_left(tmp_path):
     for _ in range(2):
         with lock(root):
             assert [path.name for path in root.iterdir()] == [LOCK]
-            who = re.escape(f"{root}: process {os.getpid()} on {liveness.mark()['host']} is at wor")
+            who = re.escape(f"{root}: process {os.getpid()} on {locks.mark()['host']} is at wor")
             with (
                 pytest.raises(FolderInUseError, match=f"^{who}k on it since 20..-"),
                 lock(root),
@@ -70,7 +69,7 @@ def test_it_is_let_go_when_the_work_fails(tmp_path):
 def test_a_dead_process_holds_nothing(tmp_path):
     with subprocess.Popen([sys.executable, "-c", ""]) as process:
         pass
-    leave_lock(tmp_path, {**liveness.mark(), "pid": process.pid, "began": 1, "token": "t"})
+    leave_lock(tmp_path, {**locks.mark(), "pid": process.pid, "began": 1, "token": "t"})
     with lock(tmp_path):
         assert json.loads((tmp_path / LOCK).read_text())["pid"] == os.getpid()
     assert list(tmp_path.iterdir()) == []
@@ -246,6 +245,6 @@ def wait_for(condition):
 
 
 def test_a_lock_cannot_speak_to_the_terminal(tmp_path, monkeypatch):
-    leave_lock(tmp_path, {**liveness.mark(), "token": "\x1b[2J", "since": "\x1b]0;taken\x07"})
+    leave_lock(tmp_path, {**locks.mark(), "token": "\x1b[2J", "since": "\x1b]0;taken\x07"})
     with pytest.raises(FolderInUseError, match=r"since \\x1b\]0;taken\\x07$"), lock(tmp_path):
         never()
