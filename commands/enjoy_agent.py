@@ -19,7 +19,7 @@ from commands.flag_values import (
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
 from commands.streams import go_on_unread
-from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.failures import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
 from pipeline.stopping import stops_noticed
 
@@ -211,7 +211,7 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest, film: Path | Non
 def _found_model(wanted: ModelRequest) -> ChosenModel:
     from pipeline.errors import UserError
     from pipeline.models.choose import find_model
-    from pipeline.run_folder import NoRunError
+    from pipeline.runs import NoRunError
 
     try:
         return find_model(wanted)

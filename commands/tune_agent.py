@@ -14,7 +14,7 @@ from commands.places import Place, place_of
 from commands.streams import go_on_unread
 from commands.tune_flags import build_parser
 from commands.tune_how import How
-from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.failures import exits_as_mistakes
 from pipeline.signs_of_life import doing
 from pipeline.stopping import stops_noticed
 

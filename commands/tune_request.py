@@ -13,7 +13,7 @@ from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec, file_n
 from pipeline.agent_checks import with_engine
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
-from pipeline.run_files import environment_name
+from pipeline.runs import environment_name
 from pipeline.settings.values import parse_assignments
 from pipeline.user_modules import import_typed
 from tuning.trial_storage import kind_of

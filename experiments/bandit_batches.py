@@ -18,8 +18,7 @@ from mdp.work_time import WorkTime
 from pipeline.environments import make_single_env
 from pipeline.finite_numbers import NotFiniteError, is_finite
 from pipeline.preparation import algorithm_kwargs
-from pipeline.run_folder import FINISHED, Run
-from pipeline.run_record import recorded_machine, recorded_versions, write_settings
+from pipeline.runs import FINISHED, Run, recorded_machine, recorded_versions, write_settings
 from pipeline.train_spec import TrainSpec
 
 

@@ -15,11 +15,9 @@ from experiments.planned_runs import PlannedRun
 from experiments.pull_statistics import PullStatistics, pull_statistics
 from experiments.run_figures import read_outcome
 from mdp.array_types import Floats
-from pipeline.array_files import read_arrays
+from pipeline.digests import DamagedFileError, read_arrays
 from pipeline.environments import make_single_env
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_files import PULLS_FILE
-from pipeline.run_folder import Run
+from pipeline.runs import PULLS_FILE, Run
 from pipeline.train_spec import TrainSpec
 
 STATISTICS_FILE = "pull_statistics.npz"

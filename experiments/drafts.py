@@ -18,7 +18,7 @@ from pathlib import Path
 
 from experiments.planned_runs import PlannedRun
 from pipeline import locks
-from pipeline.file_digests import STATE_FOLDER
+from pipeline.digests import STATE_FOLDER
 from pipeline.files import portable_name
 from pipeline.locks import seconds_silent
 from pipeline.resuming.state_folder import has_state

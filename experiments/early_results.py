@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from experiments.planned_runs import PlannedRun
 from experiments.study_spec import StudySpec
-from pipeline.file_digests import DamagedFileError
+from pipeline.digests import DamagedFileError
 from pipeline.library_loading import loading_libraries
 
 if TYPE_CHECKING:

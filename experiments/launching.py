@@ -31,7 +31,7 @@ from experiments.study_spec import file_name
 from pipeline.errors import one_line
 from pipeline.files import write_text
 from pipeline.locks import is_gone
-from pipeline.plain_runs import is_plain
+from pipeline.train_spec import is_plain
 
 
 @dataclass(frozen=True)

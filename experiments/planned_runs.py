@@ -8,10 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from pipeline.file_digests import DamagedFileError
-from pipeline.json_text import plain
-from pipeline.run_files import environment_name
-from pipeline.run_folder import FINISHED, ReadRun, Run
+from pipeline.digests import DamagedFileError
+from pipeline.files import plain
+from pipeline.runs import FINISHED, ReadRun, Run, environment_name
 from pipeline.train_spec import TrainSpec, completed
 
 # What a run of the same settings may differ in: where it is written, what is shown meanwhile, and

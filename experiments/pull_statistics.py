@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.array_types import AnyInts, Floats, Ints
-from pipeline.array_files import read_arrays
-from pipeline.file_digests import DamagedFileError
+from pipeline.digests import DamagedFileError, read_arrays
 from pipeline.files import replacing
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 FIRST_PULLS = 100  # kept one by one; of later ones fewer and fewer, `MAX_POINTS` in all

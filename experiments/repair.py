@@ -9,7 +9,7 @@ from experiments.planned_runs import PlannedRun
 from experiments.replaced_runs import move_aside
 from experiments.study_results import LeftOut, read_run
 from experiments.study_spec import StudySpec
-from pipeline.file_digests import DamagedFileError
+from pipeline.digests import DamagedFileError
 from pipeline.signs_of_life import Tell, tell_nobody
 
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from experiments.planned_runs import PlannedRun
+from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError, shown
-from pipeline.file_digests import DamagedFileError
 from pipeline.files import put_in_place
 
 FOLDER = "replaced"

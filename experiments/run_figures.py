@@ -17,10 +17,9 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from mdp.array_types import Floats
-from pipeline.array_files import read_arrays
+from pipeline.digests import DamagedFileError, read_arrays
 from pipeline.errors import one_line
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 
 LARGEST_FIGURE = 1e300
 _FORMER_BASELINE = "best_blind"  # what earlier versions called it

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext as kept_later
 from pathlib import Path
 
 from experiments.drafts import draft_path, take_over
 from experiments.planned_runs import PlannedRun
 from experiments.replaced_runs import make_room, move_aside
 from experiments.run_or_go_on import do_or_go_on
-from pipeline.file_digests import DamagedFileError
-from pipeline.files import kept_later, put_in_place, settle, sync_together
+from pipeline.digests import DamagedFileError
+from pipeline.files import put_in_place, settle, sync_together
 from pipeline.locks import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.signs_of_life import Heartbeat
 from pipeline.user_modules import import_again

@@ -11,7 +11,7 @@ def mixed_versions(infos: Iterable[Mapping[str, Any]]) -> str:
     """Which versions differ between runs, in a line; empty where none does.
 
     Args:
-        infos: contents of ``run.json``, see `pipeline.run_folder.Run.read_info`.
+        infos: contents of ``run.json``, see `pipeline.runs.Run.read_info`.
     """
     counts: dict[str, Counter[str]] = {}
     for info in infos:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from experiments.run_figures import read_episodes, read_evaluations
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_folder import Run
+from pipeline.digests import DamagedFileError
+from pipeline.runs import Run
 from safe_files.archives import read_members
 from safe_files.refusals import UnsafeFileError
 

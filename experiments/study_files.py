@@ -26,8 +26,7 @@ from experiments.study_spec import (
 )
 from pipeline.environments import check_env_id, with_maps_read
 from pipeline.errors import UserError, shown, unknown
-from pipeline.files import write_text
-from pipeline.json_text import plain
+from pipeline.files import plain, write_text
 from pipeline.settings.values import coerce
 from pipeline.settings.yaml import key_lines, read_yaml
 

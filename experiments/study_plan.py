@@ -19,7 +19,7 @@ from pipeline.environments import check_env_id, make_single_env, with_maps_read
 from pipeline.errors import UserError
 from pipeline.memory_limits import check_pulls
 from pipeline.models.load import agent_class
-from pipeline.run_files import environment_name
+from pipeline.runs import environment_name
 from pipeline.settings.hyperparams import Hyperparams, NoEntryError, read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 

@@ -22,7 +22,7 @@ from experiments.run_figures import (
 )
 from experiments.study_spec import StudySpec
 from mdp.array_types import Floats
-from pipeline.file_digests import DamagedFileError
+from pipeline.digests import DamagedFileError
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import area_under_curve, steps_to_stay, steps_to_threshold
 

@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from experiments.planned_runs import PlannedRun
-from pipeline.plain_runs import FAMILIES, NETWORKS
-from pipeline.train_spec import TrainSpec
+from pipeline.train_spec import FAMILIES, NETWORKS, TrainSpec
 
 Key = tuple[str, str]
 

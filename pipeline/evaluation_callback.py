@@ -22,7 +22,7 @@ from pipeline.files import replacing
 from pipeline.finite_numbers import check_model
 from pipeline.models.find import statistics_path
 from pipeline.models.load import save_model, save_normalization
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.stopping import current
 
 SECONDS_BETWEEN_WRITES = 1.0

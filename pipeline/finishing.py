@@ -12,7 +12,7 @@ from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
 from pipeline.preparation import Training
 from pipeline.pull_recording import PullSummary, summarise_pulls
-from pipeline.run_folder import FINISHED, INTERRUPTED
+from pipeline.runs import FINISHED, INTERRUPTED
 from pipeline.stopping import current
 
 

@@ -28,8 +28,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from pipeline.digests import LOCK
 from pipeline.errors import UserError, visible
-from pipeline.file_digests import LOCK
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import NEW, NO_LIMIT, open_number, opened, read_file
 

@@ -42,8 +42,7 @@ from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.resuming.resumed_logging import resumed_logger
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.state_saver import StateSaver
-from pipeline.run_files import environment_name
-from pipeline.run_folder import Run
+from pipeline.runs import Run, environment_name
 from pipeline.settings.components import (
     action_noise,
     build_algorithm_kwargs,

@@ -17,7 +17,7 @@ from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.settings import components
 from pipeline.train_spec import TrainSpec
 

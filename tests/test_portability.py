@@ -48,7 +48,7 @@ GUARDED = {
     ("mdp/code_cache.py", ".chmod"): "modes are neither set nor checked on Windows",
     ("pipeline/locks.py", "os.kill"): "asks _winapi on Windows, before it",
     ("pipeline/locks.py", "/proc"): "does without where there is none",
-    ("pipeline/run_record.py", "/proc"): "does without where there is none",
+    ("pipeline/runs.py", "/proc"): "does without where there is none",
 }
 
 

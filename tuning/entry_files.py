@@ -7,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from pipeline.json_text import plain
+from pipeline.files import plain
 from pipeline.settings.hyperparams import TUNED_ON, seeds_tuned_on
 from tuning.tuning_spec import TuningSpec
 

@@ -11,7 +11,7 @@ from typing import Any
 from experiments.planned_runs import PlannedRun
 from experiments.study_plan import check_settings, plan
 from experiments.study_spec import AgentSpec
-from pipeline.json_text import json_text
+from pipeline.files import json_text
 from tuning.tuning_spec import TuningSpec
 
 

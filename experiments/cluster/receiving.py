@@ -11,8 +11,8 @@ from pathlib import Path
 from experiments.cluster.answers import RefusedAnswerError
 from experiments.drafts import claim_draft, draft_path, remove_draft
 from experiments.planned_runs import PlannedRun
+from pipeline.digests import FIELD, RECORD, RecordedFiles
 from pipeline.errors import UserError
-from pipeline.file_digests import FIELD, RECORD, RecordedFiles
 from pipeline.files import sync_file, sync_folders
 from pipeline.locks import is_gone
 

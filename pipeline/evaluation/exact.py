@@ -42,8 +42,7 @@ from pipeline.environments import evaluation_kwargs, make_single_env
 from pipeline.evaluation.policies import OfLastPolicy, best_actions, obstacle, policy_matrix
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.memory_limits import observation_bytes
-from pipeline.plain_runs import is_plain
-from pipeline.train_spec import TrainSpec
+from pipeline.train_spec import TrainSpec, is_plain
 
 # What is observed in all states, kept as one array.
 MOST_BYTES_OBSERVED = 1 << 30

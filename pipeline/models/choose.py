@@ -51,7 +51,7 @@ from pipeline.models.load import (
     telling_masks,
 )
 from pipeline.module_records import check_recorded
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.settings.hyperparams import NoEntryError, read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule

@@ -24,10 +24,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from pipeline.digests import RECORD, DamagedFileError, read_record
 from pipeline.errors import UserError
-from pipeline.file_digests import RECORD, DamagedFileError, read_record
-from pipeline.run_files import environment_name
-from pipeline.run_folder import INTERRUPTED, Run
+from pipeline.runs import INTERRUPTED, Run, environment_name
 from pipeline.settings.yaml import read_saved_settings
 from safe_files.regular_files import read_file
 

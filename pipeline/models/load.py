@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any
 
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import UserError, one_line
-from pipeline.files import lasting
+from pipeline.files import replacing
 from pipeline.models.find import read_recorded
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.settings.values import algorithm_parameters
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule
@@ -504,7 +504,7 @@ def save_model(model: BaseAlgorithm, path: Path) -> None:
     from pipeline.finite_numbers import check_model
 
     check_model(model)
-    with lasting(path) as file:
+    with replacing(path) as file:
         model.save(file)
 
 
@@ -512,12 +512,12 @@ def save_normalization(model: BaseAlgorithm, path: Path) -> None:
     """Write the running statistics of VecNormalize, where the agent trains under one."""
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
-        with lasting(path) as file:
+        with replacing(path) as file:
             pickle.dump(normalization, file)  # as its own `save`, which takes paths alone
 
 
 def save_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
     """Write the replay buffer, where the agent has one."""
     if getattr(model, "replay_buffer", None) is not None:
-        with lasting(path) as file:
+        with replacing(path) as file:
             model.save_replay_buffer(file)  # type: ignore[attr-defined]

@@ -18,10 +18,9 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import IO, Any
 
+from pipeline.digests import LOCK, RECORD
 from pipeline.errors import UserError, one_line, visible
-from pipeline.file_digests import LOCK, RECORD
-from pipeline.files import replacing
-from pipeline.json_text import json_text
+from pipeline.files import json_text, replacing
 from pipeline.locks import folder_lock
 from pipeline.models.find import run_in
 from pipeline.module_records import COPIES

@@ -366,10 +366,10 @@ def test_a_log_folder_that_cannot_be_written(type_command, tmp_path):
 
 
 def test_a_full_disk(type_command, tmp_path, monkeypatch):
-    def no_space(_):
+    def no_space(*_, **__):
         raise OSError(28, "No space left on device", "run.json")
 
-    monkeypatch.setattr(files.os, "fsync", no_space)
+    monkeypatch.setattr(files.os, "replace", no_space)
     code, _, err = type_command("train.py", *QUICK)
     assert (code, err.count("\n")) == (2, 1)
     assert "No space left on device" in err

@@ -21,8 +21,7 @@ from experiments.pull_statistics import PullStatistics
 from experiments.study_files import read_study
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.run_files import PULLS_FILE
-from pipeline.run_folder import Run
+from pipeline.runs import PULLS_FILE, Run
 from pipeline.training import train
 from report.conclusions import conclusion
 from report.terminal_tables import print_analysis

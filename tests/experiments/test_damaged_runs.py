@@ -24,8 +24,8 @@ from experiments.run_in_child import do_run
 from experiments.study_plan import plan
 from experiments.study_results import read_results, read_run
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_files import PULLS_FILE
+from pipeline.digests import DamagedFileError
+from pipeline.runs import PULLS_FILE
 
 STEPS = {"n_timesteps": 60}
 WAREHOUSE = EnvironmentSpec("grid", "Warehouse-v0", STEPS)

@@ -19,7 +19,7 @@ from experiments.seed_values import curves_by_agent, mean_curve, values_over_see
 from experiments.study_plan import plan
 from experiments.study_results import RUN_COLUMNS, read_results, threshold_of
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.run_folder import FINISHED
+from pipeline.runs import FINISHED
 from report.conclusions import conclusion, places_without_a_run
 from report.figures.figure_files import write_figures
 from report.result_files import write_tables

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.run_figures import read_episodes, read_evaluations
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_folder import Run
+from pipeline.digests import DamagedFileError
+from pipeline.runs import Run
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from experiments.run_in_child import do_planned_run
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
-from pipeline.run_folder import FINISHED
+from pipeline.runs import FINISHED
 
 
 def test_a_draft_is_on_the_disk_before_it_has_its_name(monkeypatch, tmp_path):

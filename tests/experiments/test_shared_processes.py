@@ -36,8 +36,8 @@ from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.evaluation import exact
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.plain_runs import is_plain
 from pipeline.settings.hyperparams import ComponentSpec
+from pipeline.train_spec import is_plain
 
 AGENTS = (
     AgentSpec("first", "qlearning", tuned=False),

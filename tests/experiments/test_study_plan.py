@@ -8,9 +8,9 @@ import pytest
 
 from experiments.study_plan import check_settings, plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_folder import FAILED, FINISHED
+from pipeline.runs import FAILED, FINISHED
 from pipeline.train_spec import TrainSpec
 
 LAKE = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1", {"n_timesteps": 100})

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pipeline.digests import DamagedFileError, digests_of, read_record, sealed
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError, digests_of, read_record, sealed
 from pipeline.models.find import check_digest
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from pipeline import files
 from pipeline.files import (
-    lasting,
     naming,
     portable_name,
     put_in_place,
@@ -109,32 +108,15 @@ def test_a_disk_that_fails_changes_nothing(tmp_path, monkeypatch):
     path = tmp_path / "model.zip"
     path.write_text("old")
 
-    def no_space(_):
+    def no_space(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, "fsync", no_space)
+    monkeypatch.setattr(files.os, "replace", no_space)
     with pytest.raises(OSError, match="No space left") as caught:
         write_json(path, "new")
     assert caught.value.filename == str(path)
     assert path.read_text() == "old"
     assert names(tmp_path) == ["model.zip"]
-
-
-def test_what_lasts_is_on_the_disk_before_it_has_its_name_and_the_name_is_after(
-    tmp_path, monkeypatch
-):
-    path, done = tmp_path / "model.zip", []
-    put_in_place = files.put_in_place
-    monkeypatch.setattr(
-        files.os, "fsync", lambda number: done.append(Path(f"/proc/self/fd/{number}").readlink())
-    )
-    monkeypatch.setattr(
-        files, "put_in_place", lambda *args: (put_in_place(*args), done.append("renamed"))
-    )
-    with lasting(path) as file:
-        file.write(b"whole")
-        draft = tmp_path / names(tmp_path)[0]
-    assert done == [draft, "renamed", tmp_path]
 
 
 def test_a_folder_that_cannot_be_flushed_is_passed_over_and_a_broken_disk_is_not(

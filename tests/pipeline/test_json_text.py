@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.file_digests import FIELD
-from pipeline.json_text import json_text, plain
-from pipeline.run_folder import FINISHED, Run
+from pipeline.digests import FIELD
+from pipeline.files import json_text, plain
+from pipeline.runs import FINISHED, Run
 
 leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 values = st.recursive(

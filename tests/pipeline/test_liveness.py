@@ -10,10 +10,9 @@ import pytest
 
 from pipeline import locks
 from pipeline.errors import UserError
-from pipeline.leftovers import remove_leftovers
 from pipeline.locks import is_alive, mark
 from pipeline.models.find import model_of
-from pipeline.run_folder import INTERRUPTED, RUNNING, Run
+from pipeline.runs import INTERRUPTED, RUNNING, Run, remove_leftovers
 
 
 @pytest.fixture(scope="module")
@@ -155,7 +154,7 @@ def test_a_damaged_record_and_a_missing_folder_are_left_alone(tmp_path, dead):
 def test_a_training_that_was_killed_is_known_as_interrupted(tmp_path):
     """By its process: nothing else says so."""
     code = (
-        "import os, signal, sys; from pathlib import Path; from pipeline.run_folder import Run\n"
+        "import os, signal, sys; from pathlib import Path; from pipeline.runs import Run\n"
         "Run.claim(Path(sys.argv[1]), 'sarsa', 'Taxi-v4').update_info(spec={'algo': 'sarsa'})\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )

@@ -12,8 +12,8 @@ import time
 import pytest
 
 from pipeline import locks
+from pipeline.digests import LOCK
 from pipeline.errors import UserError
-from pipeline.file_digests import LOCK
 from pipeline.locks import FolderInUseError, folder_lock
 
 FOREIGN = {**locks.mark(), "host": "elsewhere", "machine": "other", "boot": "other"}

@@ -4,7 +4,7 @@ import platform
 
 import pytest
 
-from pipeline import run_record
+from pipeline import runs
 
 
 @pytest.mark.parametrize(
@@ -18,11 +18,11 @@ from pipeline import run_record
 def test_the_processor_is_named_where_it_is_told(tmp_path, monkeypatch, content, processor):
     if content is not None:
         (tmp_path / "cpuinfo").write_text(content)
-    monkeypatch.setattr(run_record, "_PROCESSORS", tmp_path / "cpuinfo")
+    monkeypatch.setattr(runs, "_PROCESSORS", tmp_path / "cpuinfo")
     monkeypatch.setattr(platform, "processor", lambda: "arm")
-    run_record.recorded_machine.cache_clear()
-    machine = run_record.recorded_machine()
-    run_record.recorded_machine.cache_clear()
+    runs.recorded_machine.cache_clear()
+    machine = runs.recorded_machine()
+    runs.recorded_machine.cache_clear()
     assert machine["processor"] == processor
     assert machine["system"].startswith(platform.system())
     assert int(machine["cores"]) >= 1

@@ -23,7 +23,7 @@ from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.models.find import recorded_run, run_around, run_of
 from pipeline.models.load import load_to_play, with_normalised_rewards
 from pipeline.playing import play_episodes, playing_env
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.settings.hyperparams import NoEntryError
 from pipeline.settings.yaml import read_saved_settings
 

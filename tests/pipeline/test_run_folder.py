@@ -10,13 +10,12 @@ from uuid import uuid4
 
 import pytest
 
-from pipeline import run_folder
+from pipeline import runs
 from pipeline.errors import UserError
 from pipeline.locks import mark
-from pipeline.run_files import environment_name
-from pipeline.run_folder import NoRunError, Run, numbered_runs
+from pipeline.runs import NoRunError, Run, environment_name, numbered_runs
 
-ROOT = Path(run_folder.__file__).parent.parent
+ROOT = Path(runs.__file__).parent.parent
 
 
 def claim_names(folder, env_id, n, **kwargs):
@@ -71,7 +70,7 @@ def test_folders_of_other_names_do_not_count(tmp_path, neighbour):
 def test_a_number_taken_meanwhile_is_passed_over(tmp_path, monkeypatch):
     claim_names(tmp_path, "Taxi-v4", 3)
     # As if the other runs had been started after this one looked.
-    monkeypatch.setattr(run_folder, "numbered_runs", lambda parent, name: [])
+    monkeypatch.setattr(runs, "numbered_runs", lambda parent, name: [])
     assert claim_names(tmp_path, "Taxi-v4", 1) == ["Taxi-v4_4"]
 
 
@@ -96,7 +95,7 @@ def test_processes_never_share_a_folder(tmp_path):
     program = """
 import sys
 from pathlib import Path
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(25):

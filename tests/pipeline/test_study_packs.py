@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from pipeline.digests import LOCK
 from pipeline.errors import UserError
-from pipeline.file_digests import LOCK
 from pipeline.locks import mark
 from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.packing.pack_files import check_pack, unpacked
