@@ -78,14 +78,10 @@ class DamagedFileError(UserError):
 
 @dataclass(frozen=True)
 class RecordedFiles:
-    """The files of a run, each held against what it was when the run ended.
+    """The files of a run, each held against what it was when the run ended."""
 
-    Attributes:
-        folder: the run folder.
-        digests: by name relative to the folder; None where the run recorded none.
-    """
-
-    folder: Path
+    folder: Path  # the run folder
+    # by name relative to the folder; None where the run recorded none
     digests: Mapping[str, str] | None
 
     def matching(self, pattern: str) -> list[Path]:
@@ -99,11 +95,7 @@ class RecordedFiles:
         return [self.folder / name for name in sorted(names)]
 
     def read(self, path: Path, limit: int = LARGEST_READ) -> bytes:
-        """All of a file of no more than ``limit`` bytes, which is as the run left it.
-
-        Raises:
-            DamagedFileError: if it is not, or cannot be read.
-        """
+        """All of a file of no more than ``limit`` bytes, which is as the run left it."""
         with _as_damage(path):
             content = read_file(path, limit)
         recorded = self._recorded(path)
@@ -112,11 +104,7 @@ class RecordedFiles:
         return content
 
     def check(self, path: Path) -> None:
-        """Make sure of the same for a file that need not fit the memory.
-
-        Raises:
-            DamagedFileError: if it is missing or changed.
-        """
+        """Make sure of the same for a file that need not fit the memory."""
         recorded = self._recorded(path)
         with _as_damage(path):
             if recorded is not None and digest_of(path) != recorded:
@@ -165,12 +153,7 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The contents of a ``run.json``, which is as it was written.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        DamagedFileError: if it holds anything else than a run's record, or was changed.
-    """
+    """The contents of a ``run.json``, which is as it was written."""
     hold(path.parent)
     try:
         content = read_file(path, LARGEST_RECORD)
@@ -233,11 +216,7 @@ def _is_too_deep(value: Any) -> bool:
 
 
 def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
-    """The arrays of numbers in an archive of NumPy's, by name.
-
-    Raises:
-        DamagedFileError: if it is no whole archive, or holds anything else.
-    """
+    """The arrays of numbers in an archive of NumPy's, by name."""
     import numpy as np
     from numpy.lib.npyio import NpzFile
 

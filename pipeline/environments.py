@@ -54,9 +54,6 @@ def check_env_id(env_id: str) -> None:
 
     A module before a colon is not imported here, whoever asks: `pipeline.user_modules` does that,
     for what the user has typed.
-
-    Raises:
-        UserError: if it is not; it names the nearest ids, or the flag to type.
     """
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:
@@ -72,9 +69,6 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """`gym.make`, with mistakes in the arguments put into one line.
 
     Of ``module:Env-v0`` the name alone counts: Gymnasium would import the module.
-
-    Raises:
-        UserError: if the environment cannot be made with these arguments.
     """
     try:
         return gym.make(env_id.rpartition(":")[2], **kwargs)
@@ -195,9 +189,6 @@ def make_training_env(spec: TrainSpec, monitor_folder: Path | None) -> Any:
     """The environments of the training, each under a Monitor that writes into the folder.
 
     What wrappers write goes there too; where it is None, into a temporary folder.
-
-    Returns:
-        A VecEnv of ``n_envs`` environments.
     """
     return _make_vec_env(spec, spec.hyperparams.n_envs, spec.seed, True, monitor_folder)
 
@@ -312,11 +303,7 @@ def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception
 
 @contextmanager
 def lacking_packages_told(env_id: str) -> Iterator[None]:
-    """Say in a line which package an environment lacks, as it may only find when it is drawn.
-
-    Raises:
-        UserError: in the place of Gymnasium's own error.
-    """
+    """Say in a line which package an environment lacks, as it may only find when it is drawn."""
     try:
         yield
     except gym.error.DependencyNotInstalled as error:

@@ -68,12 +68,7 @@ class ForeignExitError(UserError):
 
 @contextmanager
 def exits_as_mistakes() -> Iterator[None]:
-    """Let what is called inside the ``with`` statement end no program: it has failed.
-
-    Raises:
-        ForeignExitError: in the place of a SystemExit, and of a KeyboardInterrupt that no signal
-            has caused.
-    """
+    """Let what is called inside the ``with`` statement end no program: it has failed."""
     try:
         yield
     except OwnExit:
@@ -103,9 +98,6 @@ def blame_weights(model: Any, error: Exception) -> None:
     """Say that an agent's weights are at fault, where they are.
 
     PyTorch refuses distributions of nan, and does not say where they come from.
-
-    Raises:
-        NotFiniteError: naming them.
     """
     from pipeline.finite_numbers import NotFiniteError, check_model
 
@@ -120,9 +112,6 @@ def blame_settings(algo: str, model: Any, error: Exception) -> None:
 
     What went through an environment, a callback or a module of the user's may be a mistake in
     there, and keeps its traceback.
-
-    Raises:
-        LibraryError: naming the step, and the line of the library.
     """
     frames = list(traceback.walk_tb(error.__traceback__))
     packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame, _ in frames]
@@ -153,12 +142,7 @@ def has_begun(training: Training) -> bool:
 
 
 def give_up(training: Training, error: BaseException) -> None:
-    """Note the reason; or remove the folder, where the agent failed before its first step.
-
-    Raises:
-        UserError: in that case, where the agent's settings are at fault; and where the disk takes
-            no more, or somebody has removed the folder.
-    """
+    """Note the reason; or remove the folder, where the agent failed before its first step."""
     run, is_new = training.run, not training.keeping.goes_on
     if is_gone(run.path):
         raise FolderGoneError(run.path) from error

@@ -218,11 +218,7 @@ _INFINITY = "1e999"
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON gives it back: NumPy's numbers as Python's, tuples as lists, nan as None.
-
-    Raises:
-        TypeError: if there is something else in it.
-    """
+    """The value as JSON gives it back: plain numbers for NumPy's, lists for tuples, None for nan."""
     match value:
         case Mapping():
             return {_key(key): plain(item) for key, item in value.items()}
@@ -245,11 +241,7 @@ def _from_numpy(value: Any) -> Any:
 
 
 def json_text(value: Any, indent: int | None = None) -> str:
-    """The value as JSON, with infinity as a number that is too large.
-
-    Raises:
-        TypeError: as in `plain`.
-    """
+    """The value as JSON, with infinity as a number that is too large."""
     # Nobody can have put these into a text of his.
     tokens = {sign: secrets.token_hex(16) for sign in (math.inf, -math.inf)}
     text = json.dumps(_marked(plain(value), tokens), indent=indent, allow_nan=False)

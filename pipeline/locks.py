@@ -164,21 +164,12 @@ def give_sign(path: Path) -> None:
 
 
 def seconds_silent(path: Path) -> float:
-    """How long ago `give_sign` was last called for a path, or it was written to.
-
-    Raises:
-        OSError: if there is no such path, or its folder cannot be written to.
-    """
+    """How long ago `give_sign` was last called for a path, or it was written to."""
     return _now_in(path.parent) - last_sign(path)
 
 
 def last_sign(path: Path) -> float:
-    """When that was, by the folder's clock.
-
-    Raises:
-        OSError: if there is no such path.
-        UnsafeFileError: if it is neither a regular file nor a folder.
-    """
+    """When that was, by the folder's clock."""
     if path.is_dir():
         return path.stat().st_mtime
     # Network folders remember for a while what a file was, but not beyond its being opened.
@@ -240,11 +231,7 @@ def is_gone(path: Path) -> bool:
 
 @contextmanager
 def told_if_gone(root: Path) -> Iterator[None]:
-    """Say that a folder is gone, in place of whatever fails by that in the ``with`` statement.
-
-    Raises:
-        FolderGoneError: if it is.
-    """
+    """Say that a folder is gone, in place of whatever fails by that in the ``with`` statement."""
     try:
         yield
     except Exception as error:

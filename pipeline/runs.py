@@ -129,9 +129,6 @@ class Run:
         """Make the folder of a new run, with the first number that is free.
 
         It says from its first moment on which process is at work on it.
-
-        Raises:
-            UserError: if the folder cannot be made.
         """
         name = environment_name(env_id)
         parent = log_folder / algo
@@ -154,10 +151,6 @@ class Run:
 
         The one without a number lies in ``<log folder>/<algo>/`` itself, and is also the newest
         where no other is, as in rl_zoo3.
-
-        Raises:
-            NoRunError: if there is none at all.
-            UserError: if there is none of that number; it names those that there are.
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
@@ -246,11 +239,7 @@ class Run:
         return _run_number(self.path.name, self.env_name)
 
     def read_info(self) -> dict[str, Any]:
-        """The contents of ``run.json``; empty where there is none.
-
-        Raises:
-            UserError: if the file is damaged.
-        """
+        """The contents of ``run.json``; empty where there is none."""
         try:
             return read_record(self.info_path)
         except FileNotFoundError:
@@ -258,11 +247,7 @@ class Run:
 
     @property
     def state(self) -> str | None:
-        """What became of the run: one whose process is gone before its end was interrupted.
-
-        Raises:
-            UserError: if ``run.json`` is damaged.
-        """
+        """What became of the run: one whose process is gone before its end was interrupted."""
         info = self.read_info()
         state = info.get("state")
         if state == RUNNING and is_alive(info.get(PROCESS)) is False:
@@ -270,11 +255,7 @@ class Run:
         return state if isinstance(state, str) else None
 
     def recorded_spec(self) -> dict[str, Any]:
-        """What ``run.json`` says was asked for; empty where it says nothing.
-
-        Raises:
-            UserError: if the file is damaged.
-        """
+        """What ``run.json`` says was asked for; empty where it says nothing."""
         spec = self.read_info().get("spec")
         return spec if isinstance(spec, dict) else {}
 
@@ -325,11 +306,7 @@ class Run:
 
     @property
     def files(self) -> RecordedFiles:
-        """The files that the run left, each held against what it was then.
-
-        Raises:
-            UserError: if ``run.json`` is damaged.
-        """
+        """The files that the run left, each held against what it was then."""
         return RecordedFiles(self.path, self.read_info().get(FIELD))
 
     def discard(self) -> None:
@@ -438,27 +415,14 @@ def _processor() -> str:
 
 @contextmanager
 def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
-    """Keep others from going on with a run inside the ``with`` statement.
-
-    Args:
-        run: the run folder.
-        say: told in a line what this waits for.
-
-    Raises:
-        UserError: if another process is at work on it, or it is gone.
-        UnsafeFileError: if anything but files and folders lies in it.
-    """
+    """Keep others from going on with a run inside the ``with`` statement."""
     take_up(run.path)
     with folder_lock(run.path, partial(_thread.interrupt_main, signal.SIGTERM), say):
         yield
 
 
 def check_left(run: Run) -> None:
-    """Make sure that nobody is at work on a run that has no lock, as those of a study.
-
-    Raises:
-        UserError: if somebody is.
-    """
+    """Make sure that nobody is at work on a run that has no lock, as those of a study."""
     info = run.read_info()
     process: Any = info.get(PROCESS)
     if info.get("state") == RUNNING and is_alive(process):

@@ -48,15 +48,10 @@ MOST_STATES_NAMED = 3
 
 @dataclass(frozen=True)
 class Advice:
-    """What to say of a run that failed.
+    """What to say of a run that failed."""
 
-    Attributes:
-        instead: what the greedy policy does instead of solving the task.
-        try_first: the change that is likely to help; None where no signal says so.
-    """
-
-    instead: str
-    try_first: str | None
+    instead: str  # what the greedy policy does instead of solving the task
+    try_first: str | None  # the change that is likely to help; None where no signal says so
 
 
 def advice(

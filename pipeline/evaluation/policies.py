@@ -55,11 +55,7 @@ def _knows_masks(predict: Callable[..., Any]) -> bool:
 
 
 def player(model: BaseAlgorithm, env: VecEnv) -> Any:
-    """What to ask by ``predict`` on ``env``: the agent, told the masks where it takes them.
-
-    Raises:
-        UserError: if it takes them and the environment has none.
-    """
+    """What to ask by ``predict`` on ``env``: the agent, told the masks where it takes them."""
     if not takes_masks(model):
         return model
     try:
@@ -134,15 +130,7 @@ def obstacle(
     horizon: int,
     deterministic: bool = True,
 ) -> str:
-    """Why exact evaluation is out of reach, or dearer than playing; empty where it is neither.
-
-    Args:
-        agent: any agent with discrete actions.
-        observations: what it observes in each state, states along the first axis.
-        masks: what may be done in each state, bool of shape (S, A), or None if that is not known.
-        horizon: the time limit.
-        deterministic: whether it is its best actions that count.
-    """
+    """Why exact evaluation is out of reach, or dearer than playing; empty where it is neither."""
     n_states = len(observations)
     if reason := _cannot_be_asked(agent, masks):
         return reason
@@ -163,10 +151,6 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
 
     Agents of this project and of Stable-Baselines3 can. Of others, what `predict` returns is looked
     at: it has to be one action a state, the same when it is asked again, and nothing to remember.
-
-    Args:
-        agent: any agent with discrete actions.
-        observations: what it observes in each state, states along the first axis.
     """
     if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return ""
@@ -227,11 +211,7 @@ def policy_matrix(
 def best_actions(
     agent: BaseAlgorithm, observations: NDArray[Any], masks: Bools | None = None
 ) -> Ints:
-    """What the agent does in each state, shape (S,); arguments as of `policy_matrix`.
-
-    Raises:
-        TypeError: if that does not depend on the state alone.
-    """
+    """What the agent does in each state, shape (S,); arguments as of `policy_matrix`."""
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
 

@@ -38,18 +38,14 @@ FEWEST_TO_TELL = 10
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What returns on an environment are measured against.
+    """What returns on an environment are measured against."""
 
-    Attributes:
-        optimum: the highest expected return that any policy has under the time limit. Where that
-            is not known, a return that no policy exceeds.
-        baseline: the highest of uniformly random actions and of each constant action.
-        at_least: where the optimum is not known, a return that a policy was seen to reach: the
-            optimum is bracketed by the two. None where it is known.
-    """
-
+    # the highest expected return that any policy has under the time limit. Where that is not known,
+    # a return that no policy exceeds.
     optimum: float
-    baseline: float
+    baseline: float  # the highest of uniformly random actions and of each constant action
+    # where the optimum is not known, a return that a policy was seen to reach: the optimum is
+    # bracketed by the two. None where it is known.
     at_least: float | None = None
 
     def gap(self, expected_return: float) -> float:
@@ -90,24 +86,18 @@ class Yardstick:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good an agent is: episodes that it has played, or their exact expectation.
+    """How good an agent is: episodes that it has played, or their exact expectation."""
 
-    Attributes:
-        returns: undiscounted return of each episode, shape (n_episodes,); the expected return,
-            shape (1,), where that is exact.
-        lengths: number of steps, likewise.
-        successes: whether each episode succeeded, or the probability of it, likewise; None where
-            the environment does not say.
-        exact_std: standard deviation of an episode's return, where it is exact; None where
-            episodes were sampled.
-        yardstick: what to measure the return against, where it is known.
-    """
-
+    # undiscounted return of each episode, shape (n_episodes,); the expected return, shape (1,),
+    # where that is exact
     returns: Floats
-    lengths: NDArray[np.floating[Any] | np.integer[Any]]
+    lengths: NDArray[np.floating[Any] | np.integer[Any]]  # number of steps, likewise
+    # whether each episode succeeded, or the probability of it, likewise; None where the environment
+    # does not say
     successes: NDArray[np.bool_ | np.floating[Any]] | None
+    # standard deviation of an episode's return, where it is exact; None where episodes were sampled
     exact_std: float | None = None
-    yardstick: Yardstick | None = None
+    yardstick: Yardstick | None = None  # what to measure the return against, where it is known
 
     @property
     def is_exact(self) -> bool:
@@ -266,15 +256,10 @@ def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
 
 
 class Shares(NamedTuple):
-    """Steps of evaluation for one of training.
+    """Steps of evaluation for one of training."""
 
-    Attributes:
-        usual: of any training.
-        at_first: of the steps of short trainings, until that comes to `STEPS_AT_FIRST`.
-    """
-
-    usual: float
-    at_first: float
+    usual: float  # of any training
+    at_first: float  # of the steps of short trainings, until that comes to `STEPS_AT_FIRST`
 
 
 # Chosen by how long a step of evaluation takes beside one of training, so that all of them take a
@@ -297,12 +282,7 @@ STEPS_IN_ANY_CASE = 2_000
 
 
 def shares_of(model: BaseAlgorithm, *, plays_compiled: bool) -> Shares:
-    """How many steps of evaluation go with the training of an agent.
-
-    Args:
-        model: the agent.
-        plays_compiled: whether its evaluation runs in compiled code.
-    """
+    """How many steps of evaluation go with the training of an agent."""
     engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
     if engine.startswith("compiled but"):
         return PYTHON_ENV
@@ -357,12 +337,7 @@ class SampledEvaluator:
         self._last_length: float | None = None
 
     def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
-        """Whether the training has come far enough for another evaluation.
-
-        Args:
-            model: the agent.
-            n_episodes: of training so far.
-        """
+        """Whether the training has come far enough for another evaluation."""
         if self.is_limited:
             n_trained = model.num_timesteps - model._num_timesteps_at_start
             progress = n_trained / (self.training_steps or math.inf)
@@ -490,9 +465,6 @@ def evaluate_compiled(
 
     Tables and tiles act by the same bits; networks by the compiled forward pass, and by the
     library's `predict` where two actions are so close that rounding could decide.
-
-    Raises:
-        NotFiniteError: if a return is not finite.
     """
     from agents.compiled.episodes import DECIMALS
     from agents.compiled.greedy_play import play_episodes

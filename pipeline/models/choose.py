@@ -63,53 +63,37 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """Which model is asked for.
+    """Which model is asked for."""
 
-    Attributes:
-        path: a zip or a run folder, instead of looking for a run.
-        algo: name of the agent; None for what the zip or its run folder says, or else ``"ppo"``.
-        env_id: id of the environment; None for what the run folder says, or else
-            ``"CartPole-v1"``.
-        log_folder: the folder above all runs.
-        run_number: number of the run; 0 for the newest, -1 for one without a number.
-        which: the model at the end of training, the best, that of the last checkpoint, or that of
-            the checkpoint after so many steps.
-        statistics: a file of VecNormalize's statistics, instead of those that lie with the model.
-        env_kwargs: arguments of the environment, to change those of the run.
-        user_modules: modules of the user's, imported already; a run has no others imported.
-        seed: of the episodes.
-        device: torch device of the networks.
-        zipped_in: the pack that the folder was unpacked from.
-    """
-
-    path: Path | None = None
+    path: Path | None = None  # a zip or a run folder, instead of looking for a run
+    # name of the agent; None for what the zip or its run folder says, or else ``"ppo"``
     algo: str | None = None
+    # id of the environment; None for what the run folder says, or else ``"CartPole-v1"``
     env_id: str | None = None
-    log_folder: Path = Path("logs")
-    run_number: int = 0
+    log_folder: Path = Path("logs")  # the folder above all runs
+    run_number: int = 0  # number of the run; 0 for the newest, -1 for one without a number
+    # the model at the end of training, the best, that of the last checkpoint, or that of the
+    # checkpoint after so many steps
     which: Which = "final"
+    # a file of VecNormalize's statistics, instead of those that lie with the model
     statistics: Path | None = None
+    # arguments of the environment, to change those of the run
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    # modules of the user's, imported already; a run has no others imported
     user_modules: tuple[UserModule, ...] = ()
-    seed: int = 0
-    device: str = "auto"
-    zipped_in: Path | None = None
+    seed: int = 0  # of the episodes
+    device: str = "auto"  # torch device of the networks
+    zipped_in: Path | None = None  # the pack that the folder was unpacked from
 
 
 @dataclass(frozen=True)
 class ChosenModel:
-    """A model and the run that it comes from; its files have been read, and are not read again.
+    """A model and the run that it comes from; its files have been read, and are not read again."""
 
-    Attributes:
-        file: the zip.
-        spec: how its environments are made.
-        run: the run folder, or None for a zip that lies elsewhere.
-        statistics: VecNormalize's statistics that it is played with, or None.
-    """
-
-    file: ModelFile
-    spec: TrainSpec
-    run: Run | None
+    file: ModelFile  # the zip
+    spec: TrainSpec  # how its environments are made
+    run: Run | None  # the run folder, or None for a zip that lies elsewhere
+    # VecNormalize's statistics that it is played with, or None
     statistics: Statistics | None = None
 
     @property
@@ -124,11 +108,7 @@ def choose_model(request: ModelRequest) -> ChosenModel:
 
 
 def find_model(request: ModelRequest) -> ChosenModel:
-    """Find the model that is asked for, without loading a library that takes long.
-
-    Raises:
-        UserError: if there is no such model, or it may not be loaded.
-    """
+    """Find the model that is asked for, without loading a library that takes long."""
     if request.statistics is not None and not request.statistics.is_file():
         raise UserError(f"no such file of statistics: {request.statistics}")
     if request.path is None:
@@ -139,11 +119,7 @@ def find_model(request: ModelRequest) -> ChosenModel:
 
 
 def model_of_run(path: Path, spec: TrainSpec, run: Run) -> ChosenModel:
-    """A model of a run whose spec is known, ready to be played.
-
-    Raises:
-        UserError: if it, or what goes with it, is not as the run left it.
-    """
+    """A model of a run whose spec is known, ready to be played."""
     return with_statistics(ChosenModel(read_model(path, run), spec, run))
 
 
@@ -222,15 +198,7 @@ def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
 
 
 def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenModel:
-    """The model with the statistics that it is played with, which are there and may be read.
-
-    Args:
-        chosen: the model.
-        named: a file of them, instead of those that lie with the model.
-
-    Raises:
-        UserError: if they are not.
-    """
+    """The model with the statistics that it is played with, which are there and may be read."""
     params_path = None if chosen.run is None else chosen.run.params_path
     path, normalize = (
         named or statistics_of(chosen.path, params_path),
@@ -252,9 +220,6 @@ def agent_to_continue(path: Path) -> Path:
     """The zip that a path means, with or without its suffix, or of a run folder.
 
     What goes with it is looked at too, before a run begins that could not.
-
-    Raises:
-        UserError: if there is none, or it or what goes with it is not as its run left it.
     """
     model = model_at(path)
     run = run_around(model)
@@ -266,22 +231,14 @@ def agent_to_continue(path: Path) -> Path:
 
 
 def model_to_continue(spec: TrainSpec) -> ModelFile | None:
-    """The zip of the agent to go on with, read once and for all; None for a new agent.
-
-    Raises:
-        UserError: if it is no such zip, or not as its run left it.
-    """
+    """The zip of the agent to go on with, read once and for all; None for a new agent."""
     if spec.trained_agent is None:
         return None
     return read_model(spec.trained_agent, run_around(spec.trained_agent))
 
 
 def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
-    """The statistics that go on with the agent; None where there are none, or none are wanted.
-
-    Raises:
-        UserError: if they cannot be read, or are not as their run left them.
-    """
+    """The statistics that go on with the agent; None where there are none, or none are wanted."""
     if spec.trained_agent is None or spec.saved_hyperparams.get("normalize") is False:
         return None
     path = _statistics_path(spec.trained_agent)
@@ -294,11 +251,7 @@ def continuing(spec: TrainSpec, statistics: Statistics) -> TrainSpec:
 
 
 def load_to_continue(spec: TrainSpec, file: ModelFile, env: VecEnv, **kwargs: Any) -> BaseAlgorithm:
-    """The agent as it was, with its replay buffer, on ``env`` and with these hyperparameters.
-
-    Raises:
-        UserError: if it cannot be loaded so.
-    """
+    """The agent as it was, with its replay buffer, on ``env`` and with these hyperparameters."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     # The networks are those of the file: their shape cannot change.

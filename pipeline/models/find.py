@@ -35,29 +35,19 @@ _SETTINGS_FILES = ("args.yml", "config.yml")
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """What a folder says of the agent in it.
+    """What a folder says of the agent in it."""
 
-    Attributes:
-        algo: name of the agent, or None.
-        env_id: id of the environment, or None.
-        hyperparams: the entry of hyperparameters that it was trained with, or None.
-        gym_packages: modules that were imported for the environments that they register.
-        is_own: whether this project recorded it.
-    """
-
-    algo: str | None = None
-    env_id: str | None = None
+    algo: str | None = None  # name of the agent, or None
+    env_id: str | None = None  # id of the environment, or None
+    # the entry of hyperparameters that it was trained with, or None
     hyperparams: dict[str, Any] | None = None
+    # modules that were imported for the environments that they register
     gym_packages: tuple[str, ...] = ()
-    is_own: bool = False
+    is_own: bool = False  # whether this project recorded it
 
 
 def run_of(path: Path) -> Run | None:
-    """The run folder that a model file lies in, or None if it lies elsewhere.
-
-    Raises:
-        UserError: if the folder's ``run.json`` is damaged.
-    """
+    """The run folder that a model file lies in, or None if it lies elsewhere."""
     # A link to a zip may lie in the run, or lead there.
     folders = (path.parent.resolve(), path.resolve().parent)
     folder = next((one for one in folders if os.path.lexists(one / RECORD)), None)
@@ -90,11 +80,7 @@ def run_around(model: Path) -> Run | None:
 
 
 def run_in(folder: Path) -> Run:
-    """The run in a folder; where nothing says how it was trained, its ``env_name`` is empty.
-
-    Raises:
-        UserError: if models of several environments lie there.
-    """
+    """The run in a folder; where nothing says how it was trained, its ``env_name`` is empty."""
     run = run_around(folder / "any.zip")
     names = _settings_folders(folder)
     if run is None and len(names) > 1:
@@ -103,11 +89,7 @@ def run_in(folder: Path) -> Run:
 
 
 def recorded_run(run: Run | None) -> RecordedRun:
-    """What a run folder says, see the table above; of a folder that says nothing, nothing.
-
-    Raises:
-        UserError: if a file is damaged, or holds anything but plain data.
-    """
+    """What a run folder says, see the table above; of a folder that says nothing, nothing."""
     if run is None:
         return RecordedRun()
     spec = run.recorded_spec()
@@ -131,11 +113,7 @@ def recorded_run(run: Run | None) -> RecordedRun:
 
 
 def check_digest(run: Run | None, path: Path) -> None:
-    """Make sure that a file of a run is as the run left it, where the run recorded that.
-
-    Raises:
-        UserError: if it is not.
-    """
+    """Make sure that a file of a run is as the run left it, where the run recorded that."""
     if run is None:
         return
     try:
@@ -255,16 +233,7 @@ _OTHER_ZIPS = ("best_model.zip", "train_eval_metrics.zip")
 
 
 def model_at(path: Path, which: Which = "final") -> Path:
-    """The zip that a path means.
-
-    Args:
-        path: a zip, with or without its suffix, or a run folder.
-        which: of a run folder, the agent at the end of training, the best, that of the last
-            checkpoint, or that of the checkpoint after so many steps.
-
-    Raises:
-        UserError: if there is none, or ``which`` asks for another than the path names.
-    """
+    """The zip that a path means."""
     with_suffix = path.with_name(f"{path.name}.zip") if path.name else path
     if path.is_dir() and (os.path.lexists(path / RECORD) or not with_suffix.is_file()):
         return model_of(run_in(path), which)
@@ -280,11 +249,7 @@ def model_at(path: Path, which: Which = "final") -> Path:
 
 
 def model_of(run: Run, which: Which = "final") -> Path:
-    """The zip of a run.
-
-    Raises:
-        UserError: if the run holds none.
-    """
+    """The zip of a run."""
     path = _path_in(run, which)
     if not path.exists():
         known = ", ".join(path.stem.split("_")[-2] for path in run.checkpoints())

@@ -41,15 +41,11 @@ class ModelFile:
     """A zip, read once: what is held against its digest, looked into and loaded are these bytes.
 
     Whoever puts another file in its place meanwhile changes nothing.
-
-    Attributes:
-        path: where it lay.
-        content: all of it.
-        data: the JSON in it; what is pickled in that stays text.
     """
 
-    path: Path
-    content: bytes = field(repr=False)
+    path: Path  # where it lay
+    content: bytes = field(repr=False)  # all of it
+    # the JSON in it; what is pickled in that stays text
     data: Mapping[str, Any] = field(repr=False)
 
     @property
@@ -63,15 +59,7 @@ class ModelFile:
 
 
 def read_model(path: Path, run: Run | None = None) -> ModelFile:
-    """Read a zip, which is a whole one of an agent; no agent is made of it.
-
-    Args:
-        path: the zip.
-        run: the run that it is of, whose record says what it was, or None.
-
-    Raises:
-        UserError: if it is missing, unreadable, damaged, too large, or something else.
-    """
+    """Read a zip, which is a whole one of an agent; no agent is made of it."""
     from safe_files.archives import first_look
     from safe_files.limits import MAX_ARCHIVE_BYTES
 
@@ -146,12 +134,7 @@ _SCHEDULES = ("agents.schedules", "agents.common.schedules")
 def own_classes(
     algorithm: type[BaseAlgorithm], modules: Iterable[UserModule]
 ) -> Mapping[str, type]:
-    """Networks, optimizers and buffers of the user's, by their full names.
-
-    Args:
-        algorithm: the agent's class.
-        modules: those that the user typed.
-    """
+    """Networks, optimizers and buffers of the user's, by their full names."""
     from stable_baselines3.common.buffers import BaseBuffer
     from torch import nn, optim
 
@@ -188,11 +171,7 @@ _CLASS_KEYS = ("policy_class", "policy_kwargs", "replay_buffer_class", "rollout_
 
 
 def agent_class(algo: str) -> type[BaseAlgorithm]:
-    """Import the class of an agent.
-
-    Raises:
-        UserError: if it was registered wrongly, or its module cannot be imported.
-    """
+    """Import the class of an agent."""
     try:
         return load_algorithm(algo)
     except (ValueError, ImportError) as error:
@@ -312,9 +291,6 @@ def load_to_play(
 
     What only learning needs is left out: buffers, action noise, and schedules, which zips
     of older versions hold as functions. Observations may have other bounds.
-
-    Raises:
-        UserError: as `load_model`; and if the agent was trained on observations of another shape.
     """
     file = _read(model)
     if _is_hand_written(algo):
@@ -344,17 +320,7 @@ def load_to_play(
 
 
 def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None) -> None:
-    """Give an agent the replay buffer in a file, where it is of a kind that has one.
-
-    Args:
-        model: the agent.
-        path: the file.
-        run: the run that it is of, whose record says what it was, or None.
-
-    Raises:
-        UserError: if it cannot be read, is not as the run left it, or was filled by other
-            environments than the agent's.
-    """
+    """Give an agent the replay buffer in a file, where it is of a kind that has one."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
     from agents.dqn import MaskedReplayBuffer
@@ -395,31 +361,17 @@ _SETTINGS = (
 
 @dataclass(frozen=True)
 class Statistics:
-    """What a VecNormalize has seen, and how it normalises by it.
+    """What a VecNormalize has seen, and how it normalises by it."""
 
-    Attributes:
-        path: where they were read.
-        settings: arguments of VecNormalize.
-        observations: of each observation, or by key; None where observations are left alone.
-        returns: of discounted returns, by which rewards are divided.
-    """
-
-    path: Path
-    settings: Mapping[str, Any]
+    path: Path  # where they were read
+    settings: Mapping[str, Any]  # arguments of VecNormalize
+    # of each observation, or by key; None where observations are left alone
     observations: RunningMeanStd | dict[str, RunningMeanStd] | None
-    returns: RunningMeanStd
+    returns: RunningMeanStd  # of discounted returns, by which rewards are divided
 
 
 def read_statistics(path: Path, run: Run | None = None) -> Statistics:
-    """Read what VecNormalize saved, as data: nothing in the file is run.
-
-    Args:
-        path: the file.
-        run: the run that it is of, whose record says what it was, or None.
-
-    Raises:
-        UserError: if the file is no such thing, or not as the run left it.
-    """
+    """Read what VecNormalize saved, as data: nothing in the file is run."""
     from safe_files.limits import MAX_STATISTICS_BYTES
     from safe_files.vec_normalize import read_normalization
 
@@ -446,11 +398,7 @@ def normalising(spec: TrainSpec, settings: Mapping[str, Any]) -> TrainSpec:
 
 
 def take_over(env: VecEnv, statistics: Statistics) -> None:
-    """Let the VecNormalize in ``env`` go on from the statistics.
-
-    Raises:
-        UserError: if they are of other observations.
-    """
+    """Let the VecNormalize in ``env`` go on from the statistics."""
     from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
     normalization = unwrap_vec_normalize(env)
@@ -467,11 +415,7 @@ def take_over(env: VecEnv, statistics: Statistics) -> None:
 
 
 def with_normalised_rewards(env: VecEnv) -> VecEnv:
-    """The environments with rewards as training normalised them, episodes' returns too.
-
-    Raises:
-        UserError: if nothing normalises in ``env``.
-    """
+    """The environments with rewards as training normalised them, episodes' returns too."""
     from stable_baselines3.common.vec_env import VecMonitor, unwrap_vec_normalize
 
     normalization = unwrap_vec_normalize(env)
@@ -496,11 +440,7 @@ def _shapes(statistics: Any) -> Any:
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:
-    """Write the agent to ``path``, whole or not at all.
-
-    Raises:
-        NotFiniteError: if there are nan or infinity in what it has learnt: what is there stays.
-    """
+    """Write the agent to ``path``, whole or not at all."""
     from pipeline.finite_numbers import check_model
 
     check_model(model)

@@ -85,21 +85,7 @@ def wrapper_factory(
     where: str = "env_wrapper",
     folder: Path | None = None,
 ) -> Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None:
-    """What wraps an environment as ``spec`` says, the first wrapper innermost.
-
-    Args:
-        spec: a dotted name, a mapping from it to arguments, a list of either, or None.
-        extra_packages: packages that the user allows besides the usual ones.
-        where: begins every error message.
-        folder: that they may write to; None for a temporary one, see
-            `confined`.
-
-    Returns:
-        A function of the environment, or None if there is nothing to wrap.
-
-    Raises:
-        UserError: if a name is not that of a Gymnasium wrapper, or an argument does not fit it.
-    """
+    """What wraps an environment as ``spec`` says, the first wrapper innermost."""
     from gymnasium import Wrapper
 
     return _chain(spec, Wrapper, extra_packages, where, folder)
@@ -120,17 +106,7 @@ def vec_wrapper_factory(
 def callbacks(
     spec: Any, extra_packages: Sequence[str] = (), save_path: Path | str | None = None
 ) -> list[BaseCallback]:
-    """The callbacks that ``spec`` names.
-
-    Args:
-        spec: a dotted name, a mapping from it to arguments, a list of either, or None.
-        extra_packages: packages that the user allows besides the usual ones.
-        save_path: given to callbacks that have a ``save_path`` and are not told another; what
-            they are told lies inside it.
-
-    Raises:
-        UserError: if a name is not that of a callback, or an argument does not fit it.
-    """
+    """The callbacks that ``spec`` names."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     folder = None if save_path is None else Path(save_path)
@@ -142,16 +118,7 @@ def callbacks(
 def build_value(
     raw: Any, extra_packages: Sequence[str] = (), where: str = "hyperparameters"
 ) -> Any:
-    """Turn the names and schedules in nested values into classes and schedule objects.
-
-    Args:
-        raw: a value as `pipeline.settings.hyperparams.check_algorithm_kwargs` leaves it.
-        extra_packages: packages that the user allows besides the usual ones.
-        where: begins every error message.
-
-    Raises:
-        UserError: if a name is not that of a network module, an optimizer or a buffer.
-    """
+    """Turn the names and schedules in nested values into classes and schedule objects."""
     if isinstance(raw, dict):
         return {
             key: build_value(value, extra_packages, f"{where}: {key}") for key, value in raw.items()
@@ -335,9 +302,6 @@ def _is_installed(name: str) -> bool:
     """Whether a module's file is in the record of the installed distribution of that name.
 
     The packages around it are imported, so they have to be looked at before.
-
-    Raises:
-        ModuleNotFoundError: if there is no such module.
     """
     try:
         spec = importlib.util.find_spec(name)
@@ -398,16 +362,7 @@ def names_a_place(argument: str) -> bool:
 
 
 def confined(kwargs: Mapping[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """The arguments, with those that name a place leading into the folder.
-
-    Args:
-        kwargs: arguments of a wrapper or callback, nested ones too.
-        folder: the run's; None where there is none, for a temporary one that goes with the process.
-        where: begins every error message.
-
-    Raises:
-        UserError: if one leads out of the folder.
-    """
+    """The arguments, with those that name a place leading into the folder."""
     return {
         name: _confined(name, value, folder, f"{where}: {name}") for name, value in kwargs.items()
     }
@@ -465,15 +420,6 @@ def build_algorithm_kwargs(
 
     Beyond `check_algorithm_kwargs` and `build_value`, the policy must exist and know what
     ``policy_kwargs`` says, where the class tells by ``policy_aliases`` which policies it has.
-
-    Args:
-        algorithm: the agent's class.
-        kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
-        where: begins every error message.
-        extra_packages: packages that the user allows besides the usual ones.
-
-    Raises:
-        UserError: naming the argument, and what it must be.
     """
     parameters = algorithm_parameters(algorithm)
     checked = check_algorithm_kwargs(kwargs, parameters, where)
@@ -513,12 +459,7 @@ def needs_policy(algorithm: type[BaseAlgorithm], kwargs: Mapping[str, Any]) -> b
 
 
 def default_policy(algorithm: type[BaseAlgorithm], is_dict: bool) -> str:
-    """The policy of an agent for which none is said.
-
-    Args:
-        algorithm: the agent's class.
-        is_dict: whether it observes a dictionary.
-    """
+    """The policy of an agent for which none is said."""
     prefix = "MultiInput" if is_dict else "Mlp"
     known = algorithm.policy_aliases
     fitting = (name for name in known if name.startswith(prefix))
@@ -570,11 +511,7 @@ def _build(
 
 
 def check_action_noise(hyperparams: Hyperparams, algorithm: type[BaseAlgorithm], algo: str) -> None:
-    """Make sure that the agent takes the noise that is asked for.
-
-    Raises:
-        UserError: if it takes none.
-    """
+    """Make sure that the agent takes the noise that is asked for."""
     if hyperparams.noise_type is not None and "action_noise" not in constructor_parameters(
         algorithm
     ):

@@ -54,58 +54,42 @@ _KEYWORDS: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class ComponentSpec:
-    """A wrapper or callback that an entry asks for.
+    """A wrapper or callback that an entry asks for."""
 
-    Attributes:
-        name: the dotted name of its class.
-        kwargs: arguments of its constructor.
-    """
-
-    name: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
+    name: str  # the dotted name of its class
+    kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of its constructor
 
 
 @dataclass(frozen=True)
 class Hyperparams:
-    """One entry, the special keys apart from the algorithm's arguments.
+    """One entry, the special keys apart from the algorithm's arguments."""
 
-    Attributes:
-        n_timesteps: environment steps to train for; None if counted in episodes or not said.
-        n_episodes: episodes to train for; never set together with ``n_timesteps``.
-        n_envs: environments to train on at once.
-        normalize: arguments of VecNormalize, the algorithm's ``gamma`` included; None for without.
-        env_wrapper: wrappers of every environment, the innermost first.
-        train_env_wrapper: wrappers of the training environments alone, around those.
-        vec_env_wrapper: wrappers of the vectorised environment.
-        callback: callbacks of the training.
-        env_kwargs: arguments of every environment.
-        train_env_kwargs: further arguments of the training environments alone.
-        eval_env_kwargs: further arguments of the evaluation environments alone.
-        frame_stack: how many observations to stack, or None.
-        monitor_kwargs: arguments of Monitor.
-        noise_type: action noise, for algorithms that take an ``action_noise``.
-        noise_std: its standard deviation. Without a ``noise_type`` the key is an argument of the
-            algorithm like any other.
-        flush_denormal: let the processor take numbers below 1e-38 for zero.
-        algorithm: everything else: arguments of the algorithm's constructor, not checked yet.
-    """
-
+    # environment steps to train for; None if counted in episodes or not said
     n_timesteps: int | None = None
-    n_episodes: int | None = None
-    n_envs: int = 1
+    n_episodes: int | None = None  # episodes to train for; never set together with ``n_timesteps``
+    n_envs: int = 1  # environments to train on at once
+    # arguments of VecNormalize, the algorithm's ``gamma`` included; None for without
     normalize: dict[str, Any] | None = None
+    # wrappers of every environment, the innermost first
     env_wrapper: tuple[ComponentSpec, ...] = ()
+    # wrappers of the training environments alone, around those
     train_env_wrapper: tuple[ComponentSpec, ...] = ()
-    vec_env_wrapper: tuple[ComponentSpec, ...] = ()
-    callback: tuple[ComponentSpec, ...] = ()
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    vec_env_wrapper: tuple[ComponentSpec, ...] = ()  # wrappers of the vectorised environment
+    callback: tuple[ComponentSpec, ...] = ()  # callbacks of the training
+    env_kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of every environment
+    # further arguments of the training environments alone
     train_env_kwargs: dict[str, Any] = field(default_factory=dict)
+    # further arguments of the evaluation environments alone
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
-    frame_stack: int | None = None
-    monitor_kwargs: dict[str, Any] = field(default_factory=dict)
+    frame_stack: int | None = None  # how many observations to stack, or None
+    monitor_kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of Monitor
+    # action noise, for algorithms that take an ``action_noise``
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
+    # its standard deviation. Without a ``noise_type`` the key is an argument of the algorithm like
+    # any other.
     noise_std: float | None = None
-    flush_denormal: bool = False
+    flush_denormal: bool = False  # let the processor take numbers below 1e-38 for zero
+    # everything else: arguments of the algorithm's constructor, not checked yet
     algorithm: dict[str, Any] = field(default_factory=dict)
 
 
@@ -160,16 +144,7 @@ def _special_keys(entry: Mapping[str, Any]) -> list[str]:
 
 
 def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
-    """Read wrappers or callbacks in rl_zoo3's forms.
-
-    Args:
-        spec: the dotted name of a class, a mapping from it to its arguments, a list of either, or
-            what this function returned before.
-        where: begins every error message.
-
-    Raises:
-        UserError: if the form is another.
-    """
+    """Read wrappers or callbacks in rl_zoo3's forms."""
     items = spec if isinstance(spec, list | tuple) else [] if spec is None else [spec]
     return tuple(_component_spec(item, where) for item in items)
 

@@ -230,12 +230,9 @@ _CLASS_NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)*")
 
 @dataclass(frozen=True)
 class ScheduleSpec:
-    """How a number changes over training, from ``start`` at the first step to ``end`` at the last.
+    """How a number changes over training, from ``start`` at first to ``end`` at the last step."""
 
-    Attributes:
-        kind: whether it moves by a constant amount a step, or by a constant factor.
-    """
-
+    # whether it moves by a constant amount a step, or by a constant factor
     kind: Literal["linear", "exponential"]
     start: float
     end: float
@@ -277,11 +274,7 @@ def coerce(value: Any, annotation: Any, where: str) -> Any:
 
 
 def parse_schedule(text: str, where: str) -> ScheduleSpec:
-    """Read ``lin_0.001`` (to 0), ``lin_0.001_0.0001`` or ``exp_0.001_0.0001``.
-
-    Raises:
-        UserError: if the text is none of these.
-    """
+    """Read ``lin_0.001`` (to 0), ``lin_0.001_0.0001`` or ``exp_0.001_0.0001``."""
     match = _SCHEDULE.fullmatch(text)
     try:
         start, end = (_finite(part or "0") for part in match.group(2, 3)) if match else (0.0, 0.0)
@@ -560,21 +553,7 @@ def check_arguments(
     what: str = "argument",
     also_known: Iterable[str] = (),
 ) -> dict[str, Any]:
-    """Check arguments by name and type.
-
-    Args:
-        kwargs: the arguments as they stand in a file or on the command line.
-        parameters: those that exist; with ``**kwargs`` among them any name is allowed.
-        where: begins every error message.
-        what: what an argument is called there.
-        also_known: further names that a message may suggest.
-
-    Returns:
-        The arguments, each as its annotation asks for, see `coerce`.
-
-    Raises:
-        UserError: if a name is not known, naming the nearest, or a type does not fit.
-    """
+    """Check arguments by name and type."""
     admits_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     result = {}
     for name, value in kwargs.items():
@@ -586,11 +565,7 @@ def check_arguments(
 
 
 def check_range(name: str, value: object, where: str) -> None:
-    """Refuse a number, or an end of a schedule, outside of `RANGES`, or that no array can hold.
-
-    Raises:
-        UserError: saying what the bounds are.
-    """
+    """Refuse a number, or an end of a schedule, outside of `RANGES`, or that no array can hold."""
     if isinstance(value, ScheduleSpec):
         check_range(name, value.start, where)
         check_range(name, value.end, where)

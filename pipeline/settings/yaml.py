@@ -29,18 +29,7 @@ _MAX_BYTES = 256 * 1024
 
 
 def parse_yaml(content: str | bytes, where: str) -> Any:
-    """Read one YAML document.
-
-    Args:
-        content: the document; bytes may be UTF-8 or UTF-16.
-        where: the file it comes from, for error messages.
-
-    Returns:
-        Nested lists, dictionaries, texts, numbers, booleans and None.
-
-    Raises:
-        UserError: if it is not YAML, holds anything but plain data, or a key twice.
-    """
+    """Read one YAML document."""
     return _parse(content, where, StrictLoader)
 
 
@@ -61,11 +50,7 @@ def _parse(content: str | bytes, where: str, loader: type[StrictLoader]) -> Any:
 
 
 def read_yaml(path: Path) -> Any:
-    """Read the one YAML document in a file; see `parse_yaml`.
-
-    Raises:
-        UserError: if the file cannot be read, or is not such a document.
-    """
+    """Read the one YAML document in a file; see `parse_yaml`."""
     return _parse(_content(path), str(path), StrictLoader)
 
 
@@ -73,9 +58,6 @@ def read_saved_settings(path: Path) -> dict[str, Any]:
     """Read the settings that a run folder keeps, ours or rl_zoo3's; see `parse_yaml`.
 
     rl_zoo3 writes them as an OrderedDict with the name of its class, the one tag that is admitted.
-
-    Raises:
-        UserError: if the file cannot be read, or does not map names to plain data.
     """
     value = _parse(_content(path), str(path), SavedSettingsLoader)
     if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
@@ -94,11 +76,7 @@ def _content(path: Path) -> bytes:
 
 
 def read_settings_text(path: Path) -> str:
-    """The text of a file of settings, for what needs no more than a look at it.
-
-    Raises:
-        UserError: if the file cannot be read, or is no text in UTF-8.
-    """
+    """The text of a file of settings, for what needs no more than a look at it."""
     try:
         return _content(path).decode("utf-8")
     except UnicodeDecodeError as error:
