@@ -218,7 +218,7 @@ _INFINITY = "1e999"
 
 
 def plain(value: Any) -> Any:
-    """The value as JSON gives it back: plain numbers for NumPy's, lists for tuples, None for nan."""
+    """The value as JSON gives it back: Python's numbers, tuples as lists, nan as None."""
     match value:
         case Mapping():
             return {_key(key): plain(item) for key, item in value.items()}
