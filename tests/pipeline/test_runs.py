@@ -1,6 +1,7 @@
 """Run folders: each run has one of its own, and is found again."""
 
 import json
+import platform
 import shutil
 import subprocess
 import sys
@@ -247,3 +248,25 @@ def test_a_damaged_info_is_told_and_not_written_over(tmp_path, content):
         with pytest.raises(UserError, match=r"run\.json is damaged: \S"):
             act()
     assert run.info_path.read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("content", "processor"),
+    [
+        ("processor\t: 0\nmodel name\t: Fast CPU @ 3GHz\nmodel name\t: other\n", "Fast CPU @ 3GHz"),
+        ("processor\t: 0\n", "arm"),
+        (None, "arm"),
+    ],
+)  # fmt: skip
+def test_the_processor_is_named_where_it_is_told(tmp_path, monkeypatch, content, processor):
+    if content is not None:
+        (tmp_path / "cpuinfo").write_text(content)
+    monkeypatch.setattr(runs, "_PROCESSORS", tmp_path / "cpuinfo")
+    monkeypatch.setattr(platform, "processor", lambda: "arm")
+    runs.recorded_machine.cache_clear()
+    machine = runs.recorded_machine()
+    runs.recorded_machine.cache_clear()
+    assert machine["processor"] == processor
+    assert machine["system"].startswith(platform.system())
+    assert int(machine["cores"]) >= 1
+    assert platform.node() not in str(machine)
