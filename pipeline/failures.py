@@ -2,7 +2,8 @@
 
 A machine that has nothing left to give; code of the user's that raises what ends a program;
 libraries that give up in the midst of a training. Whatever it was, everything is closed, the reason
-noted, and the folder left true.
+noted, and the folder left true. Commands load this before their first words: what takes long to
+load is imported where it is needed.
 """
 
 from __future__ import annotations
@@ -16,11 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError, one_line
-from pipeline.files import DISK_ERRORS
-from pipeline.locks import FolderGoneError, is_gone
-from pipeline.runs import INTERRUPTED
 from pipeline.stopping import Stopped, current
-from pipeline.worker_processes import close_environments
 
 if TYPE_CHECKING:
     from pipeline.preparation import Training
@@ -126,6 +123,8 @@ def blame_settings(algo: str, model: Any, error: Exception) -> None:
 @exits_as_mistakes()
 def close(training: Training) -> None:
     """Close what is open, each part also where another cannot be closed."""
+    from pipeline.worker_processes import close_environments
+
     model = training.model
     with ExitStack() as stack:
         if model.env is not None:
@@ -143,6 +142,10 @@ def has_begun(training: Training) -> bool:
 
 def give_up(training: Training, error: BaseException) -> None:
     """Note the reason; or remove the folder, where the agent failed before its first step."""
+    from pipeline.files import DISK_ERRORS
+    from pipeline.locks import FolderGoneError, is_gone
+    from pipeline.runs import INTERRUPTED
+
     run, is_new = training.run, not training.keeping.goes_on
     if is_gone(run.path):
         raise FolderGoneError(run.path) from error
@@ -166,6 +169,8 @@ def give_up(training: Training, error: BaseException) -> None:
 
 def is_of_the_machine(error: BaseException | None) -> bool:
     """Whether a run has failed by a full disk or memory, and by no fault of its own."""
+    from pipeline.files import DISK_ERRORS
+
     while error is not None:
         is_of_disk = isinstance(error, OSError) and error.errno in DISK_ERRORS
         if is_of_disk or exhaustion(error) is not None:
