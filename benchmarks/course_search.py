@@ -30,8 +30,7 @@ from pipeline.auto_settings import resolved_spec
 from pipeline.environments import make_training_env
 from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator
 from pipeline.preparation import algorithm_kwargs
-from pipeline.settings.hyperparam_entries import override, read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.settings.hyperparams import override, read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 from tuning.search_spaces import read_search_space
 

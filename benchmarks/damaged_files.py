@@ -37,9 +37,8 @@ from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from pipeline.models.continuation import agent_to_continue
-from pipeline.models.model_choice import ChosenModel, ModelRequest, choose_model
-from pipeline.models.model_loading import load_model
+from pipeline.models.choose import ChosenModel, ModelRequest, agent_to_continue, choose_model
+from pipeline.models.load import load_model
 from safe_files.tensors import tensors_in
 
 REFUSED, RIGHT, WRONG, ANOTHER, BROKEN = "refused", "right", "wrong", "another run", "broken"

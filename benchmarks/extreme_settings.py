@@ -80,7 +80,7 @@ class Case:
 def _small(algo: str, changed: str) -> list[str]:
     """Settings that let an agent learn within the few steps."""
     from agents import load_algorithm
-    from pipeline.settings.constructor_arguments import algorithm_parameters
+    from pipeline.settings.values import algorithm_parameters
 
     known = algorithm_parameters(load_algorithm(algo))
     small = {"learning_starts": 20, "buffer_size": 1000, "batch_size": 16}
@@ -92,7 +92,7 @@ def _small(algo: str, changed: str) -> list[str]:
 def cases() -> Iterator[Case]:
     """Every number of every agent, at the ends of its type."""
     from agents import ALGORITHMS, load_algorithm
-    from pipeline.settings.constructor_arguments import algorithm_parameters
+    from pipeline.settings.values import algorithm_parameters
 
     for algo in ALGORITHMS:
         env_id = _environment(algo)

@@ -66,7 +66,7 @@ def final_return(case: Case, seed: int) -> float:
     from pipeline.environments import make_training_env
     from pipeline.evaluation.exact import exact_evaluator
     from pipeline.preparation import algorithm_kwargs
-    from pipeline.settings.hyperparam_entries import override, read_hyperparams
+    from pipeline.settings.hyperparams import override, read_hyperparams
 
     th.set_num_threads(1)
     changes = {"n_timesteps": case.n_timesteps, "n_envs": case.n_envs}

@@ -21,7 +21,7 @@ from rich.table import Table
 from pipeline.auto_settings import resolved_spec
 from pipeline.resuming import state_saver
 from pipeline.resuming.state_saver import StateSaver
-from pipeline.settings.hyperparam_entries import override, read_hyperparams
+from pipeline.settings.hyperparams import override, read_hyperparams
 from pipeline.training import train
 
 CASES: tuple[tuple[str, str, int, dict[str, Any]], ...] = (

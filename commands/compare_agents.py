@@ -21,7 +21,7 @@ from commands.flag_values import (
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, command_line, program_name
 from commands.places import Place, add_limit_flags, add_place_flags, give_way, held, place_of
 from commands.streams import go_on_unread
-from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.failures import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
 from pipeline.signs_of_life import doing
 from pipeline.stopping import stops_noticed
@@ -193,7 +193,7 @@ def _compare(args: argparse.Namespace) -> int:
     from experiments.child_processes import end_server
     from experiments.plan import plan
     from experiments.run_limits import RunLimits
-    from pipeline.folder_lock import folder_lock, told_if_gone
+    from pipeline.locks import folder_lock, told_if_gone
     from safe_files.regular_files import take_up
 
     go_on_unread()
@@ -296,7 +296,7 @@ def _prepare(
 
 def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], float]]:
     """On which engines the missing runs of networks will train, and what each run takes."""
-    from pipeline.plain_runs import NETWORKS
+    from pipeline.train_spec import NETWORKS
 
     missing: dict[tuple[str, str], list[PlannedRun]] = {}
     for run in planned:

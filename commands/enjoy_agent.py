@@ -19,12 +19,12 @@ from commands.flag_values import (
 )
 from commands.parsing import MODULES_HELP, OneLineParser, as_called, called_as, program_name
 from commands.streams import go_on_unread
-from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.failures import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
-    from pipeline.models.model_choice import ChosenModel, ModelRequest
+    from pipeline.models.choose import ChosenModel, ModelRequest
 
 FRAMES = whole_number(1, 60)
 STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
@@ -186,7 +186,7 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest, film: Path | Non
     console.print(about, soft_wrap=True)
     with doing(console, "loading the libraries"), loading_libraries():
         from commands.playing_output import PlayingRequest, play
-        from pipeline.models.model_choice import with_statistics
+        from pipeline.models.choose import with_statistics
 
         chosen = with_statistics(found, wanted.statistics)
     if film is not None or args.reward_log:
@@ -210,8 +210,8 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest, film: Path | Non
 
 def _found_model(wanted: ModelRequest) -> ChosenModel:
     from pipeline.errors import UserError
-    from pipeline.models.model_choice import find_model
-    from pipeline.run_folder import NoRunError
+    from pipeline.models.choose import find_model
+    from pipeline.runs import NoRunError
 
     try:
         return find_model(wanted)

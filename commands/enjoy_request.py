@@ -8,9 +8,9 @@ from secrets import randbelow
 
 from commands.parsing import check_device
 from pipeline.errors import UserError
-from pipeline.models.model_choice import ModelRequest
-from pipeline.models.model_finding import Which
-from pipeline.settings.literals import parse_assignments
+from pipeline.models.choose import ModelRequest
+from pipeline.models.find import Which
+from pipeline.settings.values import parse_assignments
 from pipeline.user_modules import import_typed
 
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from agents import ALGORITHMS, load_algorithm
 from pipeline.errors import OTHER_NAMES, did_you_mean
-from pipeline.settings.constructor_arguments import RANGES
 from pipeline.settings.hyperparams import SPECIAL_KEYS
+from pipeline.settings.values import RANGES
 
 _SEARCH = "hyperparameters are not searched for here, but by the command tune: see tune --help"
 _NO_WANDB = "Weights & Biases is not supported; -tb DIR writes TensorBoard logs"

@@ -29,7 +29,7 @@ def build_parser() -> argparse.ArgumentParser:
 def main() -> int:
     """Parse the arguments and print what the file holds; the exit code."""
     path = Path(build_parser().parse_args().model)
-    from pipeline.models.admitted_classes import own_makers
+    from pipeline.models.load import own_makers
     from safe_files import inspect_model
 
     try:

@@ -11,7 +11,7 @@ from agents.algorithm_entries import is_bandit
 from commands.terminal import table_console
 from envs.action_masks import has_masks
 from pipeline.environments import make_env
-from pipeline.settings.hyperparam_entries import entry_names
+from pipeline.settings.hyperparams import entry_names
 
 
 def print_lists() -> None:

@@ -68,7 +68,7 @@ def main() -> int:
 
 def _pack(path: Path, target: Path | None, say: Callable[[str], object]) -> None:
     """Pack a run or a study, and say how it is played on any machine."""
-    from pipeline.models.recorded_runs import run_in
+    from pipeline.models.find import run_in
     from pipeline.module_records import COPIES
     from pipeline.packing.model_card import to_type
     from pipeline.packing.pack_files import default_target, pack

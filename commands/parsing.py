@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 
 from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
-from pipeline.exhaustion import exhaustion
+from pipeline.failures import exhaustion
 from pipeline.stopping import default_for_signals, n_stops
 from safe_files.refusals import UnsafeFileError
 

@@ -16,16 +16,14 @@ from rich.console import Console
 from commands.live_show import LiveShow
 from commands.run_output import describe, describe_measured, episodes, print_refusal
 from envs.layout import action_names
-from pipeline.environment_mistakes import lacking_packages_told
+from pipeline.environments import lacking_packages_told
 from pipeline.errors import UserError
-from pipeline.evaluation.asked_policies import why_not_exact
-from pipeline.evaluation.bracketed import bracketed_yardstick
 from pipeline.evaluation.exact import exact_evaluator, model_refusal
-from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.policies import why_not_exact
+from pipeline.evaluation.sampled import Evaluation, bracketed_yardstick
 from pipeline.filming import write_film
-from pipeline.models.model_choice import ChosenModel
-from pipeline.models.model_loading import load_to_play
-from pipeline.models.normalization import with_normalised_rewards
+from pipeline.models.choose import ChosenModel
+from pipeline.models.load import load_to_play, with_normalised_rewards
 from pipeline.playing import (
     KEPT_MODES,
     FrameTaker,

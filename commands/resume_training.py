@@ -22,7 +22,7 @@ from pipeline.resuming.unfinished_runs import (
     run_of_spec,
     tell_changes,
 )
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.stopping import StopRequest, current
 from pipeline.train_spec import TrainSpec
 
@@ -51,7 +51,7 @@ def resume_run(args: argparse.Namespace, stop: StopRequest) -> int:
         UserError: if there is none, it cannot go on, or another process is at work on it.
     """
     _check_given(args)
-    from pipeline.models.recorded_runs import run_in
+    from pipeline.models.find import run_in
     from pipeline.user_modules import import_typed
 
     if args.resume:
@@ -103,8 +103,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
         writing_watched,
     )
     from commands.terminal import TextConsole
-    from pipeline.run_folder import INTERRUPTED
-    from pipeline.run_lock import at_work_on, check_left
+    from pipeline.runs import INTERRUPTED, at_work_on, check_left
 
     spec = replace(spec, verbose=args.verbose, progress=args.progress)
     go_on_unread()

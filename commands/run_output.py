@@ -16,8 +16,8 @@ from commands.parsing import called_as
 from commands.terminal import print_rows
 from pipeline.errors import UserError
 from pipeline.module_records import as_flag
-from pipeline.run_folder import FINISHED, Run, numbered_runs
-from pipeline.settings.coercion import parse_schedule
+from pipeline.runs import FINISHED, Run, numbered_runs
+from pipeline.settings.values import parse_schedule
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:

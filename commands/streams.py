@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any, TextIO
 
-from pipeline.foreign_exits import OwnExit
+from pipeline.failures import OwnExit
 
 
 class Output:

@@ -25,8 +25,8 @@ from experiments.study import (
 from pipeline.agent_checks import with_engine
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError, unknown
-from pipeline.run_files import environment_name
-from pipeline.settings.literals import parse_assignments
+from pipeline.runs import environment_name
+from pipeline.settings.values import parse_assignments
 from pipeline.user_modules import import_typed
 
 

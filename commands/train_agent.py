@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from commands.parsing import command_line, exit_code
 from commands.streams import go_on_unread
 from commands.train_flags import RESUMING, build_parser
-from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.failures import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
 from pipeline.stopping import StopRequest, stops_noticed
 
@@ -74,8 +74,7 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
         with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
                 from pipeline.resuming.state_keeping import StateKeeping
-                from pipeline.run_folder import INTERRUPTED
-                from pipeline.run_lock import at_work_on
+                from pipeline.runs import INTERRUPTED, at_work_on
                 from pipeline.training import carry_out, prepare
 
             activity.now("making the environments and the agent")

@@ -12,11 +12,10 @@ from typing import Any
 from commands.parsing import check_device, check_tensorboard
 from pipeline.agent_checks import check_algorithm, check_fit, with_engine
 from pipeline.auto_settings import resolved_spec, training_follows
-from pipeline.environments import check_env_id
+from pipeline.environments import check_env_id, with_logs_located, with_maps_read
 from pipeline.errors import UserError
-from pipeline.map_contents import with_logs_located, with_maps_read
-from pipeline.settings.hyperparam_entries import NoEntryError, override, read_hyperparams
-from pipeline.settings.literals import parse_assignments
+from pipeline.settings.hyperparams import NoEntryError, override, read_hyperparams
+from pipeline.settings.values import parse_assignments
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_typed
 
@@ -36,7 +35,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     raw = with_logs_located(args.env, with_maps_read(args.env, raw))
     trained_agent = None
     if args.trained_agent:
-        from pipeline.models.continuation import agent_to_continue
+        from pipeline.models.choose import agent_to_continue
 
         trained_agent = agent_to_continue(Path(args.trained_agent))
     # A flag that has the name of a field goes there as it is.

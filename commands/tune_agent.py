@@ -14,7 +14,7 @@ from commands.places import Place, place_of
 from commands.streams import go_on_unread
 from commands.tune_flags import build_parser
 from commands.tune_how import How
-from pipeline.foreign_exits import exits_as_mistakes
+from pipeline.failures import exits_as_mistakes
 from pipeline.signs_of_life import doing
 from pipeline.stopping import stops_noticed
 
@@ -49,7 +49,7 @@ def _tune(args: argparse.Namespace) -> int:
 
             how.place(root).get_ready([shipped_run(tuning, root)])
             from commands.tune_driving import drive
-            from pipeline.folder_lock import told_if_gone
+            from pipeline.locks import told_if_gone
             from tuning.opening import open_tuning
             from tuning.trial_storage import failing_in_a_line
 

@@ -24,7 +24,7 @@ from commands.tune_progress import TuningProgress
 from experiments.launching import EarlyResults
 from experiments.plan import plan
 from experiments.run_folders import remove_dead_drafts
-from pipeline.folder_lock import FolderInUseError, folder_lock
+from pipeline.locks import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
 from tuning.opening import OpenTuning
 from tuning.record import FILE as RECORD

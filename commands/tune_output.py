@@ -12,8 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from commands.study_output import say
-from pipeline.plain_runs import NETWORKS
 from pipeline.signs_of_life import duration
+from pipeline.train_spec import NETWORKS
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome, Retested
 from tuning.trial_queue import FAILURE, figures_of, seconds_of

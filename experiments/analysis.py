@@ -535,8 +535,8 @@ def advice_on(runs: Sequence[PlannedRun]) -> list[tuple[str, str | None] | None]
 
 def _advice_on(planned: PlannedRun) -> tuple[str, str | None] | None:
     from pipeline.evaluation.advice import advice
-    from pipeline.evaluation.kept_evaluators import evaluator_of
-    from pipeline.models.model_loading import load_model
+    from pipeline.evaluation.exact import evaluator_of
+    from pipeline.models.load import load_model
 
     run, spec = planned.run, planned.spec
     with suppress(UserError, OSError):

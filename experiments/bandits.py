@@ -19,13 +19,17 @@ from numpy.typing import NDArray
 from experiments.plan import PlannedRun
 from experiments.run_files import read_outcome
 from mdp.array_types import AnyInts, Floats, Ints
-from pipeline.array_files import read_arrays
+from pipeline.digests import DamagedFileError, read_arrays
 from pipeline.environments import make_single_env
-from pipeline.file_digests import DamagedFileError
 from pipeline.files import replacing
-from pipeline.run_files import PULLS_FILE
-from pipeline.run_folder import FINISHED, Run
-from pipeline.run_record import recorded_machine, recorded_versions, write_settings
+from pipeline.runs import (
+    FINISHED,
+    PULLS_FILE,
+    Run,
+    recorded_machine,
+    recorded_versions,
+    write_settings,
+)
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:

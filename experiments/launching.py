@@ -31,13 +31,12 @@ from experiments.plan import PlannedRun
 from experiments.run_folders import draft_path, leave_drafts, remove_dead_drafts, run_name
 from experiments.run_limits import RunLimits
 from experiments.study import StudySpec, file_name
+from pipeline.digests import DamagedFileError
 from pipeline.errors import one_line
-from pipeline.file_digests import DamagedFileError
 from pipeline.files import write_text
-from pipeline.folder_lock import FolderGoneError, is_gone
 from pipeline.library_loading import loading_libraries
-from pipeline.plain_runs import FAMILIES, NETWORKS, is_plain
-from pipeline.train_spec import TrainSpec
+from pipeline.locks import FolderGoneError, is_gone
+from pipeline.train_spec import FAMILIES, NETWORKS, TrainSpec, is_plain
 from safe_files.regular_files import hold
 
 if TYPE_CHECKING:

@@ -23,17 +23,20 @@ from experiments.study import (
 )
 from pipeline.agent_checks import check_algorithm, check_fit
 from pipeline.auto_settings import resolved_spec, training_follows
-from pipeline.environments import check_env_id, make_single_env, usual_kwargs
+from pipeline.digests import DamagedFileError
+from pipeline.environments import check_env_id, make_single_env, usual_kwargs, with_maps_read
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError
-from pipeline.json_text import plain
-from pipeline.map_contents import with_maps_read
+from pipeline.files import plain
 from pipeline.memory_limits import check_pulls
-from pipeline.models.model_loading import agent_class
-from pipeline.run_files import environment_name
-from pipeline.run_folder import FINISHED, ReadRun, Run
-from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams, seeds_tuned_on
-from pipeline.settings.hyperparams import Hyperparams, split
+from pipeline.models.load import agent_class
+from pipeline.runs import FINISHED, ReadRun, Run, environment_name
+from pipeline.settings.hyperparams import (
+    Hyperparams,
+    NoEntryError,
+    read_hyperparams,
+    seeds_tuned_on,
+    split,
+)
 from pipeline.train_spec import TrainSpec, completed
 
 # What a run of the same settings may differ in: where it is written, what is shown meanwhile, and

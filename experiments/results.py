@@ -25,7 +25,7 @@ from experiments.run_files import (
 )
 from experiments.study import StudySpec
 from mdp.array_types import Floats
-from pipeline.file_digests import DamagedFileError
+from pipeline.digests import DamagedFileError
 from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import (
     Band,

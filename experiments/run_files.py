@@ -20,10 +20,9 @@ from numpy.typing import NDArray
 
 from experiments.plan import PlannedRun
 from mdp.array_types import Floats
-from pipeline.array_files import read_arrays
+from pipeline.digests import DamagedFileError, read_arrays
 from pipeline.errors import one_line
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from safe_files.archives import read_members
 from safe_files.refusals import UnsafeFileError
 

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING
 
 from experiments.plan import PlannedRun
 from experiments.study import StudySpec
-from pipeline import liveness
+from pipeline import locks
+from pipeline.digests import STATE_FOLDER, DamagedFileError
 from pipeline.errors import UserError, shown
-from pipeline.file_digests import STATE_FOLDER, DamagedFileError
 from pipeline.files import portable_name, put_in_place, settle, sync_together
-from pipeline.folder_clock import seconds_silent
+from pipeline.locks import seconds_silent
 from pipeline.resuming.state_folder import has_state
 from pipeline.signs_of_life import Tell, tell_nobody
 
@@ -52,7 +52,7 @@ def draft_path(root: Path, planned: PlannedRun) -> Path:
 
 
 def _own_mark() -> str:
-    mark = liveness.mark()
+    mark = locks.mark()
     return f"{mark['pid']}-{mark['began'] or 0}-{_place(mark)}"
 
 
@@ -68,10 +68,10 @@ def _place(mark: dict[str, object]) -> str:
 
 def _is_dead(draft: Path) -> bool:
     """Whether the process that wrote a draft is certainly gone."""
-    mark, owner = liveness.mark(), _OWNER.match(draft.name)
+    mark, owner = locks.mark(), _OWNER.match(draft.name)
     if owner is not None and owner[3] == _place(mark):
         began = int(owner[2]) or None
-        return liveness.is_alive({**mark, "pid": int(owner[1]), "began": began}) is False
+        return locks.is_alive({**mark, "pid": int(owner[1]), "began": began}) is False
     try:
         return seconds_silent(draft) > SECONDS_OF_SILENCE
     except OSError:

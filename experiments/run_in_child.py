@@ -14,14 +14,13 @@ from experiments.run_folders import (
     put_run_in_place,
     take_over,
 )
-from pipeline.broken_runs import is_of_the_machine
 from pipeline.errors import UserError
-from pipeline.files import kept_later
-from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
+from pipeline.failures import is_of_the_machine
+from pipeline.locks import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.resuming.state_folder import remove_states
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.unfinished_runs import go_on
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.signs_of_life import Heartbeat
 from pipeline.training import train
 from pipeline.user_modules import import_again
@@ -37,8 +36,7 @@ def do_run(planned: PlannedRun, draft: Path, command: str) -> None:
     heart = Heartbeat(lambda: give_sign(draft), SECONDS_BETWEEN_SIGNS)
     heart.start()
     try:
-        with kept_later(draft):  # what a power cut leaves of it without a state is begun anew
-            _do_or_go_on(planned, draft, command)
+        _do_or_go_on(planned, draft, command)
     finally:
         heart.stop()
     put_run_in_place(planned, draft)

@@ -17,14 +17,12 @@ import yaml
 
 from agents import ALGORITHMS
 from experiments import run_limits
-from pipeline.environments import check_env_id
+from pipeline.environments import check_env_id, with_maps_read
 from pipeline.errors import UserError, shown, unknown
-from pipeline.files import LONGEST_NAME, portable_name, write_text
-from pipeline.json_text import plain
-from pipeline.map_contents import with_maps_read
-from pipeline.settings.coercion import coerce
-from pipeline.settings.hyperparam_entries import override
-from pipeline.settings.strict_yaml import key_lines, read_yaml
+from pipeline.files import LONGEST_NAME, plain, portable_name, write_text
+from pipeline.settings.hyperparams import override
+from pipeline.settings.values import coerce
+from pipeline.settings.yaml import key_lines, read_yaml
 from pipeline.user_modules import UserModule
 
 Metric = Literal["final", "best", "area", "training", "last_episodes", "regret"]

@@ -17,7 +17,7 @@ from typing import Any
 
 from experiments.plan import PlannedRun
 from mdp.code_cache import PACKAGES
-from pipeline.models.model_loading import agent_class
+from pipeline.models.load import agent_class
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule, import_again

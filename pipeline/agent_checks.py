@@ -10,7 +10,7 @@ from agents.algorithm_entries import is_bandit
 from envs.action_masks import has_masks
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError, unknown
-from pipeline.settings.constructor_arguments import algorithm_parameters
+from pipeline.settings.values import algorithm_parameters
 from pipeline.train_spec import TrainSpec
 
 

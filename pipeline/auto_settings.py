@@ -40,32 +40,20 @@ Env = gym.Env[Any, Any]
 
 @dataclass(frozen=True)
 class Found:
-    """A number in the place of the word.
+    """A number in the place of the word."""
 
-    Attributes:
-        value: the setting.
-        how: the formula with its numbers, for people.
-    """
-
-    value: Any
-    how: str
+    value: Any  # the setting
+    how: str  # the formula with its numbers, for people
 
 
 @dataclass(frozen=True)
 class _Asked:
-    """A setting that says ``auto``.
+    """A setting that says ``auto``."""
 
-    Attributes:
-        env: the environment that the agent is judged on.
-        amount: what follows the word, as in ``auto_1000``; empty for nothing.
-        n_timesteps: of the training, where that is known already.
-        where: begins every error message.
-    """
-
-    env: Env
-    amount: str
-    n_timesteps: int | None
-    where: str
+    env: Env  # the environment that the agent is judged on
+    amount: str  # what follows the word, as in ``auto_1000``; empty for nothing
+    n_timesteps: int | None  # of the training, where that is known already
+    where: str  # begins every error message
 
     def pairs(self) -> tuple[int, int]:
         """The numbers of states and of actions."""

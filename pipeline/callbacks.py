@@ -15,8 +15,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import ConstantSchedule
 
 from agents.common.callback_horizons import BlockCallback, Horizon
-from pipeline.models.companions import replay_buffer_path, statistics_path
-from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
+from pipeline.models.find import replay_buffer_path, statistics_path
+from pipeline.models.load import save_model, save_normalization, save_replay_buffer
 from pipeline.stopping import current
 
 

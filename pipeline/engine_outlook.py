@@ -16,10 +16,9 @@ from agents.networks.engine_costs import Work
 from agents.networks.engine_setting import CompiledNetworks, EnginePlan
 from agents.networks.network_worlds import network_world
 from pipeline.environments import make_training_env
-from pipeline.plain_runs import NETWORKS
 from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.settings import components
-from pipeline.train_spec import TrainSpec
+from pipeline.train_spec import NETWORKS, TrainSpec
 from pipeline.training import UNBOUNDED_TIMESTEPS
 
 

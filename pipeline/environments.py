@@ -5,7 +5,8 @@ from __future__ import annotations
 import inspect
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,12 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
-import envs  # noqa: F401  # registers the project's environments
 from agents import ALGORITHMS
 from envs.action_masks import has_masks
+from envs.bandits.replay import ReplayBandit
+from envs.grid import GridWorld
+from envs.grid_map import read_rows
 from envs.wrappers import ActionMasks
-from pipeline.environment_mistakes import environment_mistake
 from pipeline.errors import UserError, one_line, shown, unknown
 from pipeline.memory_limits import check_environments, check_frame_stack
 from pipeline.train_spec import TrainSpec
@@ -52,9 +54,6 @@ def check_env_id(env_id: str) -> None:
 
     A module before a colon is not imported here, whoever asks: `pipeline.user_modules` does that,
     for what the user has typed.
-
-    Raises:
-        UserError: if it is not; it names the nearest ids, or the flag to type.
     """
     module, _, name = env_id.rpartition(":")
     if module and module not in sys.modules:
@@ -70,9 +69,6 @@ def make_env(env_id: str, kwargs: Mapping[str, Any]) -> gym.Env[Any, Any]:
     """`gym.make`, with mistakes in the arguments put into one line.
 
     Of ``module:Env-v0`` the name alone counts: Gymnasium would import the module.
-
-    Raises:
-        UserError: if the environment cannot be made with these arguments.
     """
     try:
         return gym.make(env_id.rpartition(":")[2], **kwargs)
@@ -193,9 +189,6 @@ def make_training_env(spec: TrainSpec, monitor_folder: Path | None) -> Any:
     """The environments of the training, each under a Monitor that writes into the folder.
 
     What wrappers write goes there too; where it is None, into a temporary folder.
-
-    Returns:
-        A VecEnv of ``n_envs`` environments.
     """
     return _make_vec_env(spec, spec.hyperparams.n_envs, spec.seed, True, monitor_folder)
 
@@ -284,3 +277,126 @@ def _normalize(env: Any, spec: TrainSpec, training: bool) -> Any:
         # Statistics come from training, and returns are reported as they are.
         kwargs = {**kwargs, "norm_reward": False, "training": False}
     return VecNormalize(env, **kwargs)
+
+
+# What `gymnasium.make` takes itself.
+_OF_MAKE = ("max_episode_steps", "render_mode")
+# It adds this to some errors, and all arguments once more.
+_ADDED = " was raised from the environment creator"
+
+
+def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception) -> UserError:
+    """The line for an environment that raised ``error`` when it was made with ``kwargs``."""
+    parameters, module = _creator(env_id)
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    foreign = next((name for name in kwargs if name not in (*parameters, *_OF_MAKE)), None)
+    if foreign is not None and parameters and not takes_any:
+        known = [name for name in (*parameters, *_OF_MAKE) if name != "render_mode"]
+        return unknown(f"{env_id}: unknown argument", foreign, known)
+    if isinstance(error, KeyError):
+        return _missing_key(env_id, kwargs, error, parameters, module)
+    what = one_line(error).partition(_ADDED)[0]
+    if kwargs and not any(name in what for name in kwargs):
+        what += f" (with {', '.join(f'{name}={shown(value)}' for name, value in kwargs.items())})"
+    return UserError(f"{env_id}: {what}")
+
+
+@contextmanager
+def lacking_packages_told(env_id: str) -> Iterator[None]:
+    """Say in a line which package an environment lacks, as it may only find when it is drawn."""
+    try:
+        yield
+    except gym.error.DependencyNotInstalled as error:
+        raise UserError(f"{env_id}: {one_line(error)}") from error
+
+
+def _creator(env_id: str) -> tuple[Mapping[str, inspect.Parameter], str]:
+    """The parameters of what makes the environment, and its module; empty where not known."""
+    entry_point = gym.spec(env_id.rpartition(":")[2]).entry_point
+    try:
+        creator: Any = (
+            gym.envs.registration.load_env_creator(entry_point)
+            if isinstance(entry_point, str)
+            else entry_point
+        )
+        return inspect.signature(creator).parameters, creator.__module__
+    except (ImportError, AttributeError, TypeError, ValueError):
+        return {}, ""
+
+
+def _missing_key(
+    env_id: str,
+    kwargs: Mapping[str, Any],
+    error: KeyError,
+    parameters: Mapping[str, inspect.Parameter],
+    module: str,
+) -> UserError:
+    """The environment looked something up that is not there: an argument, as a rule."""
+    key = error.args[0] if error.args else None
+    name = next((name for name, value in kwargs.items() if value is key or value == key), None)
+    if name is None:
+        return UserError(f"{env_id}: it looks for {shown(key)}, which is not there")
+    default = parameters[name].default if name in parameters else None
+    return unknown(f"{env_id}: unknown {name}", str(key), _keys_beside(default, module))
+
+
+def _keys_beside(default: Any, module: str) -> Iterable[str]:
+    """The keys of a table in the module that has the default of an argument among its own."""
+    tables = [v for v in vars(sys.modules.get(module, object)).values() if isinstance(v, dict)]
+    found = next((t for t in tables if isinstance(default, str) and default in t), {})
+    return map(str, found)
+
+
+_ENV_KWARGS = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
+
+
+def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The hyperparameters with the rows of each map in place of the path to its file.
+
+    Args:
+        env_id: a registered environment; others than grid worlds are left as they are.
+        settings: an entry of hyperparameters.
+
+    Raises:
+        UserError: if a map's file cannot be read.
+    """
+    named = _naming(settings, "desc")
+    if not (named and _is_kind_of(GridWorld, env_id)):
+        return dict(settings)
+    try:
+        read = {
+            key: {**settings[key], "desc": list(read_rows(settings[key]["desc"]))} for key in named
+        }
+    except ValueError as error:
+        raise UserError(f"{env_id}: {one_line(error)}") from error
+    return {**settings, **read}
+
+
+def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The hyperparameters with the full path to each log of pulls.
+
+    Args:
+        env_id: a registered environment; others than ReplayBandit are left as they are.
+        settings: an entry of hyperparameters.
+    """
+    named = _naming(settings, "log")
+    if not (named and _is_kind_of(ReplayBandit, env_id)):
+        return dict(settings)
+    paths = {key: str(Path(settings[key]["log"]).absolute()) for key in named}
+    return {**settings, **{key: {**settings[key], "log": path} for key, path in paths.items()}}
+
+
+def _naming(settings: Mapping[str, Any], argument: str) -> list[str]:
+    """The keys of the settings that give the environment a text as that argument."""
+    given = {key: settings.get(key) for key in _ENV_KWARGS}
+    return [
+        key
+        for key, env_kwargs in given.items()
+        if isinstance(env_kwargs, dict) and isinstance(env_kwargs.get(argument), str)
+    ]
+
+
+def _is_kind_of(kind: type[gym.Env[Any, Any]], env_id: str) -> bool:
+    entry_point = gym.spec(env_id.rpartition(":")[2]).entry_point
+    creator: object = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    return isinstance(creator, type) and issubclass(creator, kind)

@@ -16,14 +16,13 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from agents.common.callback_horizons import Horizon, calls_until_multiple
 from mdp.work_time import WorkTime
-from pipeline.evaluation.evaluation_budget import SampledEvaluator
-from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
 from pipeline.finite_numbers import check_model
-from pipeline.models.companions import statistics_path
-from pipeline.models.model_saving import save_model, save_normalization
-from pipeline.run_folder import Run
+from pipeline.models.find import statistics_path
+from pipeline.models.load import save_model, save_normalization
+from pipeline.runs import Run
 from pipeline.stopping import current
 
 SECONDS_BETWEEN_WRITES = 1.0

@@ -1,27 +1,32 @@
-"""Writing files so that a reader, or a crash, never meets a half-written one; names for them."""
+"""Writing files so that a reader, or a crash, never meets a half-written one; names for them.
+
+And JSON that every reader takes: Python's own writes ``NaN`` and ``Infinity``, which are none.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import hashlib
+import json
+import math
 import os
 import re
 import secrets
 import sys
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BufferedWriter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.json_text import json_text
 from safe_files.regular_files import NEW, folder_of, open_number
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
+
 
 # Windows takes no more than 260 characters for a whole path, Linux no more than 255 bytes a name.
 LONGEST_NAME = 100  # bytes
@@ -38,7 +43,6 @@ DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "E
 _CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
 
 SYNCED_AT_ONCE = 8
-_KEPT_LATER: list[Path] = []
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
 _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
@@ -99,9 +103,9 @@ def naming(path: Path) -> Iterator[None]:
 def replacing(path: Path) -> Iterator[BufferedWriter]:
     """Give a file to write to, and let it appear as ``path`` once it is whole.
 
-    Nobody meets a half-written file then, whatever becomes of the process. A power cut may still
-    take the file: see `lasting`. A link or pipe of that name is replaced and not written to; and
-    who exchanges its folder meanwhile changes nothing, since names are those of the open folder.
+    Nobody meets a half-written file then, whatever becomes of the process; a power cut may still
+    take the file. A link or pipe of that name is replaced and not written to; and who exchanges its
+    folder meanwhile changes nothing, since names are those of the open folder.
 
     Raises:
         OSError: if the folder is gone, as one that was renamed meanwhile, or lies behind a link in
@@ -122,41 +126,6 @@ def replacing(path: Path) -> Iterator[BufferedWriter]:
         finally:
             with contextlib.suppress(OSError):  # a disk that has become read-only refuses that too
                 os.unlink(draft, dir_fd=folder)
-
-
-@contextmanager
-def lasting(path: Path) -> Iterator[BufferedWriter]:
-    """As `replacing`, and after it the file is there for good, also after a power cut.
-
-    Not so in a folder that is `kept_later`.
-    """
-    later = is_kept_later(path)
-    with replacing(path) as file:
-        yield file
-        if not later:
-            file.flush()
-            with naming(path):
-                os.fsync(file.fileno())
-    if not later:
-        sync_folders(path.parent)
-
-
-@contextmanager
-def kept_later(folder: Path) -> Iterator[None]:
-    """Within the ``with`` statement nobody waits for what `lasting` writes in a folder.
-
-    Whoever says so waits for all of it at once, before it counts: see `settle`.
-    """
-    _KEPT_LATER.append(folder)
-    try:
-        yield
-    finally:
-        _KEPT_LATER.remove(folder)
-
-
-def is_kept_later(path: Path) -> bool:
-    """Whether somebody else waits until the disk has what is written there."""
-    return any(path.is_relative_to(folder) for folder in _KEPT_LATER)
 
 
 def settle(folder: Path) -> None:
@@ -238,6 +207,61 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, data: Any) -> None:
-    """Replace the file at ``path`` for good by ``data`` as indented JSON; nan is null there."""
-    with lasting(path) as file:
+    """Replace the file at ``path`` by ``data`` as indented JSON; nan is null there."""
+    with replacing(path) as file:
         file.write(f"{json_text(data, indent=2)}\n".encode())
+
+
+# A number in JSON's grammar, beyond what a double holds: read as infinity, by Python's reader and
+# by browsers.
+_INFINITY = "1e999"
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON gives it back: Python's numbers, tuples as lists, nan as None."""
+    match value:
+        case Mapping():
+            return {_key(key): plain(item) for key, item in value.items()}
+        case list() | tuple():
+            return [plain(item) for item in value]
+        case float():
+            return None if math.isnan(value) else float(value)
+        case None | bool() | int() | str():
+            return value
+        case _:
+            return plain(_from_numpy(value))
+
+
+def _from_numpy(value: Any) -> Any:
+    import numpy as np  # where there is such a value; `--help` is there without
+
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise TypeError(f"a {type(value).__name__} has no place in JSON")
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """The value as JSON, with infinity as a number that is too large."""
+    # Nobody can have put these into a text of his.
+    tokens = {sign: secrets.token_hex(16) for sign in (math.inf, -math.inf)}
+    text = json.dumps(_marked(plain(value), tokens), indent=indent, allow_nan=False)
+    for sign, token in tokens.items():
+        text = text.replace(f'"{token}"', _INFINITY if sign > 0 else f"-{_INFINITY}")
+    return text
+
+
+def _marked(value: Any, tokens: Mapping[float, str]) -> Any:
+    match value:
+        case dict():
+            return {key: _marked(item, tokens) for key, item in value.items()}
+        case list():
+            return [_marked(item, tokens) for item in value]
+        case float():
+            return tokens.get(value, value)
+        case _:
+            return value
+
+
+def _key(key: Any) -> str:
+    """A name as JSON has it: that of a number or truth value is its text."""
+    return key if isinstance(key, str) else json.dumps(plain(key))

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pipeline.evaluation.evaluation_budget import SampledEvaluator
-from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import value_map
 from pipeline.library_loading import loading_libraries
-from pipeline.models.companions import final_replay_buffer_path
-from pipeline.models.model_saving import save_model, save_normalization, save_replay_buffer
+from pipeline.models.find import final_replay_buffer_path
+from pipeline.models.load import save_model, save_normalization, save_replay_buffer
 from pipeline.pictures.learning_curve import draw_learning_curve
 from pipeline.pictures.pull_curve import draw_pulls
 from pipeline.pictures.value_map import draw_value_map
 from pipeline.preparation import Training
 from pipeline.pull_recording import PullSummary, summarise_pulls
-from pipeline.run_folder import FINISHED, INTERRUPTED
+from pipeline.runs import FINISHED, INTERRUPTED
 from pipeline.stopping import current
 
 

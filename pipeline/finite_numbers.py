@@ -76,11 +76,7 @@ def check_rows(values: Any, what: str, when: str) -> None:
 
 
 def check_model(model: Any) -> None:
-    """Make sure that what an agent has learnt is finite: tables or weights, and its statistics.
-
-    Raises:
-        NotFiniteError: naming the table or the layer.
-    """
+    """Make sure that what an agent has learnt is finite: tables or weights, and its statistics."""
     when = f"at step {model.num_timesteps:,}"
     policy = getattr(model, "policy", None)
     if isinstance(policy, th.nn.Module):
@@ -116,11 +112,7 @@ class FinitePlayer:
         self._when = when
 
     def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """The agent's own.
-
-        Raises:
-            NotFiniteError: naming the observation.
-        """
+        """The agent's own."""
         check_rows(observation, "observation", self._when)
         actions, state = self._player.predict(observation, **kwargs)
         return actions, state

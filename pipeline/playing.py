@@ -11,8 +11,8 @@ import numpy as np
 
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.models.model_choice import ChosenModel
-from pipeline.models.normalization import take_over
+from pipeline.models.choose import ChosenModel
+from pipeline.models.load import take_over
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -100,7 +100,7 @@ def play_episodes(
     Raises:
         NotFiniteError: if an observation or a return is not finite.
     """
-    from pipeline.evaluation.mask_telling import player
+    from pipeline.evaluation.policies import player
     from pipeline.finite_numbers import FinitePlayer, check_numbers
 
     choose = FinitePlayer(player(model, env), "while it is played").predict

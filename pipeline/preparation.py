@@ -23,38 +23,34 @@ from pipeline.environments import (
     trains_on_variant,
 )
 from pipeline.errors import UserError
-from pipeline.evaluation.asked_policies import why_not_exact
-from pipeline.evaluation.evaluation_budget import n_environments
-from pipeline.evaluation.exact import ExactEvaluator, discount_note, model_refusal
-from pipeline.evaluation.kept_evaluators import evaluator_of
-from pipeline.evaluation.sampled import takes_batches
+from pipeline.evaluation.exact import ExactEvaluator, discount_note, evaluator_of, model_refusal
+from pipeline.evaluation.policies import why_not_exact
+from pipeline.evaluation.sampled import n_environments, takes_batches
 from pipeline.evaluation.value_maps import map_refusal
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
-from pipeline.models.continuation import (
+from pipeline.models.choose import (
     continuing,
     load_to_continue,
     model_to_continue,
     statistics_to_continue,
 )
-from pipeline.models.model_loading import agent_class
-from pipeline.models.model_zips import ModelFile, telling_masks
-from pipeline.models.normalization import take_over
+from pipeline.models.load import ModelFile, agent_class, take_over, telling_masks
 from pipeline.number_watch import NumberWatch
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
 from pipeline.resuming.resumed_logging import resumed_logger
 from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.resuming.state_saver import StateSaver
-from pipeline.run_files import environment_name
-from pipeline.run_folder import Run
-from pipeline.settings.action_noise import action_noise, check_action_noise
-from pipeline.settings.algorithm_kwargs import (
+from pipeline.runs import Run, environment_name
+from pipeline.settings.components import (
+    action_noise,
     build_algorithm_kwargs,
+    check_action_noise,
     default_policy,
     needs_policy,
 )
-from pipeline.settings.constructor_arguments import algorithm_parameters
+from pipeline.settings.values import algorithm_parameters
 from pipeline.signs_of_life import can_move
 from pipeline.train_spec import TrainSpec
 from pipeline.training_callbacks import (

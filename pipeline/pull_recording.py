@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.bandits.pull_log import PullLog
 from pipeline.files import replacing
-from pipeline.run_files import PULLS_FILE
+from pipeline.runs import PULLS_FILE
 
 LAST_PULLS = 100
 

@@ -8,7 +8,6 @@ as if nothing were in its way.
 
 from __future__ import annotations
 
-import _thread
 import contextlib
 import math
 import signal
@@ -29,7 +28,7 @@ SIGNALS = tuple(
 SECONDS_OF_ONE_REQUEST = 0.2
 # What swallows the exception, as a bare `except` does, is told again.
 SECONDS_BEFORE_RAISING_AGAIN = 0.5
-_SECONDS_BETWEEN_LOOKS = 0.02
+_SOON = 0.02  # seconds
 
 
 class Stopped(KeyboardInterrupt):
@@ -48,22 +47,15 @@ class Stopped(KeyboardInterrupt):
 
 
 class StopRequest:
-    """What signals have asked for, and how long it may wait.
-
-    Attributes:
-        number: the first signal that asked, or None.
-        n_asked: how often; signals in quick succession count once.
-    """
+    """What signals have asked for, and how long it may wait."""
 
     def __init__(self) -> None:
-        self.number: int | None = None
-        self.n_asked = 0
+        self.number: int | None = None  # the first signal that asked
+        self.n_asked = 0  # how often; signals in quick succession count once
         self._asked_at = self._signalled_at = self._raised_at = -math.inf
         self._patience = 0.0  # seconds
         self._reminds = False
-        self._is_reminder = False
-        self._is_over = False
-        self._reminding = threading.Lock()
+        self._alarm_before: tuple[Any, tuple[float, float]] | None = None  # handler, and its timer
 
     @property
     def is_urgent(self) -> bool:
@@ -71,11 +63,7 @@ class StopRequest:
         return self.n_asked > 1
 
     def raise_if_asked(self) -> None:
-        """Stop here, if a stop was asked for: call it where nothing is half done.
-
-        Raises:
-            Stopped: if so.
-        """
+        """Stop here, if a stop was asked for: call it where nothing is half done."""
         if self.number is not None:
             raise Stopped(self.number)
 
@@ -96,6 +84,7 @@ class StopRequest:
         try:
             if self._is_due():
                 self.raise_if_asked()
+            self._set_timer()
             yield
         except Exception as error:
             was_raised_here = self._raised_at > -math.inf
@@ -104,6 +93,7 @@ class StopRequest:
             raise Stopped(self.number) from error
         finally:
             self._patience, self._reminds = before
+            self._set_timer()
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -113,35 +103,39 @@ class StopRequest:
             yield
         finally:
             self._patience = before
+            self._set_timer()
 
     def notice(self, number: int, frame: FrameType | None = None) -> None:
-        """Handle a signal.
-
-        Raises:
-            Stopped: if it need not wait.
-        """
-        if self._is_reminder:
-            self._is_reminder = False
-        else:
-            self._count(number)
-        if self._is_due():
-            self._raised_at = time.monotonic()
-            self.raise_if_asked()
-
-    def _count(self, number: int) -> None:
+        """Handle a signal, by raising `Stopped` if that need not wait."""
         now = time.monotonic()
         is_another = now - self._signalled_at > SECONDS_OF_ONE_REQUEST
         self._signalled_at = now
         if self.number is None:
             self.number, self.n_asked, self._asked_at = number, 1, now
             _noticed.append(number)
-            # A thread of `threading` takes locks that the interrupted code may hold.
-            _thread.start_new_thread(self._remind, ())
+            if sys.platform != "win32":
+                self._alarm_before = (
+                    signal.signal(signal.SIGALRM, self._remind),
+                    signal.setitimer(signal.ITIMER_REAL, 0),
+                )
         elif is_another:
             self.n_asked += 1
         if self.n_asked > 2:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
+        self._raise_if_due()
+
+    def _remind(self, number: int, frame: FrameType | None) -> None:
+        if self._reminds:
+            self._raise_if_due()
+
+    def _raise_if_due(self) -> None:
+        is_due = self._is_due()
+        if is_due:
+            self._raised_at = time.monotonic()
+        self._set_timer()
+        if is_due:
+            self.raise_if_asked()
 
     def _is_due(self) -> bool:
         now = time.monotonic()
@@ -151,25 +145,29 @@ class StopRequest:
             return False
         return self.is_urgent or now >= self._asked_at + self._patience
 
-    def _remind(self) -> None:
-        """Signal to the main thread when its time is over, wherever it waits."""
-        assert self.number is not None
-        while True:
-            with self._reminding:
-                if self._is_over:
-                    return
-                if self._reminds and self._is_due() and not self._is_reminder:
-                    self._is_reminder = True
-                    if sys.platform == "win32":
-                        _thread.interrupt_main(signal.Signals(self.number))
-                    else:  # unlike the other, this also ends a wait for input or another process
-                        signal.pthread_kill(threading.main_thread().ident or 0, self.number)
-            time.sleep(_SECONDS_BETWEEN_LOOKS)
+    def _set_timer(self) -> None:
+        """Have the main thread reminded when its time is over, wherever it waits.
+
+        An alarm also ends a wait for input or another process. Windows has none: what waits there
+        is told at the next safe moment.
+        """
+        if sys.platform == "win32" or self._alarm_before is None:
+            return
+        delay = 0.0  # for none
+        if self._reminds and self._patience < math.inf:
+            due = -math.inf if self.is_urgent else self._asked_at + self._patience
+            again = self._raised_at + SECONDS_BEFORE_RAISING_AGAIN
+            delay = max(due - time.monotonic(), again - time.monotonic(), _SOON)
+        signal.setitimer(signal.ITIMER_REAL, delay)
 
     def end(self) -> None:
         """Remind no more."""
-        with self._reminding:
-            self._is_over = True
+        if sys.platform != "win32" and self._alarm_before is not None:
+            handler, timer = self._alarm_before
+            self._alarm_before = None
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.signal(signal.SIGALRM, handler or signal.SIG_DFL)
+            signal.setitimer(signal.ITIMER_REAL, *timer)
 
 
 def _is_of_a_stop(error: BaseException) -> bool:

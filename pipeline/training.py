@@ -14,26 +14,34 @@ from rich.console import Console
 
 from mdp.machine_code import compile_timer
 from mdp.work_time import WorkTime
-from pipeline.broken_runs import close, give_up, has_begun
+from pipeline.digests import VERSION, VERSION_FIELD
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation
-from pipeline.file_digests import VERSION, VERSION_FIELD
+from pipeline.failures import (
+    blame_settings,
+    blame_weights,
+    close,
+    exits_as_mistakes,
+    give_up,
+    has_begun,
+)
 from pipeline.files import naming
 from pipeline.finishing import draw, judge, save
-from pipeline.foreign_exits import exits_as_mistakes
-from pipeline.leftovers import remove_leftovers
-from pipeline.library_errors import blame_settings, blame_weights
 from pipeline.library_loading import load_for_optimizer
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
 from pipeline.pull_recording import PullSummary
 from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
 from pipeline.resuming.state_folder import remove_states
 from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.run_folder import FINISHED, INTERRUPTED, RUNNING, Run
-from pipeline.run_record import (
+from pipeline.runs import (
+    FINISHED,
+    INTERRUPTED,
+    RUNNING,
     TRAINED_AGENT,
+    Run,
     recorded_machine,
     recorded_versions,
+    remove_leftovers,
     write_arguments,
     write_settings,
 )

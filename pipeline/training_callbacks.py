@@ -11,13 +11,13 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.common.callback_horizons import EpisodeBudget
 from pipeline.callbacks import EpisodeCheckpoint, ExponentialExploration, StepCheckpoint
 from pipeline.errors import UserError
-from pipeline.evaluation.evaluation_budget import SampledEvaluator
 from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.evaluation.sampled import SampledEvaluator
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.settings import components
 from pipeline.train_spec import TrainSpec
 

@@ -25,7 +25,7 @@ from safe_files.regular_files import read_file
 
 if TYPE_CHECKING:
     from experiments.results import StudyResults
-    from pipeline.models.model_choice import ChosenModel
+    from pipeline.models.choose import ChosenModel
 
 FILM = "episode.gif"
 MAX_STEPS = 200  # twenty seconds; a robot that walks in a circle shows it sooner
@@ -89,8 +89,8 @@ def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
 
     from pipeline.evaluation.sampled import evaluation_seed
     from pipeline.filming import film_episode
-    from pipeline.models.model_choice import model_of_run
-    from pipeline.models.model_loading import load_model
+    from pipeline.models.choose import model_of_run
+    from pipeline.models.load import load_model
     from pipeline.playing import playing_env
 
     # Pictures alone: no display is needed, nor looked for.
@@ -148,7 +148,7 @@ def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"
     from pipeline.evaluation.sampled import evaluation_seed
     from pipeline.filming import write_film
-    from pipeline.models.model_choice import model_of_run
+    from pipeline.models.choose import model_of_run
 
     for checkpoint, episode in _checkpoints(planned):
         path = folder / f"{name}_{episode}.gif"
@@ -190,7 +190,7 @@ def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[
     import torch as th
 
     from pipeline.filming import film_episode
-    from pipeline.models.model_loading import load_model
+    from pipeline.models.load import load_model
     from pipeline.playing import playing_env
 
     th.set_num_threads(chosen.spec.num_threads)

@@ -54,7 +54,7 @@ def pytest_collection_finish():
 @pytest.fixture(autouse=True, scope="session")
 def shipped_settings_are_parsed_once():
     """Each run asks for them, and to parse a file takes longer than to check what it says."""
-    from pipeline.settings import hyperparam_entries as entries
+    from pipeline.settings import hyperparams as entries
 
     read, parsed = entries.read_yaml, cache(entries.read_yaml)
 

@@ -45,9 +45,9 @@ GUARDED = {
     ("experiments/child_processes.py", "os.kill"): "asks for the platform before it",
     ("experiments/run_limits.py", "/proc"): "refuses to measure on Windows",
     ("mdp/code_cache.py", ".chmod"): "modes are neither set nor checked on Windows",
-    ("pipeline/liveness.py", "os.kill"): "asks _winapi on Windows, before it",
-    ("pipeline/liveness.py", "/proc"): "does without where there is none",
-    ("pipeline/run_record.py", "/proc"): "does without where there is none",
+    ("pipeline/locks.py", "os.kill"): "asks _winapi on Windows, before it",
+    ("pipeline/locks.py", "/proc"): "does without where there is none",
+    ("pipeline/runs.py", "/proc"): "does without where there is none",
 }
 
 

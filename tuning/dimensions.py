@@ -8,7 +8,7 @@ from enum import Enum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
 
-from pipeline.settings.literals import DottedName
+from pipeline.settings.values import DottedName
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution

@@ -7,9 +7,8 @@ from typing import Any
 
 import yaml
 
-from pipeline.json_text import plain
-from pipeline.settings.hyperparam_entries import seeds_tuned_on
-from pipeline.settings.tuned_seeds import KEY as TUNED_ON
+from pipeline.files import plain
+from pipeline.settings.hyperparams import TUNED_ON, seeds_tuned_on
 from tuning.tuning_spec import TuningSpec
 
 

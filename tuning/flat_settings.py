@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pipeline.settings.literals import DottedName, parse_literal
+from pipeline.settings.values import DottedName, parse_literal
 from tuning.dimensions import LEFT_OUT
 
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
 from pipeline.errors import UserError
-from pipeline.settings.coercion import parse_schedule
+from pipeline.settings.values import parse_schedule
 from tuning.dimensions import LEFT_OUT, SHIPPED, Pick, Word, is_word, same
 
 if TYPE_CHECKING:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
-from pipeline.files import write_json
-from pipeline.json_text import plain
+from pipeline.files import plain, write_json
 from tuning.opening import OpenTuning
 from tuning.retesting import Outcome
 from tuning.trial_queue import FAILURE, SETTINGS, figures_of, seconds_of

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, cast
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.plan import PlannedRun
 from experiments.study import METRICS, AgentSpec, Metric, StudySpec
-from pipeline.file_digests import DamagedFileError
+from pipeline.digests import DamagedFileError
 from pipeline.files import write_text
 from tuning.entry_files import entry_text
 from tuning.judging import UnjudgedError, judged, outcome_of

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError, shown
-from pipeline.settings.hyperparam_entries import override
-from pipeline.settings.strict_yaml import read_yaml
+from pipeline.settings.hyperparams import override
+from pipeline.settings.yaml import read_yaml
 from tuning.dimensions import LEFT_OUT, Pick, same
 from tuning.flat_settings import flat_items, nested, with_mappings
 from tuning.number_ranges import spread

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from experiments.launching import Launcher, RunFailure
 from experiments.plan import PlannedRun
+from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError
-from pipeline.files import DISK_ERRORS
-from pipeline.folder_lock import FolderGoneError, is_gone
-from pipeline.json_text import plain
+from pipeline.files import DISK_ERRORS, plain
+from pipeline.locks import FolderGoneError, is_gone
 from tuning.judging import RunOutcome, UnjudgedError, judged, outcome_of
 from tuning.suggesting import Suggestions
 from tuning.trial_queue import (

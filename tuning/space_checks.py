@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import fields
 from typing import Any
 
-from pipeline.models.model_loading import agent_class
-from pipeline.settings.algorithm_kwargs import default_policy
-from pipeline.settings.constructor_arguments import algorithm_parameters, constructor_parameters
+from pipeline.models.load import agent_class
+from pipeline.settings.components import default_policy
 from pipeline.settings.hyperparams import Hyperparams, check_algorithm_kwargs, split
+from pipeline.settings.values import algorithm_parameters, constructor_parameters
 
 
 def defaults_of(algo: str, keys: Iterable[str]) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pipeline.errors import UserError, shown, unknown
-from pipeline.settings.constructor_arguments import check_arguments
+from pipeline.settings.values import check_arguments
 from tuning.dimensions import Choice, Dimension, Word, is_word
 from tuning.number_ranges import FORMS, NumberRange, Scale
 

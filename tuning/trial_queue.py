@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline import liveness
-from pipeline.folder_lock import FolderGoneError, FolderInUseError, folder_lock, is_gone
+from pipeline import locks
+from pipeline.locks import FolderGoneError, FolderInUseError, folder_lock, is_gone
 from pipeline.signs_of_life import Heartbeat
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ class TrialQueue:
 
     def _begin(self, place: FrozenTrial, params: Mapping[str, Any]) -> None:
         number = place._trial_id
-        owner = {**liveness.mark(), "token": self.token}
+        owner = {**locks.mark(), "token": self.token}
         self.storage.set_trial_user_attr(number, DRIVER, owner)
         if params:
             self.storage.set_trial_system_attr(number, "fixed_params", dict(params))
@@ -153,7 +153,7 @@ class TrialQueue:
         token = str(owner.get("token"))
         if token == self.token:
             return False
-        is_alive = liveness.is_alive(owner)
+        is_alive = locks.is_alive(owner)
         if is_alive is not None:
             return not is_alive
         # Without an owner it may have been taken a moment ago.

@@ -10,7 +10,7 @@ from typing import Any
 
 from experiments.plan import PlannedRun, check_settings, plan
 from experiments.study import AgentSpec
-from pipeline.json_text import json_text
+from pipeline.files import json_text
 from tuning.tuning_spec import TuningSpec
 
 

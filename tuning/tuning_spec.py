@@ -12,7 +12,7 @@ import numpy as np
 from agents import ALGORITHMS
 from experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from pipeline.json_text import plain
+from pipeline.files import plain
 
 Sampler = Literal["tpe", "gp", "random", "grid", "cmaes"]
 Objective = Literal["mean", "iqm", "lower"]

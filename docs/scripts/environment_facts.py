@@ -17,8 +17,8 @@ from agents.known_algorithms import ALGORITHMS
 from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import TransitionModel, baseline_policies, finite_horizon_optimum, policy_return
 from mdp.policy_returns import PolicyReturn
-from pipeline.settings.hyperparam_entries import entry_names
-from pipeline.settings.literals import parse_assignments
+from pipeline.settings.hyperparams import entry_names
+from pipeline.settings.values import parse_assignments
 
 LIMIT = 1000  # what commands take where an environment has none
 MOST_REWARDS = 8

@@ -84,7 +84,7 @@ def filled(text: str) -> str:
 
 def pictured_environments() -> dict[str, dict[str, object]]:
     """The environments that pages show, with their arguments."""
-    from pipeline.settings.literals import parse_assignments
+    from pipeline.settings.values import parse_assignments
 
     found = {}
     for path in sorted(DOCS.rglob("*.md")):

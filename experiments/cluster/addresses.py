@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from pipeline.errors import UserError, shown
-from pipeline.settings.strict_yaml import read_yaml
+from pipeline.settings.yaml import read_yaml
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import read_file
 

@@ -21,10 +21,10 @@ from typing import Any
 from experiments.launching import RunFailure
 from experiments.plan import PlannedRun
 from experiments.run_folders import claim_draft, draft_path, put_run_in_place, remove_draft
+from pipeline.digests import FIELD, RECORD, RecordedFiles
 from pipeline.errors import UserError, one_line
-from pipeline.file_digests import FIELD, RECORD, RecordedFiles
 from pipeline.files import portable_name, sync_file, sync_folders
-from pipeline.folder_lock import is_gone
+from pipeline.locks import is_gone
 
 # The last is for a worker that can do no run at all.
 DONE, FAILED, STOPPED, UNFIT = "done", "failed", "stopped", "unfit"

@@ -23,8 +23,8 @@ from experiments.off_policy.estimators import (
 from experiments.off_policy.policy_files import PolicyFile, find_policy, read_logged
 from mdp.array_types import Floats
 from pipeline.errors import UserError, one_line
-from pipeline.evaluation.asked_policies import policy_matrix, why_not_exact
-from pipeline.models.model_loading import load_model
+from pipeline.evaluation.policies import policy_matrix, why_not_exact
+from pipeline.models.load import load_model
 from pipeline.user_modules import UserModule
 
 

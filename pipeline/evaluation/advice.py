@@ -27,7 +27,7 @@ from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation
-from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparams import read_hyperparams
 from pipeline.train_spec import TrainSpec
 
 SOLVED = 0.5  # a score of planning from which on it may be recommended
@@ -48,15 +48,10 @@ MOST_STATES_NAMED = 3
 
 @dataclass(frozen=True)
 class Advice:
-    """What to say of a run that failed.
+    """What to say of a run that failed."""
 
-    Attributes:
-        instead: what the greedy policy does instead of solving the task.
-        try_first: the change that is likely to help; None where no signal says so.
-    """
-
-    instead: str
-    try_first: str | None
+    instead: str  # what the greedy policy does instead of solving the task
+    try_first: str | None  # the change that is likely to help; None where no signal says so
 
 
 def advice(

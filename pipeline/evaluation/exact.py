@@ -6,10 +6,12 @@ and its return under the time limit follows by arithmetic, without evaluation no
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -36,12 +38,11 @@ from mdp import (
     state_values,
 )
 from mdp.array_types import Bools, Floats
-from pipeline.environments import make_single_env
-from pipeline.evaluation.asked_policies import best_actions, obstacle, policy_matrix
-from pipeline.evaluation.last_policy import OfLastPolicy
+from pipeline.environments import evaluation_kwargs, make_single_env
+from pipeline.evaluation.policies import OfLastPolicy, best_actions, obstacle, policy_matrix
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.memory_limits import observation_bytes
-from pipeline.train_spec import TrainSpec
+from pipeline.train_spec import TrainSpec, is_plain
 
 # What is observed in all states, kept as one array.
 MOST_BYTES_OBSERVED = 1 << 30
@@ -53,6 +54,10 @@ MOST_BACKUPS = 20_000_000_000
 # a tenth of a second, and the score below which that is worth a word.
 MOST_OUTCOMES_PLANNED = 250_000
 LOW_SCORE = 0.95
+# Evaluators of plain runs: where many share a process, the optimum is worked out once. Arrays of a
+# model with more states are not small any more.
+MOST_KEPT = 8
+MOST_STATES_KEPT = 20_000
 
 
 @dataclass(frozen=True)
@@ -216,3 +221,26 @@ def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
     """Whether the agent sees the environment through something around all of its copies."""
     special = spec.hyperparams
     return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)
+
+
+_kept: OrderedDict[str, ExactEvaluator] = OrderedDict()
+
+
+def evaluator_of(spec: TrainSpec) -> ExactEvaluator | None:
+    """As `exact_evaluator`; that of plain runs on the same environment is the same object."""
+    if not is_plain(spec):
+        return exact_evaluator(spec)
+    key = _key(spec)
+    evaluator = _kept.pop(key, None) or exact_evaluator(spec)
+    if evaluator is not None and evaluator.model.n_states <= MOST_STATES_KEPT:
+        _kept[key] = evaluator
+        if len(_kept) > MOST_KEPT:
+            _kept.popitem(last=False)
+    return evaluator
+
+
+def _key(spec: TrainSpec) -> str:
+    """All that the environment of a plain run's evaluation is made from."""
+    masks = spec.hyperparams.algorithm.get("mask_actions", False)
+    kwargs = sorted(evaluation_kwargs(spec).items())
+    return repr((gym.registry[spec.env_id], kwargs, masks))

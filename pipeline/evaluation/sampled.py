@@ -1,25 +1,31 @@
-"""How good an agent is: played on the environment as it is, never on a training variant of it."""
+"""How good an agent is: played on the environment as it is, never on a training variant of it.
+
+During training, for no more steps than it is worth beside the training. That goes by steps and
+never by the clock, so that the same seed gives the same files anywhere. Agents that were trained in
+compiled code are played in it too.
+"""
 
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
+from stable_baselines3 import A2C
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
+from envs.brackets.known_brackets import may_have_bracket, optimum_bracket
 from mdp.array_types import Floats
-from pipeline.evaluation.mask_telling import player
+from pipeline.environments import make_single_env
+from pipeline.evaluation.policies import KNOWN_LIBRARIES, is_network, player
 from pipeline.finite_numbers import FinitePlayer, check_numbers
-
-# The agents of these packages take any number of observations at once.
-KNOWN_LIBRARIES = ("agents", "stable_baselines3")
-
+from pipeline.train_spec import TrainSpec
 
 # Where nothing that an agent does makes a difference, sums may differ by this much.
 ROUNDING = 1e-12
@@ -32,18 +38,14 @@ FEWEST_TO_TELL = 10
 
 @dataclass(frozen=True)
 class Yardstick:
-    """What returns on an environment are measured against.
+    """What returns on an environment are measured against."""
 
-    Attributes:
-        optimum: the highest expected return that any policy has under the time limit. Where that
-            is not known, a return that no policy exceeds.
-        baseline: the highest of uniformly random actions and of each constant action.
-        at_least: where the optimum is not known, a return that a policy was seen to reach: the
-            optimum is bracketed by the two. None where it is known.
-    """
-
+    # the highest expected return that any policy has under the time limit. Where that is not known,
+    # a return that no policy exceeds.
     optimum: float
-    baseline: float
+    baseline: float  # the highest of uniformly random actions and of each constant action
+    # where the optimum is not known, a return that a policy was seen to reach: the optimum is
+    # bracketed by the two. None where it is known.
     at_least: float | None = None
 
     def gap(self, expected_return: float) -> float:
@@ -84,24 +86,18 @@ class Yardstick:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How good an agent is: episodes that it has played, or their exact expectation.
+    """How good an agent is: episodes that it has played, or their exact expectation."""
 
-    Attributes:
-        returns: undiscounted return of each episode, shape (n_episodes,); the expected return,
-            shape (1,), where that is exact.
-        lengths: number of steps, likewise.
-        successes: whether each episode succeeded, or the probability of it, likewise; None where
-            the environment does not say.
-        exact_std: standard deviation of an episode's return, where it is exact; None where
-            episodes were sampled.
-        yardstick: what to measure the return against, where it is known.
-    """
-
+    # undiscounted return of each episode, shape (n_episodes,); the expected return, shape (1,),
+    # where that is exact
     returns: Floats
-    lengths: NDArray[np.floating[Any] | np.integer[Any]]
+    lengths: NDArray[np.floating[Any] | np.integer[Any]]  # number of steps, likewise
+    # whether each episode succeeded, or the probability of it, likewise; None where the environment
+    # does not say
     successes: NDArray[np.bool_ | np.floating[Any]] | None
+    # standard deviation of an episode's return, where it is exact; None where episodes were sampled
     exact_std: float | None = None
-    yardstick: Yardstick | None = None
+    yardstick: Yardstick | None = None  # what to measure the return against, where it is known
 
     @property
     def is_exact(self) -> bool:
@@ -239,3 +235,253 @@ def evaluation_seed(seed: int, purpose: int) -> int:
     """
     stream = np.random.SeedSequence(seed, spawn_key=(purpose,))
     return int(stream.generate_state(1)[0] % 2**31)
+
+
+def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
+    """The bracket of the environment that a run is evaluated on, or None where none holds for it.
+
+    Normalised and stacked observations make no difference. What a wrapper around all copies does,
+    nobody knows.
+    """
+    if spec.hyperparams.vec_env_wrapper or not may_have_bracket(spec.env_id):
+        return None
+    env = make_single_env(spec)
+    try:
+        found = optimum_bracket(env)
+    finally:
+        env.close()
+    if found is None:
+        return None
+    return Yardstick(found.upper, found.baseline, at_least=found.lower)
+
+
+class Shares(NamedTuple):
+    """Steps of evaluation for one of training."""
+
+    usual: float  # of any training
+    at_first: float  # of the steps of short trainings, until that comes to `STEPS_AT_FIRST`
+
+
+# Chosen by how long a step of evaluation takes beside one of training, so that all of them take a
+# fifth of its time or less. Figures: `benchmarks/evaluation_share.py`.
+NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
+TABLE = Shares(usual=1 / 100, at_first=1 / 5)
+# A2C learns once from each step, which takes no longer than to play one.
+LIGHT_NETWORK = Shares(usual=1 / 10, at_first=1 / 10)
+# Where training and evaluation are both compiled.
+COMPILED_NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
+COMPILED_TABLE = Shares(usual=1 / 10, at_first=1 / 2)
+# Compiled learning from environments in Python.
+PYTHON_ENV = Shares(usual=1 / 32, at_first=1 / 6)
+# Compiled training whose evaluation cannot be compiled.
+NETWORK_ALONE = Shares(usual=1 / 32, at_first=1 / 32)
+TABLE_ALONE = Shares(usual=1 / 2500, at_first=1 / 2500)
+STEPS_AT_FIRST = 10_000
+# A tenth of a second in most environments.
+STEPS_IN_ANY_CASE = 2_000
+
+
+def shares_of(model: BaseAlgorithm, *, plays_compiled: bool) -> Shares:
+    """How many steps of evaluation go with the training of an agent."""
+    engine, learns_weights = getattr(model, "engine_in_use", "") or "", is_network(model)
+    if engine.startswith("compiled but"):
+        return PYTHON_ENV
+    if not engine.startswith("compiled"):
+        light = LIGHT_NETWORK if isinstance(model, A2C) else NETWORK
+        return light if learns_weights else TABLE
+    if plays_compiled:
+        return COMPILED_NETWORK if learns_weights else COMPILED_TABLE
+    return NETWORK_ALONE if learns_weights else TABLE_ALONE
+
+
+def allowed_steps(n_trained: float, shares: Shares) -> float:
+    """Steps that all evaluations of a training of so many may take."""
+    at_first = min(shares.at_first * n_trained, STEPS_AT_FIRST)
+    return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
+
+
+# The final evaluation has the rest, and no less where those before took more than they had.
+PART_DURING_TRAINING = 1 / 2
+
+# Episodes of an evaluation: the first number, and the next until the standard error is small.
+STAGES = (5, 10, 20)
+STAGES_AT_THE_END = (10, 25, 50, 100)
+LEAST_SURE = 10
+# Relative to the mean return.
+PRECISION = 0.05
+PRECISION_AT_THE_END = 0.01
+
+
+class SampledEvaluator:
+    """Plays episodes: as many as are asked for, or as few as will do.
+
+    Args:
+        spec: the run.
+        env: environments to play on, with a time limit.
+
+    Attributes:
+        n_steps: environment steps that it has taken, in all evaluations.
+    """
+
+    def __init__(self, spec: TrainSpec, env: VecEnv) -> None:
+        self.env = env
+        self.yardstick = bracketed_yardstick(spec)
+        self.seed = spec.seed
+        self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
+        # Whoever says when to evaluate, or how long, gets that.
+        self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
+        self.training_steps = spec.hyperparams.n_timesteps
+        self.training_episodes = spec.hyperparams.n_episodes
+        self.n_steps = 0
+        self._left = math.inf
+        self._last_length: float | None = None
+
+    def can_afford(self, model: BaseAlgorithm, n_episodes: int) -> bool:
+        """Whether the training has come far enough for another evaluation."""
+        if self.is_limited:
+            n_trained = model.num_timesteps - model._num_timesteps_at_start
+            progress = n_trained / (self.training_steps or math.inf)
+            if self.training_episodes is not None:
+                progress = n_episodes / self.training_episodes
+            planned = n_trained / progress if progress > 0 else 0.0
+            allowed = self._allowed(model, planned) * min(progress, 1.0)
+            self._left = allowed * PART_DURING_TRAINING - self.n_steps
+        return STAGES[0] * self._usual_length(model) <= self._left
+
+    def __call__(self, model: BaseAlgorithm) -> Evaluation:
+        """An evaluation during training."""
+        stages = STAGES if self.n_episodes is None else (self.n_episodes,)
+        return self._evaluate(model, stages, PRECISION, self._left, purpose=1)
+
+    def at_the_end(self, model: BaseAlgorithm) -> Evaluation:
+        """The final evaluation, by episodes of its own."""
+        n_trained = model.num_timesteps - model._num_timesteps_at_start
+        allowed = self._allowed(model, n_trained)
+        left = max(allowed - self.n_steps, allowed * (1 - PART_DURING_TRAINING))
+        stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
+        if self.n_final is None and not self._is_known_to_fit(stages[0], left):
+            stages = (STAGES[0], *stages)
+        return self._evaluate(model, stages, PRECISION_AT_THE_END, left, purpose=2)
+
+    def _evaluate(
+        self,
+        model: BaseAlgorithm,
+        stages: tuple[int, ...],
+        precision: float,
+        most: float,
+        purpose: int,
+    ) -> Evaluation:
+        """Play episodes, until the mean is sure enough or more of them would be too many steps."""
+        seed = evaluation_seed(self.seed, purpose)
+        copy = self._compiled_copy(model)
+        found = self._play(model, copy, stages[0], seed)
+        for n_episodes in stages[1:]:
+            n_more = n_episodes - len(found.returns)
+            if is_sure(found, precision) or found.lengths.sum() + n_more * found.mean_length > most:
+                break
+            # Not seeded again, the environments go on to other episodes.
+            found = found.joined(self._play(model, copy, n_more, None))
+        self.n_steps += int(found.lengths.sum())
+        self._last_length = found.mean_length
+        return found.measured_by(self.yardstick)
+
+    def _allowed(self, model: BaseAlgorithm, n_trained: float) -> float:
+        is_compiled = self._compiled_copy(model) is not None
+        return allowed_steps(n_trained, shares_of(model, plays_compiled=is_compiled))
+
+    def _is_known_to_fit(self, n_episodes: int, left: float) -> bool:
+        return self._last_length is not None and n_episodes * self._last_length <= left
+
+    def _usual_length(self, model: BaseAlgorithm) -> float:
+        """Steps of an episode: of those evaluated last, or else of training's last ones."""
+        if self._last_length is not None:
+            return self._last_length
+        lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
+        return float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
+
+    def _play(
+        self, model: BaseAlgorithm, copy: CompiledCopy | None, n_episodes: int, seed: int | None
+    ) -> Evaluation:
+        if copy is None:
+            return evaluate(model, self.env, n_episodes, seed)
+        return evaluate_compiled(model, copy, n_episodes, seed)
+
+    def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
+        """The environments in compiled code, if it is that what the agent was trained on."""
+        if getattr(model, "engine_in_use", "") != "compiled":
+            return None
+        return compiled_copy(self.env)
+
+
+def is_sure(evaluation: Evaluation, precision: float) -> bool:
+    """Whether the standard error of the mean return is small beside it.
+
+    Of fewer than ten episodes that cannot be said: the first five may be alike by chance.
+    """
+    n_episodes = len(evaluation.returns)
+    error = float(np.std(evaluation.returns)) / math.sqrt(max(n_episodes - 1, 1))
+    return n_episodes >= LEAST_SURE and error <= precision * abs(evaluation.mean_return)
+
+
+def n_environments(n_eval_envs: int, n_episodes: int | None) -> int:
+    """How many environments to play on at once: no more than there are episodes."""
+    return min(n_eval_envs, STAGES[0] if n_episodes is None else n_episodes)
+
+
+@dataclass(frozen=True)
+class CompiledCopy:
+    """Environments to evaluate on, and their compiled counterpart."""
+
+    env: DummyVecEnv
+    world: Any  # what `agents.compiled.loop` steps
+    seen: Any  # how its observations are read
+
+
+def compiled_copy(env: VecEnv) -> CompiledCopy | None:
+    """What can be evaluated on in compiled code; None where that is not possible.
+
+    Environments whose states can be counted are left out: there, evaluation is exact, or there are
+    so many states that to look at all of them takes longer than to play.
+    """
+    from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
+
+    from agents.compiled.compile_envs import NotCompilable, monitor_of
+    from agents.networks.network_worlds import network_world
+
+    if not isinstance(env, DummyVecEnv) or any(monitor_of(each) is None for each in env.envs):
+        return None
+    if not isinstance(env.envs[0].unwrapped, CartPoleEnv | MountainCarEnv):
+        return None
+    try:
+        return CompiledCopy(env, *network_world(env))
+    except NotCompilable:
+        return None
+
+
+def evaluate_compiled(
+    model: BaseAlgorithm, copy: CompiledCopy, n_episodes: int, seed: int | None
+) -> Evaluation:
+    """Play the episodes that `evaluate` would: the same seeds, starts and order.
+
+    Tables and tiles act by the same bits; networks by the compiled forward pass, and by the
+    library's `predict` where two actions are so close that rounding could decide.
+    """
+    from agents.compiled.episodes import DECIMALS
+    from agents.compiled.greedy_play import play_episodes
+    from agents.networks.matrix_products import one_thread
+    from agents.networks.network_worlds import NetworkEnvStates
+
+    env, n_envs = copy.env, copy.env.num_envs
+    if seed is not None:
+        env.seed(seed)
+    # As the library shares them out.
+    wanted = (n_episodes + np.arange(n_envs)) // n_envs
+    states = NetworkEnvStates(env, copy.world, copy.seen)
+    acting = cast(Any, model).greedy_player(copy.seen)
+    with one_thread() if is_network(model) else nullcontext():
+        found = play_episodes(copy.world, acting, states, env.reset(), wanted)
+    # As Monitor tells them.
+    returns = np.array([round(total, DECIMALS) for total in found.returns.tolist()])
+    when = f"in the evaluation at step {model.num_timesteps:,}"
+    check_numbers(returns, "return", when)
+    return Evaluation(returns, found.lengths, None)

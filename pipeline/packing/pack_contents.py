@@ -9,14 +9,14 @@ from typing import Any
 
 import yaml
 
+from pipeline.digests import FIELD, RECORD, VERSION, VERSION_FIELD, sealed
 from pipeline.errors import UserError, one_line
-from pipeline.file_digests import FIELD, RECORD, VERSION, VERSION_FIELD, sealed
-from pipeline.json_text import json_text
-from pipeline.models.recorded_runs import read_recorded, run_in
+from pipeline.files import json_text
+from pipeline.models.find import read_recorded, run_in
 from pipeline.module_records import COPIES
 from pipeline.packing.model_card import card, results
 from pipeline.packing.scrubbing import check_secrets, check_untold, record_to_tell, zip_to_tell
-from pipeline.run_folder import FINISHED, Run
+from pipeline.runs import FINISHED, Run
 from safe_files.limits import MAX_ARCHIVE_BYTES
 
 CARD = "README.md"

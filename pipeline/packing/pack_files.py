@@ -15,10 +15,10 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
+from pipeline.digests import FIELD, RECORD, RecordedFiles, read_record
 from pipeline.errors import UserError, one_line, shown
-from pipeline.file_digests import FIELD, RECORD, RecordedFiles, read_record
 from pipeline.files import portable_name, put_in_place, replacing, settle
-from pipeline.models.recorded_runs import run_in
+from pipeline.models.find import run_in
 from pipeline.module_records import COPIES
 from pipeline.packing.pack_contents import STUDY_RECORD, contents
 from pipeline.packing.scrubbing import zipped

@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 from pipeline.errors import UserError
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from safe_files.archives import read_members
 
 # Fields of a spec that name places or code of the machine that the run was done on.

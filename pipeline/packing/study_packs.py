@@ -18,12 +18,11 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import IO, Any
 
+from pipeline.digests import LOCK, RECORD
 from pipeline.errors import UserError, one_line, visible
-from pipeline.file_digests import LOCK, RECORD
-from pipeline.files import replacing
-from pipeline.folder_lock import folder_lock
-from pipeline.json_text import json_text
-from pipeline.models.recorded_runs import run_in
+from pipeline.files import json_text, replacing
+from pipeline.locks import folder_lock
+from pipeline.models.find import run_in
 from pipeline.module_records import COPIES
 from pipeline.packing.model_card import fenced, plain_text, to_type
 from pipeline.packing.pack_contents import CARD, STUDY_RECORD, contents

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from io import BufferedReader
 from pathlib import Path
 
+from pipeline.digests import STATE_FOLDER
 from pipeline.errors import UserError
-from pipeline.file_digests import STATE_FOLDER
 from pipeline.files import replacing
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import NO_LIMIT, opened

@@ -27,7 +27,7 @@ from pipeline.resuming.saved_states import SavedState, save_state
 from pipeline.resuming.state_folder import settings_digest
 from pipeline.resuming.state_keeping import SaveInterval
 from pipeline.resuming.user_state import put_back, user_state
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.safe_moments import StopAtSafeMoment
 from pipeline.stopping import current
 from pipeline.user_modules import UserModule

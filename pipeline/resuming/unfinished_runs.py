@@ -8,15 +8,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pipeline.digests import DamagedFileError, digest_of
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError, digest_of
 from pipeline.module_records import changed_since
 from pipeline.resuming.log_positions import cut_back, monitor_files
 from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
 from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.run_files import environment_name
-from pipeline.run_folder import FINISHED, Run, numbered_runs
-from pipeline.run_record import TRAINED_AGENT, recorded_versions
+from pipeline.runs import (
+    FINISHED,
+    TRAINED_AGENT,
+    Run,
+    environment_name,
+    numbered_runs,
+    recorded_versions,
+)
 from pipeline.train_spec import TrainSpec, completed
 from pipeline.user_modules import UserModule
 

@@ -1,27 +1,48 @@
-"""From what a file names to objects: wrappers, callbacks, schedules and classes.
+"""From what a file names to objects: classes, wrappers, callbacks, schedules, agents' arguments.
 
-All are looked up and checked before any is used, so that a mistake shows before a run begins.
+A name in a file can choose among classes of a fixed kind from a fixed set of packages; it cannot
+make anything else be imported or called. A module is imported only if it is one of ours, if its
+name was typed, or if its file is in the record of a distribution that is installed: a folder
+``rl_zoo3`` of a stranger's is none, wherever it lies. All are looked up and checked before any is
+used, so that a mistake shows before a run begins.
 """
 
 from __future__ import annotations
 
+import importlib
+import importlib.metadata
+import importlib.util
+import inspect
+import re
+import site
+import sysconfig
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from functools import cache
+from pathlib import Path, PureWindowsPath
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, get_args, get_origin
 
-from pipeline.errors import UserError, one_line
-from pipeline.settings.class_names import find_class
-from pipeline.settings.coercion import ScheduleSpec
-from pipeline.settings.constructor_arguments import check_arguments, constructor_parameters
-from pipeline.settings.file_arguments import confined
-from pipeline.settings.hyperparams import component_specs
-from pipeline.settings.literals import DottedName
+from pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
+from pipeline.settings.hyperparams import Hyperparams, check_algorithm_kwargs, component_specs
+from pipeline.settings.values import (
+    DottedName,
+    ScheduleSpec,
+    algorithm_parameters,
+    check_arguments,
+    constructor_parameters,
+)
+from pipeline.user_modules import is_ours
 
 if TYPE_CHECKING:
     import gymnasium as gym
+    from gymnasium import spaces
+    from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.policies import BasePolicy
     from stable_baselines3.common.vec_env import VecEnv
+
 
 # How wrappers call the number of observations that they stack, which take their memory at once.
 _STACKS = frozenset({"n_stack", "stack_size"})
@@ -64,21 +85,7 @@ def wrapper_factory(
     where: str = "env_wrapper",
     folder: Path | None = None,
 ) -> Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None:
-    """What wraps an environment as ``spec`` says, the first wrapper innermost.
-
-    Args:
-        spec: a dotted name, a mapping from it to arguments, a list of either, or None.
-        extra_packages: packages that the user allows besides the usual ones.
-        where: begins every error message.
-        folder: that they may write to; None for a temporary one, see
-            `pipeline.settings.file_arguments`.
-
-    Returns:
-        A function of the environment, or None if there is nothing to wrap.
-
-    Raises:
-        UserError: if a name is not that of a Gymnasium wrapper, or an argument does not fit it.
-    """
+    """What wraps an environment as ``spec`` says, the first wrapper innermost."""
     from gymnasium import Wrapper
 
     return _chain(spec, Wrapper, extra_packages, where, folder)
@@ -99,17 +106,7 @@ def vec_wrapper_factory(
 def callbacks(
     spec: Any, extra_packages: Sequence[str] = (), save_path: Path | str | None = None
 ) -> list[BaseCallback]:
-    """The callbacks that ``spec`` names.
-
-    Args:
-        spec: a dotted name, a mapping from it to arguments, a list of either, or None.
-        extra_packages: packages that the user allows besides the usual ones.
-        save_path: given to callbacks that have a ``save_path`` and are not told another; what
-            they are told lies inside it.
-
-    Raises:
-        UserError: if a name is not that of a callback, or an argument does not fit it.
-    """
+    """The callbacks that ``spec`` names."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     folder = None if save_path is None else Path(save_path)
@@ -121,16 +118,7 @@ def callbacks(
 def build_value(
     raw: Any, extra_packages: Sequence[str] = (), where: str = "hyperparameters"
 ) -> Any:
-    """Turn the names and schedules in nested values into classes and schedule objects.
-
-    Args:
-        raw: a value as `pipeline.settings.hyperparams.check_algorithm_kwargs` leaves it.
-        extra_packages: packages that the user allows besides the usual ones.
-        where: begins every error message.
-
-    Raises:
-        UserError: if a name is not that of a network module, an optimizer or a buffer.
-    """
+    """Turn the names and schedules in nested values into classes and schedule objects."""
     if isinstance(raw, dict):
         return {
             key: build_value(value, extra_packages, f"{where}: {key}") for key, value in raw.items()
@@ -212,3 +200,340 @@ def _is_function(annotation: object) -> bool:
     """Whether an argument takes functions alone, as its type says."""
     kind = str(annotation).partition("[")[0]
     return "Callable" in kind and "|" not in kind
+
+
+# The libraries that this project cannot do without: where they lie, packages are installed.
+_REQUIRED = ("stable_baselines3", "gymnasium", "torch")
+
+# Of rl_zoo3 only what its files name: importing it changes Gymnasium's time limit.
+_PACKAGES = (
+    "stable_baselines3",
+    "sb3_contrib",
+    "gymnasium",
+    "torch.nn",
+    "torch.optim",
+    "rl_zoo3.wrappers",
+    "rl_zoo3.callbacks",
+    "envs",
+    "agents",
+    "pipeline",
+)
+
+# The short names that rl_zoo3's files use.
+_MODULE_ALIASES = {"nn": "torch.nn", "th": "torch", "sb3": "stable_baselines3", "gym": "gymnasium"}
+_CLASS_ALIASES = {
+    "RMSpropTFLike": "stable_baselines3.common.sb2_compat.rmsprop_tf_like.RMSpropTFLike",
+    "HerReplayBuffer": "stable_baselines3.her.her_replay_buffer.HerReplayBuffer",
+    # Where classes of ours were before: files that name them so are still read.
+    "envs.wrappers.encodings.FlattenToDiscrete": "envs.wrappers.FlattenToDiscrete",
+    "envs.wrappers.encodings.OneHotObservation": "envs.wrappers.OneHotObservation",
+    "envs.wrappers.rewards.ScaleReward": "envs.wrappers.ScaleReward",
+    "envs.wrappers.rewards.TerminationReward": "envs.wrappers.TerminationReward",
+}
+
+
+def find_class(
+    name: str, bases: tuple[type, ...], where: str, extra_packages: Sequence[str] = ()
+) -> type:
+    """Import a class.
+
+    Args:
+        name: such as ``nn.Tanh`` or ``stable_baselines3.common.monitor.Monitor``.
+        bases: it must be a subclass of one of these.
+        where: begins every error message.
+        extra_packages: packages that the user allows besides the usual ones.
+
+    Raises:
+        UserError: if the name is not admitted, does not exist, or is no such class.
+    """
+    module_name, _, class_name = _full_name(name).rpartition(".")
+    parts = [*module_name.split("."), class_name]
+    if not all(part.isidentifier() and not part.startswith("_") for part in parts):
+        raise UserError(f"{where}: {name!r} is not the dotted name of a class")
+    packages = (*_PACKAGES, *extra_packages)
+    if not any(f"{module_name}.".startswith(f"{package}.") for package in packages):
+        raise UserError(
+            f"{where}: {name} is in none of the packages that may be named "
+            f"({', '.join(packages)}); admit others with --gym-packages"
+        )
+    module = _import(module_name, f"{where}: {name}", extra_packages)
+    found = getattr(module, class_name, None)
+    if isinstance(found, type) and issubclass(found, bases):
+        return found
+    wanted = " or ".join(base.__name__ for base in bases)
+    fault = "does not exist" if found is None else f"is no {wanted}"
+    hint = did_you_mean(class_name, _classes(module, bases))
+    raise UserError(f"{where}: {name} {fault}{': ' + hint if hint else ''}")
+
+
+def _full_name(name: str) -> str:
+    first, dot, rest = _CLASS_ALIASES.get(name, name).partition(".")
+    return _MODULE_ALIASES.get(first, first) + dot + rest
+
+
+def _import(module_name: str, what: str, typed: Sequence[str]) -> ModuleType:
+    """Import a module, after each package that it lies in has been looked at."""
+    parts = module_name.split(".")
+    try:
+        for end in range(1, len(parts) + 1):
+            name = ".".join(parts[:end])
+            if not (is_ours(name) or _is_typed(name, typed) or _is_installed(name)):
+                raise UserError(
+                    f"{what}: {name} belongs to no package that is installed; if you trust it, "
+                    f"type --gym-packages {parts[0]}"
+                )
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"{what}: there is no module {error.name}, or it is not installed"
+        ) from error
+    except ImportError as error:
+        raise UserError(f"{what}: cannot be imported: {error}") from error
+
+
+def _is_typed(name: str, typed: Sequence[str]) -> bool:
+    """Whether a module was typed, lies in a package that was, or is one around it."""
+    return any(
+        f"{name}.".startswith(f"{one}.") or f"{one}.".startswith(f"{name}.") for one in typed
+    )
+
+
+def _is_installed(name: str) -> bool:
+    """Whether a module's file is in the record of the installed distribution of that name.
+
+    The packages around it are imported, so they have to be looked at before.
+    """
+    try:
+        spec = importlib.util.find_spec(name)
+    except ValueError:  # somebody has put an object of another kind in its place
+        return False
+    if spec is None:
+        raise ModuleNotFoundError(name=name)
+    folder = next((each for each in _folders() if _is_below(spec.origin, each)), None)
+    if spec.origin is None or folder is None:
+        return False
+    return Path(spec.origin).relative_to(folder).as_posix() in _record(
+        name.partition(".")[0], folder
+    )
+
+
+def _is_below(origin: str | None, folder: Path) -> bool:
+    return origin is not None and Path(origin).is_relative_to(folder)
+
+
+@cache
+def _folders() -> tuple[Path, ...]:
+    """Where packages are installed; neither the current folder nor PYTHONPATH is such a place."""
+    paths = sysconfig.get_paths()
+    places = [paths["purelib"], paths["platlib"], *site.getsitepackages()]
+    places += [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
+    found = {name: importlib.util.find_spec(name) for name in _REQUIRED}
+    beside = {
+        name: Path(spec.origin).parents[1] for name, spec in found.items() if spec and spec.origin
+    }
+    required = [one for name, one in beside.items() if f"{name}/__init__.py" in _record(name, one)]
+    return tuple(dict.fromkeys([*required, *map(Path, places)]))
+
+
+@cache
+def _record(distribution: str, folder: Path) -> frozenset[str]:
+    """The files of a distribution that is installed in a folder, relative to it."""
+    found = importlib.metadata.distributions(name=distribution, path=[str(folder)])
+    texts = [one.read_text("RECORD") or "" for one in found]
+    return frozenset(line.rsplit(",", 2)[0] for text in texts for line in text.splitlines())
+
+
+def _classes(module: ModuleType, bases: tuple[type, ...]) -> list[str]:
+    return [
+        name
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, bases) and value not in bases
+    ]
+
+
+_NAME_OF_A_PLACE = re.compile(
+    r"path|folder|file|prefix|dir$|(^|_)(log|logs|dir|directory)(_|$)", re.IGNORECASE
+)
+
+
+def names_a_place(argument: str) -> bool:
+    """Whether an argument of that name says where something is written."""
+    return _NAME_OF_A_PLACE.search(argument) is not None
+
+
+def confined(kwargs: Mapping[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
+    """The arguments, with those that name a place leading into the folder."""
+    return {
+        name: _confined(name, value, folder, f"{where}: {name}") for name, value in kwargs.items()
+    }
+
+
+def _confined(name: str, value: Any, folder: Path | None, where: str) -> Any:
+    if isinstance(value, dict):
+        return {
+            key: _confined(f"{name}_{key}", item, folder, f"{where}: {key}")
+            for key, item in value.items()
+        }
+    if isinstance(value, list | tuple):
+        return type(value)(_confined(name, item, folder, where) for item in value)
+    if not (isinstance(value, str | Path) and names_a_place(name)):
+        return value
+    if "prefix" in name.lower():
+        return _plain_prefix(str(value), where)
+    return _inside(_scratch_folder() if folder is None else folder, str(value), where)
+
+
+def _plain_prefix(value: str, where: str) -> str:
+    if PureWindowsPath(value).name != value or value == "..":
+        raise UserError(
+            f"{where} begins the names of files and holds no path, unlike {shown(value)}"
+        )
+    return value
+
+
+def _inside(folder: Path, value: str, where: str) -> str:
+    # Read as on Windows, where both slashes part folders and a drive's letter leads out as well.
+    pure = PureWindowsPath(value)
+    leads_out = bool(pure.anchor) or ".." in pure.parts or "\0" in value
+    # Where it leads by way of links.
+    if leads_out or not (folder / value).resolve().is_relative_to(folder.resolve()):
+        raise UserError(f"{where} must lie inside the run folder, unlike {shown(value)}")
+    return str(folder / value)
+
+
+@cache
+def _scratch() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="yardstick-", ignore_cleanup_errors=True)
+
+
+def _scratch_folder() -> Path:
+    return Path(_scratch().name)
+
+
+def build_algorithm_kwargs(
+    algorithm: type[BaseAlgorithm],
+    kwargs: Mapping[str, Any],
+    where: str,
+    extra_packages: Sequence[str] = (),
+) -> dict[str, Any]:
+    """An agent's constructor arguments, checked to the last one and built.
+
+    Beyond `check_algorithm_kwargs` and `build_value`, the policy must exist and know what
+    ``policy_kwargs`` says, where the class tells by ``policy_aliases`` which policies it has.
+    """
+    parameters = algorithm_parameters(algorithm)
+    checked = check_algorithm_kwargs(kwargs, parameters, where)
+    policy = _policy_class(algorithm, checked, parameters, where, extra_packages)
+    if policy is not None and checked.get("policy_kwargs") is not None:
+        accepted = constructor_parameters(policy)
+        policy_kwargs = check_arguments(
+            checked["policy_kwargs"], accepted, f"{where}: policy_kwargs"
+        )
+        checked["policy_kwargs"] = _build(policy_kwargs, accepted, where, extra_packages)
+    if isinstance(checked.get("policy"), DottedName):
+        checked["policy"] = policy
+    built = _build(checked, parameters, where, extra_packages)
+    return built if _is_hand_written(algorithm) else _as_library_schedules(built)
+
+
+def _is_hand_written(algorithm: type[BaseAlgorithm]) -> bool:
+    from agents.common.model_files import JsonAlgorithm
+
+    return issubclass(algorithm, JsonAlgorithm)
+
+
+def _as_library_schedules(kwargs: Mapping[str, Any]) -> dict[str, Any]:
+    """Schedules of classes that a library agent's zip finds wherever that agent is installed."""
+    from agents.common.schedules import ExponentialSchedule, library_schedule
+
+    return {
+        name: library_schedule(value) if isinstance(value, ExponentialSchedule) else value
+        for name, value in kwargs.items()
+    }
+
+
+def needs_policy(algorithm: type[BaseAlgorithm], kwargs: Mapping[str, Any]) -> bool:
+    """Whether the constructor wants a policy that the arguments do not say."""
+    policy = algorithm_parameters(algorithm).get("policy")
+    return policy is not None and policy.default is policy.empty and "policy" not in kwargs
+
+
+def default_policy(algorithm: type[BaseAlgorithm], is_dict: bool) -> str:
+    """The policy of an agent for which none is said."""
+    prefix = "MultiInput" if is_dict else "Mlp"
+    known = algorithm.policy_aliases
+    fitting = (name for name in known if name.startswith(prefix))
+    return next(fitting, next(iter(known), f"{prefix}Policy"))
+
+
+def _policy_class(
+    algorithm: type[BaseAlgorithm],
+    kwargs: Mapping[str, Any],
+    parameters: Mapping[str, inspect.Parameter],
+    where: str,
+    extra_packages: Sequence[str],
+) -> type[BasePolicy] | None:
+    """The class of the policy; None where only the agent's constructor knows it."""
+    from stable_baselines3.common.policies import BasePolicy
+
+    if needs_policy(algorithm, kwargs):
+        raise UserError(f"{where}: policy is missing: {', '.join(algorithm.policy_aliases)}")
+    default = parameters["policy"].default if "policy" in parameters else None
+    policy = kwargs.get("policy", default)
+    if isinstance(policy, DottedName):
+        return find_class(policy.name, (BasePolicy,), f"{where}: policy", extra_packages)
+    known = algorithm.policy_aliases
+    if isinstance(policy, str) and known and policy not in known and "policy" in kwargs:
+        raise unknown(f"{where}: unknown policy", policy, known)
+    return known.get(policy) if isinstance(policy, str) else None
+
+
+def _build(
+    kwargs: Mapping[str, Any],
+    parameters: Mapping[str, inspect.Parameter],
+    where: str,
+    extra_packages: Sequence[str],
+) -> dict[str, Any]:
+    """Build each argument, and hold classes against ``type[...]`` in the annotations."""
+    built = {}
+    for name, value in kwargs.items():
+        built[name] = build_value(value, extra_packages, f"{where}: {name}")
+        annotation = parameters[name].annotation if name in parameters else None
+        bases = tuple(
+            get_args(option)[0]
+            for option in (annotation, *get_args(annotation))
+            if get_origin(option) is type
+        )
+        if isinstance(value, DottedName) and bases and not issubclass(built[name], bases):
+            wanted = " or ".join(base.__name__ for base in bases)
+            raise UserError(f"{where}: {name}: {value} is no {wanted}")
+    return built
+
+
+def check_action_noise(hyperparams: Hyperparams, algorithm: type[BaseAlgorithm], algo: str) -> None:
+    """Make sure that the agent takes the noise that is asked for."""
+    if hyperparams.noise_type is not None and "action_noise" not in constructor_parameters(
+        algorithm
+    ):
+        raise UserError(
+            f"{algo}: noise_type is for agents that add noise to continuous actions, such as td3"
+        )
+
+
+def action_noise(hyperparams: Hyperparams, actions: spaces.Space[Any]) -> dict[str, Any]:
+    """The constructor argument ``action_noise``, as a mapping; empty where none is asked for.
+
+    Args:
+        hyperparams: of the run; the noise has mean 0 and the same standard deviation
+            ``noise_std`` in each component of an action, after actions are scaled to [-1, 1].
+        actions: what the agent acts in, a Box.
+    """
+    if hyperparams.noise_type is None:
+        return {}
+    import numpy as np
+    from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
+
+    kinds = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
+    mean = np.zeros(actions.shape or ())
+    sigma = np.full_like(mean, hyperparams.noise_std)
+    return {"action_noise": kinds[hyperparams.noise_type](mean, sigma)}

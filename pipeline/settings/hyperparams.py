@@ -1,21 +1,24 @@
-"""What an entry of hyperparameters says: checked strictly, and never run.
+"""Entries of hyperparameters in rl_zoo3's format: found in a file, checked strictly, never run.
 
-An entry is in rl_zoo3's format, see `pipeline.settings.hyperparam_entries`. It holds arguments of
-the algorithm's constructor, and the special keys that `Hyperparams` lists.
+One YAML file per algorithm maps environment ids to entries. An entry holds arguments of the
+algorithm's constructor, and the special keys that `Hyperparams` lists. Beside the entries, under
+``tuned_on``, a file may say which seeds they were tuned on: that is no hyperparameter, no part of
+what a run is, and tools that look entries up by environment pass it by.
 """
 
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal, get_type_hints
 
-from pipeline.errors import UserError, shown
-from pipeline.settings.coercion import coerce
-from pipeline.settings.constructor_arguments import check_arguments, check_range
-from pipeline.settings.literals import contains_name
+from pipeline.errors import UserError, did_you_mean, shown
+from pipeline.settings.values import check_arguments, check_range, coerce, contains_name
+from pipeline.settings.yaml import read_settings_text, read_yaml
 
 # Constructor arguments that are set elsewhere, and how.
 _SET_ELSEWHERE = {
@@ -51,58 +54,42 @@ _KEYWORDS: Mapping[str, Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class ComponentSpec:
-    """A wrapper or callback that an entry asks for.
+    """A wrapper or callback that an entry asks for."""
 
-    Attributes:
-        name: the dotted name of its class.
-        kwargs: arguments of its constructor.
-    """
-
-    name: str
-    kwargs: dict[str, Any] = field(default_factory=dict)
+    name: str  # the dotted name of its class
+    kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of its constructor
 
 
 @dataclass(frozen=True)
 class Hyperparams:
-    """One entry, the special keys apart from the algorithm's arguments.
+    """One entry, the special keys apart from the algorithm's arguments."""
 
-    Attributes:
-        n_timesteps: environment steps to train for; None if counted in episodes or not said.
-        n_episodes: episodes to train for; never set together with ``n_timesteps``.
-        n_envs: environments to train on at once.
-        normalize: arguments of VecNormalize, the algorithm's ``gamma`` included; None for without.
-        env_wrapper: wrappers of every environment, the innermost first.
-        train_env_wrapper: wrappers of the training environments alone, around those.
-        vec_env_wrapper: wrappers of the vectorised environment.
-        callback: callbacks of the training.
-        env_kwargs: arguments of every environment.
-        train_env_kwargs: further arguments of the training environments alone.
-        eval_env_kwargs: further arguments of the evaluation environments alone.
-        frame_stack: how many observations to stack, or None.
-        monitor_kwargs: arguments of Monitor.
-        noise_type: action noise, for algorithms that take an ``action_noise``.
-        noise_std: its standard deviation. Without a ``noise_type`` the key is an argument of the
-            algorithm like any other.
-        flush_denormal: let the processor take numbers below 1e-38 for zero.
-        algorithm: everything else: arguments of the algorithm's constructor, not checked yet.
-    """
-
+    # environment steps to train for; None if counted in episodes or not said
     n_timesteps: int | None = None
-    n_episodes: int | None = None
-    n_envs: int = 1
+    n_episodes: int | None = None  # episodes to train for; never set together with ``n_timesteps``
+    n_envs: int = 1  # environments to train on at once
+    # arguments of VecNormalize, the algorithm's ``gamma`` included; None for without
     normalize: dict[str, Any] | None = None
+    # wrappers of every environment, the innermost first
     env_wrapper: tuple[ComponentSpec, ...] = ()
+    # wrappers of the training environments alone, around those
     train_env_wrapper: tuple[ComponentSpec, ...] = ()
-    vec_env_wrapper: tuple[ComponentSpec, ...] = ()
-    callback: tuple[ComponentSpec, ...] = ()
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
+    vec_env_wrapper: tuple[ComponentSpec, ...] = ()  # wrappers of the vectorised environment
+    callback: tuple[ComponentSpec, ...] = ()  # callbacks of the training
+    env_kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of every environment
+    # further arguments of the training environments alone
     train_env_kwargs: dict[str, Any] = field(default_factory=dict)
+    # further arguments of the evaluation environments alone
     eval_env_kwargs: dict[str, Any] = field(default_factory=dict)
-    frame_stack: int | None = None
-    monitor_kwargs: dict[str, Any] = field(default_factory=dict)
+    frame_stack: int | None = None  # how many observations to stack, or None
+    monitor_kwargs: dict[str, Any] = field(default_factory=dict)  # arguments of Monitor
+    # action noise, for algorithms that take an ``action_noise``
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = None
+    # its standard deviation. Without a ``noise_type`` the key is an argument of the algorithm like
+    # any other.
     noise_std: float | None = None
-    flush_denormal: bool = False
+    flush_denormal: bool = False  # let the processor take numbers below 1e-38 for zero
+    # everything else: arguments of the algorithm's constructor, not checked yet
     algorithm: dict[str, Any] = field(default_factory=dict)
 
 
@@ -118,7 +105,7 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
     """Tell the special keys of an entry from the algorithm's arguments, and check them.
 
     Args:
-        entry: as `pipeline.settings.hyperparam_entries.read_hyperparams` returns it. A special key
+        entry: as `read_hyperparams` returns it. A special key
             that is null counts as left out.
         where: begins every error message.
 
@@ -157,16 +144,7 @@ def _special_keys(entry: Mapping[str, Any]) -> list[str]:
 
 
 def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
-    """Read wrappers or callbacks in rl_zoo3's forms.
-
-    Args:
-        spec: the dotted name of a class, a mapping from it to its arguments, a list of either, or
-            what this function returned before.
-        where: begins every error message.
-
-    Raises:
-        UserError: if the form is another.
-    """
+    """Read wrappers or callbacks in rl_zoo3's forms."""
     items = spec if isinstance(spec, list | tuple) else [] if spec is None else [spec]
     return tuple(_component_spec(item, where) for item in items)
 
@@ -207,7 +185,7 @@ def check_algorithm_kwargs(
     Args:
         kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
         parameters: those of the constructor, see
-            `pipeline.settings.constructor_arguments.constructor_parameters`.
+            `pipeline.settings.values.constructor_parameters`.
         where: begins every error message.
 
     Returns:
@@ -231,3 +209,188 @@ def check_algorithm_kwargs(
     for name, value in result.items():
         check_range(name, value, where)
     return result
+
+
+_FOLDER = Path(__file__).resolve().parents[2] / "hyperparams"
+_ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
+_TOP_LEVEL_KEY = re.compile(r"^([\w./-]+):", re.MULTILINE)
+_STAND_INS = ("default", "atari")
+
+
+class NoEntryError(UserError):
+    """A file of hyperparameters says nothing about the environment."""
+
+
+def read_hyperparams(
+    algo: str,
+    env_id: str,
+    path: Path | str | None = None,
+    env_kwargs: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """Read the entry of an environment.
+
+    Args:
+        algo: the algorithm, whose file is ``hyperparams/<algo>.yml``.
+        env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts. The entry
+            ``atari`` stands in for Atari games without their own, ``default`` for all others.
+        path: another file to read.
+        env_kwargs: arguments of the environment. Where they make it the one that another id stands
+            for, and the file has an entry for that id, it is this: for CliffWalking-v1 with
+            ``is_slippery: True`` that of CliffWalkingSlippery-v1.
+
+    Returns:
+        The entry as it stands there, see `split`; an empty one for an algorithm that
+        has no file here, such as one of the user's own.
+
+    Raises:
+        UserError: if the file cannot be read or is not of this format.
+        NoEntryError: if it has no entry that fits.
+    """
+    if path is None and not _path(algo, None).is_file():
+        return {}
+    path = _path(algo, path)
+    entries, _ = _read(path)
+    key = _same_environment(entries, env_id, env_kwargs) or _find_entry(entries, env_id)
+    if key is None:
+        hint = did_you_mean(env_id, [name for name in entries if name not in _STAND_INS], n=3)
+        raise NoEntryError(
+            f"{path}: no entry for {shown(env_id)}{' (' + hint + ')' if hint else ''}; "
+            "give hyperparameters with -params, or another file with --conf-file"
+        )
+    entry = entries[key]
+    if not (isinstance(entry, dict) and all(isinstance(name, str) for name in entry)):
+        raise UserError(f"{path}: the entry {key} must map names to values")
+    return entry
+
+
+def seeds_tuned_on(
+    algo: str, env_id: str, path: Path | str | None = None
+) -> tuple[range, ...] | None:
+    """The seeds that the entry of an environment was tuned on, as its file says.
+
+    Args:
+        algo: the algorithm.
+        env_id: the environment.
+        path: another file than the algorithm's own.
+
+    Returns:
+        Ranges of seeds, none for an entry that was chosen without; None where nobody says: in a
+        file without ``tuned_on``, and for an algorithm that has no file here.
+
+    Raises:
+        UserError: as `read_hyperparams` does.
+    """
+    if path is None and not _path(algo, None).is_file():
+        return None
+    entries, tuned_on = _read(_path(algo, path))
+    if tuned_on is None:
+        return () if path is None else None
+    return tuned_on.get(_find_entry(entries, env_id) or "", ())
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, tuple[range, ...]] | None]:
+    """The entries of a file, and the seeds that it says they were tuned on."""
+    if path.suffix == ".py":
+        raise UserError(f"{path}: hyperparameters are read from YAML; Python files are not run")
+    entries = read_yaml(path)
+    if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
+        raise UserError(f"{path}: must map environment ids to hyperparameters")
+    tuned_on = read_tuned_on(entries, str(path))
+    return {key: entry for key, entry in entries.items() if key != TUNED_ON}, tuned_on
+
+
+def _same_environment(
+    entries: Mapping[str, Any], env_id: str, env_kwargs: Mapping[str, Any] | None
+) -> str | None:
+    """An entry's id that is registered as this environment with these arguments, and no others."""
+    if not env_kwargs:
+        return None
+    import gymnasium as gym
+
+    own = gym.registry.get(env_id.partition(":")[2] or env_id)
+    if own is None:
+        return None
+    given = {**own.kwargs, **env_kwargs}
+    meant = own.entry_point, given, own.max_episode_steps
+    named = (gym.registry[name] for name in entries if name in gym.registry)
+    return next(
+        (one.id for one in named if (one.entry_point, one.kwargs, one.max_episode_steps) == meant),
+        None,
+    )
+
+
+def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:
+    env_id = env_id.partition(":")[2] or env_id
+    if env_id in entries:
+        return env_id
+    if _ATARI_ID.fullmatch(env_id) and "atari" in entries:
+        return "atari"
+    return "default" if "default" in entries else None
+
+
+def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
+    """Ids of the environments that an algorithm's file has an entry for, in its order.
+
+    Empty where there is no such file. The stand-ins ``default`` and ``atari`` are left out.
+    """
+    path = _path(algo, path)
+    # The keys alone, by their place in the line: parsing all files would slow listing them down.
+    names = _TOP_LEVEL_KEY.findall(read_settings_text(path)) if path.is_file() else []
+    return [name for name in names if name not in (*_STAND_INS, TUNED_ON)]
+
+
+def _path(algo: str, path: Path | str | None) -> Path:
+    return _FOLDER / f"{algo}.yml" if path is None else Path(path)
+
+
+def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry with ``changes`` made to it; one budget of training replaces the other."""
+    kept = dict(entry)
+    if not {"n_timesteps", "n_episodes"}.isdisjoint(changes):
+        kept.pop("n_timesteps", None)
+        kept.pop("n_episodes", None)
+    return {**kept, **changes}
+
+
+TUNED_ON = "tuned_on"
+
+
+def read_tuned_on(entries: Mapping[str, Any], where: str) -> dict[str, tuple[range, ...]] | None:
+    """The seeds on which entries were tried while they were chosen, by the entry's name.
+
+    Args:
+        entries: a file of hyperparameters. Under ``tuned_on`` it maps names of entries to
+            ``{first: 0, count: 10}``, or to a list of such; an entry that is not named there was
+            chosen without trying it on any seed.
+        where: the file, for error messages.
+
+    Returns:
+        None where the file has no such key, and so does not say.
+
+    Raises:
+        UserError: if the key holds anything else, or names an entry that is not there.
+    """
+    if TUNED_ON not in entries:
+        return None
+    said = entries[TUNED_ON]
+    if not isinstance(said, dict):
+        raise UserError(f"{where}: {TUNED_ON} must map entries to seeds, not be {shown(said)}")
+    missing = next((name for name in said if name not in entries or name == TUNED_ON), None)
+    if missing is not None:
+        raise UserError(f"{where}: {TUNED_ON} names {shown(missing)}, which has no entry there")
+    return {
+        name: tuple(_seeds(item, f"{where}: {TUNED_ON}: {name}") for item in _listed(seeds))
+        for name, seeds in said.items()
+    }
+
+
+def _listed(seeds: Any) -> list[Any]:
+    return seeds if isinstance(seeds, list) else [seeds]
+
+
+def _seeds(given: Any, where: str) -> range:
+    numbers = list(given.values()) if isinstance(given, dict) else []
+    is_whole = all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in numbers)
+    if not (isinstance(given, dict) and {*given} == {"first", "count"} and is_whole):
+        raise UserError(f"{where} must be like {{first: 0, count: 10}}, not {shown(given)}")
+    return range(given["first"], given["first"] + given["count"])

@@ -34,7 +34,7 @@ from agents.common.callback_horizons import (
 from pipeline.callbacks import EpisodeCheckpoint, StepCheckpoint
 from pipeline.evaluation.sampled import Evaluation
 from pipeline.evaluation_callback import EvaluationCallback
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 
 ENGINES = ("interpreted", "compiled")
 VOLATILE = {"time/fps", "time/time_elapsed"}

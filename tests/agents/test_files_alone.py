@@ -17,7 +17,7 @@ import envs  # noqa: F401  # registers the bandits
 from agents import ALGORITHMS, load_algorithm
 from agents.common.model_files import JsonAlgorithm
 from agents.common.schedules import ExponentialSchedule, library_schedule
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.settings.components import build_algorithm_kwargs
 
 # Classes of ours on agents of the library, whose zips are its own.
 ON_THE_LIBRARY = ("dqn", "double_dqn", "deep_qlearning", "ppo", "a2c", "ars")

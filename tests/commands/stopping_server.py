@@ -42,9 +42,9 @@ def moments():
     """What is called at each moment: its owner, its name, and on which of the calls."""
     from agents.compiled import engine
     from commands import run_output
-    from pipeline import broken_runs, evaluation_callback, files, finishing, preparation
+    from pipeline import evaluation_callback, files, finishing, preparation, worker_processes
     from pipeline.resuming.state_saver import StateSaver
-    from pipeline.run_folder import Run
+    from pipeline.runs import Run
 
     calls = iter(range(10**9))
     return {
@@ -58,7 +58,7 @@ def moments():
         "judging": (finishing, "_final_evaluation", always),
         "drawing": (finishing, "draw_learning_curve", always),
         "recording": (Run, "end", always),
-        "closing": (broken_runs, "close_environments", always),
+        "closing": (worker_processes, "close_environments", always),
     }
 
 

@@ -26,7 +26,7 @@ from pipeline import files
 from pipeline.environments import training_kwargs
 from pipeline.errors import UserError
 from pipeline.filming import FRAMES_PER_SECOND, check_film_path, write_film
-from pipeline.settings import hyperparam_entries
+from pipeline.settings import hyperparams
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
@@ -366,10 +366,10 @@ def test_a_log_folder_that_cannot_be_written(type_command, tmp_path):
 
 
 def test_a_full_disk(type_command, tmp_path, monkeypatch):
-    def no_space(_):
+    def no_space(*_, **__):
         raise OSError(28, "No space left on device", "run.json")
 
-    monkeypatch.setattr(files.os, "fsync", no_space)
+    monkeypatch.setattr(files.os, "replace", no_space)
     code, _, err = type_command("train.py", *QUICK)
     assert (code, err.count("\n")) == (2, 1)
     assert "No space left on device" in err
@@ -404,7 +404,7 @@ def test_a_file_of_one_default_entry_is_enough(type_command, monkeypatch, tmp_pa
     folder = tmp_path / "hyperparams"
     folder.mkdir()
     (folder / "qlearning.yml").write_text("default:\n  n_timesteps: 60\n  policy: QTablePolicy\n")
-    monkeypatch.setattr(hyperparam_entries, "_FOLDER", folder)
+    monkeypatch.setattr(hyperparams, "_FOLDER", folder)
     code, out, err = type_command("train.py", "--list")
     assert (code, err) == (0, "")
     assert "qlearning" in out

@@ -9,7 +9,7 @@ import pytest
 
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 
 LAKE = ["--algo", "random", "--env", "FrozenLake-v1"]
 QUICK = ["train.py", "--seed", "0", "-n", "100", "--eval-freq", "-1", "--verbose", "1"]

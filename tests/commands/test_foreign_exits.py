@@ -6,7 +6,7 @@ import signal
 import gymnasium as gym
 import pytest
 
-from pipeline.foreign_exits import ForeignExitError, exits_as_mistakes
+from pipeline.failures import ForeignExitError, exits_as_mistakes
 
 LEAVING = """
 import gymnasium as gym

@@ -16,7 +16,7 @@ import train
 import tune
 from commands import inspect_model, pack_run
 from commands.parsing import run_command
-from pipeline.file_digests import FIELD, RECORD, digests_of, sealed
+from pipeline.digests import FIELD, RECORD, digests_of, sealed
 from pipeline.files import replacing
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.settings.hyperparams import split

@@ -16,7 +16,7 @@ from commands.playing_output import PlayingRequest, play
 from commands.terminal import TextConsole
 from pipeline.action_figures import ActionFigures
 from pipeline.errors import UserError
-from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.models.choose import ModelRequest, choose_model
 
 REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty
 

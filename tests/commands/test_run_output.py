@@ -23,7 +23,7 @@ from commands.run_output import (
 from commands.terminal import TextConsole
 from mdp.work_time import WorkTime
 from pipeline.evaluation.sampled import Evaluation, Yardstick
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule

@@ -18,8 +18,8 @@ import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
 from envs.bandits import log_uniformly
 from pipeline.errors import UserError
-from pipeline.models.model_choice import model_of_run
-from pipeline.run_folder import Run
+from pipeline.models.choose import model_of_run
+from pipeline.runs import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from report.films import episode_in_training

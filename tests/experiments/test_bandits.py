@@ -33,8 +33,7 @@ from experiments.bandits import (
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
 from pipeline.pull_recording import PullRecorder, are_bandits
-from pipeline.run_files import PULLS_FILE
-from pipeline.run_folder import Run
+from pipeline.runs import PULLS_FILE, Run
 from pipeline.training import train
 from report.conclusions import conclusion
 from report.series.regret_bounds import (

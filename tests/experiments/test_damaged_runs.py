@@ -25,9 +25,8 @@ from experiments.run_files import read_episodes, read_evaluations, read_value_ma
 from experiments.run_folders import draft_path, move_damaged_aside
 from experiments.run_in_child import do_run
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_files import PULLS_FILE
-from pipeline.run_folder import Run
+from pipeline.digests import DamagedFileError
+from pipeline.runs import PULLS_FILE, Run
 
 STEPS = {"n_timesteps": 60}
 WAREHOUSE = EnvironmentSpec("grid", "Warehouse-v0", STEPS)

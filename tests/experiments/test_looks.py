@@ -16,7 +16,7 @@ from experiments.growing import (
     take_looks,
     take_planned_looks,
 )
-from experiments.looks import FILE, read_looks
+from experiments.looks import LOOKS_FILE, read_looks
 from experiments.plan import plan
 from experiments.results import RUN_COLUMNS, StudyResults
 from experiments.run_files import CURVE_COLUMNS
@@ -94,13 +94,13 @@ def test_a_look_counts_when_the_runs_or_the_question_are_others(tmp_path):
     assert look(tmp_path, *three, n_seeds=20) == (6, level(6))
     assert look(tmp_path, n_seeds=20, first_seed=30) == (7, level(7))
     assert number_of_looks(tmp_path) == 7
-    (tmp_path / FILE).unlink()
+    (tmp_path / LOOKS_FILE).unlink()
     assert look(tmp_path, n_seeds=20) == (1, level(1))
 
 
 def test_too_few_seeds_to_say_anything_are_no_look(tmp_path):
     assert look(tmp_path, n_seeds=4) == (1, level(1))
-    assert not (tmp_path / FILE).exists()
+    assert not (tmp_path / LOOKS_FILE).exists()
     assert look(tmp_path, n_seeds=5) == (1, level(1))
     # At the level of the second look it takes nine seeds.
     assert look(tmp_path, n_seeds=8) == (2, level(2))
@@ -123,7 +123,7 @@ def test_a_run_that_is_damaged_since_costs_no_look_and_one_that_is_new_does(tmp_
     assert look(tmp_path) == (1, level(1))
     assert look(tmp_path, ends=fewer) == (1, level(1))
     assert look(tmp_path, ends=other) == (2, level(2))
-    (tmp_path / FILE).unlink()
+    (tmp_path / LOOKS_FILE).unlink()
     assert look(tmp_path, ends=fewer) == (1, level(1))
     assert look(tmp_path) == (2, level(2))
 
@@ -142,7 +142,7 @@ def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
     tmp_path, monkeypatch
 ):
     assert look(tmp_path) == (1, level(1))
-    before = (tmp_path / FILE).read_bytes()
+    before = (tmp_path / LOOKS_FILE).read_bytes()
 
     def cut_off(*_):
         raise KeyboardInterrupt
@@ -151,8 +151,8 @@ def test_a_look_that_could_not_be_written_down_is_neither_lost_nor_spent_twice(
         patch.setattr("pipeline.files.put_in_place", cut_off)
         with pytest.raises(KeyboardInterrupt):
             look(tmp_path, n_seeds=20)
-    assert [path.name for path in tmp_path.iterdir()] == [FILE]
-    assert (tmp_path / FILE).read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == [LOOKS_FILE]
+    assert (tmp_path / LOOKS_FILE).read_bytes() == before
     assert look(tmp_path, n_seeds=20) == (2, level(2))
 
 
@@ -217,7 +217,7 @@ def damages(data):
 def test_a_file_that_is_not_as_it_was_written_is_refused_in_a_line(tmp_path):
     look(tmp_path)
     look(tmp_path, n_seeds=20)
-    path = tmp_path / FILE
+    path = tmp_path / LOOKS_FILE
     data = json.loads(path.read_text())
     found = list(damages(data))
     assert len(found) > 25
@@ -314,11 +314,11 @@ def test_after_a_look_by_hand_the_settled_ones_share_what_is_left(tmp_path):
 )
 def test_what_was_settled_cannot_change(tmp_path, study, most, words):
     grow(study_of(*THREE), tmp_path, most=40)
-    before = (tmp_path / FILE).read_bytes()
+    before = (tmp_path / LOOKS_FILE).read_bytes()
     with pytest.raises(UserError, match="looks were fixed before the first") as refusal:
         settled_looks(study, tmp_path, most)
     assert words in str(refusal.value)
-    assert (tmp_path / FILE).read_bytes() == before
+    assert (tmp_path / LOOKS_FILE).read_bytes() == before
 
 
 def test_nothing_is_settled_that_could_not_be(tmp_path):

@@ -8,9 +8,9 @@ import pytest
 
 from experiments.plan import TuningSeeds, check_settings, plan, tuning_seeds
 from experiments.study import AS_IT_COMES, AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError
-from pipeline.run_folder import FAILED, FINISHED
+from pipeline.runs import FAILED, FINISHED
 from pipeline.train_spec import TrainSpec
 from report.seed_sentence import seed_sentence, spans
 

@@ -25,7 +25,7 @@ from experiments.results import (
 )
 from experiments.run_files import CURVE_COLUMNS
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.run_folder import FINISHED
+from pipeline.runs import FINISHED
 from report.conclusions import conclusion, places_without_a_run
 from report.figures.figure_files import write_figures
 from report.result_files import write_tables

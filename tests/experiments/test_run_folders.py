@@ -27,9 +27,9 @@ from experiments.run_folders import (
 )
 from experiments.run_in_child import do_run
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline import files, liveness
+from pipeline import files, locks
 from pipeline.errors import UserError
-from pipeline.run_folder import FINISHED
+from pipeline.runs import FINISHED
 
 HERE = platform.node()
 RUN = "qlearning@lake_1"
@@ -49,7 +49,7 @@ def draft_of(root, process, machine=HERE, state=False, run=RUN):
 
 def owner_of(pid):
     """How drafts name a process of this machine that is there, or was."""
-    mark = liveness.mark()
+    mark = locks.mark()
     stat = Path(f"/proc/{pid}/stat")
     began = stat.read_text().rpartition(")")[2].split()[19] if stat.exists() else 1
     return f"{pid}-{began}-{run_folders._place(mark)}"
@@ -120,7 +120,7 @@ def test_each_draft_is_judged_by_itself(tmp_path, dead_pid, live_pid):
 
 
 def test_a_draft_is_kept_for_a_run_that_is_still_to_do(tmp_path, dead_pid):
-    draft = draft_of(tmp_path, f"{dead_pid}-2-{run_folders._place(liveness.mark())}")
+    draft = draft_of(tmp_path, f"{dead_pid}-2-{run_folders._place(locks.mark())}")
     remove_dead_drafts(tmp_path, {RUN})
     assert draft.is_dir()
     leave_drafts(tmp_path, RUN)
@@ -149,7 +149,7 @@ def test_the_next_process_takes_over_what_a_dead_one_has_left(tmp_path, dead_pid
     draft_of(tmp_path, live_pid, state=True)
     assert not take_over(own)
     assert not own.exists()
-    stateless = draft_of(tmp_path, f"{dead_pid}-2-{run_folders._place(liveness.mark())}")
+    stateless = draft_of(tmp_path, f"{dead_pid}-2-{run_folders._place(locks.mark())}")
     left = draft_of(tmp_path, dead_pid, state=True)
     assert take_over(own)
     assert not left.exists()

@@ -33,10 +33,10 @@ from experiments.run_folders import draft_path
 from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.evaluation import kept_evaluators
+from pipeline.evaluation import exact
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.plain_runs import is_plain
 from pipeline.settings.hyperparams import ComponentSpec
+from pipeline.train_spec import is_plain
 
 AGENTS = (
     AgentSpec("first", "qlearning", tuned=False),
@@ -316,20 +316,20 @@ def test_an_environment_registered_by_somebody_else_is_no_plain_one(registered):
 
 
 def test_an_evaluator_is_kept_for_runs_on_the_very_same_environment(registered):
-    kept_evaluators._kept.clear()
+    exact._kept.clear()
     runs = runs_of(Path("x"), 1)
     spec, other = (
         next(run.spec for run in runs if run.environment == name) for name in ("house", "mines")
     )
-    first = kept_evaluators.evaluator_of(spec)
-    assert kept_evaluators.evaluator_of(replace(spec, seed=5)) is first
+    first = exact.evaluator_of(spec)
+    assert exact.evaluator_of(replace(spec, seed=5)) is first
     assert first.yardstick == exact_evaluator(spec).yardstick
     slippery = replace(spec.hyperparams, eval_env_kwargs={"slip": 0.4})
-    changed = kept_evaluators.evaluator_of(replace(spec, hyperparams=slippery))
+    changed = exact.evaluator_of(replace(spec, hyperparams=slippery))
     assert changed.yardstick != first.yardstick
     masked = replace(spec.hyperparams, algorithm={"mask_actions": True})
-    assert kept_evaluators.evaluator_of(replace(spec, hyperparams=masked)) is not first
-    assert kept_evaluators.evaluator_of(other).model.n_states != first.model.n_states
+    assert exact.evaluator_of(replace(spec, hyperparams=masked)) is not first
+    assert exact.evaluator_of(other).model.n_states != first.model.n_states
     registered.kwargs["shelf_reward"] = -7
-    assert kept_evaluators.evaluator_of(spec).yardstick != first.yardstick
-    assert len(kept_evaluators._kept) <= kept_evaluators.MOST_KEPT
+    assert exact.evaluator_of(spec).yardstick != first.yardstick
+    assert len(exact._kept) <= exact.MOST_KEPT

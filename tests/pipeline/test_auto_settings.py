@@ -10,8 +10,7 @@ from pipeline.auto_settings import resolved_spec, training_follows
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import discount_note, exact_evaluator
-from pipeline.settings.hyperparam_entries import read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.settings.hyperparams import read_hyperparams, split
 
 SCALED = {"train_env_wrapper": {"envs.wrappers.ScaleReward": {"scale": "auto"}}}
 CLIP = {"gymnasium.wrappers.ClipReward": {"min_reward": "auto"}}

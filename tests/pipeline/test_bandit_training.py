@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from commands.run_output import describe_pulls, print_outcome
 from envs.bandits import log_uniformly
 from pipeline.pull_recording import PullSummary, summarise_pulls
-from pipeline.run_files import PULLS_FILE
+from pipeline.runs import PULLS_FILE
 from pipeline.settings import hyperparams
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train

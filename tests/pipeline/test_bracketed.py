@@ -12,9 +12,8 @@ from rich.console import Console
 from commands.playing_output import _print_measured
 from commands.run_output import describe
 from envs.brackets.known_brackets import OptimumBracket
-from pipeline.evaluation import bracketed
-from pipeline.evaluation.bracketed import bracketed_yardstick
-from pipeline.evaluation.sampled import Evaluation, Yardstick
+from pipeline.evaluation import sampled
+from pipeline.evaluation.sampled import Evaluation, Yardstick, bracketed_yardstick
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
@@ -114,7 +113,7 @@ def test_where_a_bracket_holds(entry, holds):
 
 
 def test_elsewhere_nothing_is_made_to_find_out(monkeypatch):
-    monkeypatch.delattr(bracketed, "make_single_env")
+    monkeypatch.delattr(sampled, "make_single_env")
     assert bracketed_yardstick(spec_of("FrozenLake-v1")) is None
 
 
@@ -138,7 +137,7 @@ def test_a_run_under_another_gravity_records_none(tmp_path):
 
 def test_a_run_that_beats_the_bracket_says_so(tmp_path, monkeypatch):
     wrong = OptimumBracket(lower=-5000.0, upper=-4000.0, baseline=-6000.0)
-    monkeypatch.setattr(bracketed, "optimum_bracket", lambda env: wrong)
+    monkeypatch.setattr(sampled, "optimum_bracket", lambda env: wrong)
     final = train_and_read(replace(spec_of(), final_episodes=10), tmp_path)
     assert final["beats_optimum"] is True
     assert final["score"] > 1

@@ -31,8 +31,8 @@ from pipeline.callbacks import (
 )
 from pipeline.evaluation.sampled import Evaluation, evaluate
 from pipeline.evaluation_callback import EvaluationCallback
-from pipeline.models.companions import statistics_path
-from pipeline.run_folder import Run
+from pipeline.models.find import statistics_path
+from pipeline.runs import Run
 
 TINY_DQN = {
     "buffer_size": 200,

@@ -14,9 +14,7 @@ from agents.compiled.greedy_play import play_episodes
 from agents.networks.network_worlds import NetworkEnvStates, network_world
 from agents.networks.q_learner import choose_greedily
 from envs.wrappers import DiscretizeObservation
-from pipeline.evaluation.compiled_play import compiled_copy, evaluate_compiled
-from pipeline.evaluation.evaluation_budget import SampledEvaluator
-from pipeline.evaluation.sampled import evaluate
+from pipeline.evaluation.sampled import SampledEvaluator, compiled_copy, evaluate, evaluate_compiled
 
 CART, CAR = "CartPole-v1", "MountainCar-v0"
 WIDTHS = {"low": [-2.4, -3.0, -0.21, -3.0], "high": [2.4, 3.0, 0.21, 3.0]}
@@ -132,15 +130,15 @@ def test_many_steps_take_more_than_one_go(monkeypatch):
 
 @pytest.mark.parametrize(("engine", "expected"), [("compiled", True), ("interpreted", False)])
 def test_an_agent_is_evaluated_by_the_engine_that_trained_it(engine, expected, monkeypatch):
-    from pipeline.evaluation import compiled_play, evaluation_budget
+    from pipeline.evaluation import sampled
 
     env = environments(CART, IN_BINS, 1)
     model = load_algorithm("qlearning")(env=env, seed=1, engine=engine).learn(100)
     used = []
-    for module, name in ((compiled_play, "evaluate_compiled"), (evaluation_budget, "evaluate")):
-        found = getattr(module, name)
+    for name in ("evaluate_compiled", "evaluate"):
+        found = getattr(sampled, name)
         monkeypatch.setattr(
-            module, name, lambda *given, found=found, name=name: used.append(name) or found(*given)
+            sampled, name, lambda *given, found=found, name=name: used.append(name) or found(*given)
         )
     evaluator = SampledEvaluator.__new__(SampledEvaluator)
     vars(evaluator).update(env=environments(CART, IN_BINS), seed=0, n_steps=0, yardstick=None)

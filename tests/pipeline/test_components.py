@@ -29,18 +29,16 @@ from agents import load_algorithm
 from agents.common.schedules import ExponentialSchedule
 from envs.wrappers import FlattenToDiscrete, OneHotObservation, ScaleReward, TerminationReward
 from pipeline.errors import UserError
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
-from pipeline.settings.class_names import find_class
-from pipeline.settings.coercion import ScheduleSpec
 from pipeline.settings.components import (
+    build_algorithm_kwargs,
     build_value,
     callbacks,
+    find_class,
     vec_wrapper_factory,
     wrapper_factory,
 )
-from pipeline.settings.hyperparam_entries import read_hyperparams
-from pipeline.settings.hyperparams import component_specs, split
-from pipeline.settings.literals import DottedName
+from pipeline.settings.hyperparams import component_specs, read_hyperparams, split
+from pipeline.settings.values import DottedName, ScheduleSpec
 from tests.peers.peer_environment import peer_folder, peer_python
 
 TIME_LIMIT = "gymnasium.wrappers.TimeLimit"
@@ -370,7 +368,7 @@ def test_a_wrong_agent_is_told(kwargs: dict[str, Any], complaint: str) -> None:
 def test_reading_needs_no_heavy_library() -> None:
     code = (
         "import sys\n"
-        "from pipeline.settings import components, hyperparams, literals\n"
+        "from pipeline.settings import components, hyperparams, values\n"
         "print({'torch', 'stable_baselines3', 'numba', 'rl_zoo3', 'gymnasium'} & {*sys.modules})"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

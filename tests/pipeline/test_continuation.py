@@ -7,10 +7,9 @@ import pytest
 from rich.console import Console
 
 from pipeline.errors import UserError
-from pipeline.models.companions import replay_buffer_of, statistics_of
-from pipeline.models.model_choice import ModelRequest, choose_model
-from pipeline.models.model_finding import model_at
-from pipeline.models.model_loading import load_to_play
+from pipeline.models.choose import ModelRequest, choose_model
+from pipeline.models.find import model_at, replay_buffer_of, statistics_of
+from pipeline.models.load import load_to_play
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -130,7 +129,7 @@ def test_the_end_is_judged_on_the_statistics_of_the_end(tmp_path, monkeypatch):
         judged.append(round(self.env.obs_rms.count))
         raise RuntimeError("judged")
 
-    evaluator = "pipeline.evaluation.evaluation_budget.SampledEvaluator"
+    evaluator = "pipeline.evaluation.sampled.SampledEvaluator"
     monkeypatch.setattr(f"{evaluator}.at_the_end", note)
     with pytest.raises(RuntimeError, match="judged"):
         train_to(tmp_path, "a2c", {**A2C, "normalize": True}, eval_freq=80)

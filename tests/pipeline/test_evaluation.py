@@ -9,7 +9,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import load_algorithm
 from pipeline.evaluation.sampled import Evaluation, evaluate, evaluation_seed
-from pipeline.models.model_loading import load_model
+from pipeline.models.load import load_model
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train

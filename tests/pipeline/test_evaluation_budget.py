@@ -9,11 +9,15 @@ import pytest
 from rich.console import Console
 
 from agents import load_algorithm
-from pipeline.evaluation import evaluation_budget as budget
-from pipeline.evaluation import evaluation_shares as shares
-from pipeline.evaluation.evaluation_budget import SampledEvaluator, is_sure
-from pipeline.evaluation.evaluation_shares import allowed_steps, shares_of
-from pipeline.evaluation.sampled import Evaluation, evaluate
+from pipeline.evaluation import sampled
+from pipeline.evaluation.sampled import (
+    Evaluation,
+    SampledEvaluator,
+    allowed_steps,
+    evaluate,
+    is_sure,
+    shares_of,
+)
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
@@ -66,11 +70,11 @@ def test_what_is_allowed(algo, engine_in_use, plays_compiled, of_long, of_short)
     found = shares_of(model, plays_compiled=plays_compiled)
     assert allowed_steps(1e6, found) == of_long
     assert allowed_steps(5000, found) == of_short
-    assert allowed_steps(1, found) == shares.STEPS_IN_ANY_CASE
+    assert allowed_steps(1, found) == sampled.STEPS_IN_ANY_CASE
 
 
 def test_short_trainings_are_allowed_more():
-    found = [allowed_steps(n, shares.NETWORK) for n in (2000, 10_000, 20_000, 40_000, 60_000)]
+    found = [allowed_steps(n, sampled.NETWORK) for n in (2000, 10_000, 20_000, 40_000, 60_000)]
     assert found == [2000, 5000, 10_000, 10_000, 15_000]
 
 
@@ -82,7 +86,7 @@ def played(monkeypatch, returns, length):
         asked.append((n_episodes, seed is None))
         return episodes(*[left.pop(0) for _ in range(n_episodes)], length=length)
 
-    monkeypatch.setattr(budget, "evaluate", evaluate)
+    monkeypatch.setattr(sampled, "evaluate", evaluate)
     return asked
 
 

@@ -1,5 +1,9 @@
 """Exact evaluations agree with sampled ones, for every kind of agent whose policy is known."""
 
+import math
+from collections import defaultdict
+
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -8,10 +12,9 @@ from gymnasium import spaces
 from agents import load_algorithm
 from mdp import policy_return, value_iteration
 from pipeline.environments import make_evaluation_env, make_training_env
-from pipeline.evaluation import asked_policies
-from pipeline.evaluation.asked_policies import policy_matrix
+from pipeline.evaluation import policies
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.last_policy import OfLastPolicy
+from pipeline.evaluation.policies import OfLastPolicy, policy_matrix
 from pipeline.evaluation.sampled import Yardstick, evaluate
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -215,8 +218,8 @@ def test_what_takes_longer_than_playing_is_said(monkeypatch):
     evaluator = exact_evaluator(spec)
     agents = {name: briefly_trained(name, spec) for name in ("qlearning", "dqn", "random")}
     assert [evaluator.obstacle(agent) for agent in agents.values()] == ["", "", ""]
-    monkeypatch.setattr(asked_policies, "MOST_NUMBERS", 100 * 100 - 1)
-    monkeypatch.setattr(asked_policies, "MOST_AT_RANDOM", 100 * 60 - 1)
+    monkeypatch.setattr(policies, "MOST_NUMBERS", 100 * 100 - 1)
+    monkeypatch.setattr(policies, "MOST_AT_RANDOM", 100 * 60 - 1)
     assert evaluator.obstacle(agents["qlearning"]) == ""
     assert evaluator.obstacle(agents["dqn"]).startswith("to ask a network about 100 states")
     assert evaluator.obstacle(agents["random"]).startswith("random actions come to too many")
@@ -228,7 +231,7 @@ def test_a_network_is_asked_in_parts_where_states_are_many(name, monkeypatch):
     spec = spec_of("Warehouse")
     evaluator, agent = exact_evaluator(spec), briefly_trained(name, spec)
     at_once = [evaluator(agent, sure) for sure in (True, False)]
-    monkeypatch.setattr(asked_policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
+    monkeypatch.setattr(policies, "MOST_AT_ONCE", 100 * 7)  # rows of 100 numbers
     for sure, expected in zip((True, False), at_once, strict=True):
         assert evaluator(agent, sure).mean_return == pytest.approx(expected.mean_return, rel=1e-5)
 
@@ -260,9 +263,9 @@ def test_a_table_is_looked_up_only_where_that_is_what_the_agent_does():
         assert len(agent.policy.q_tables) == tables
         agent.policy.q_tables.numpy()[:] = rng.normal(size=(tables, 16, 4)).round(1)
         expected, _ = agent.predict(states, deterministic=True)
-        assert (asked_policies.best_actions(agent, states) == expected).all()
+        assert (policies.best_actions(agent, states) == expected).all()
     contrary = Contrary(env="FrozenLake-v1")
-    assert (asked_policies.best_actions(contrary, states) == 3).all()
+    assert (policies.best_actions(contrary, states) == 3).all()
 
 
 def test_what_an_unknown_agent_samples_from_is_not_guessed():
@@ -343,3 +346,80 @@ def test_an_agent_that_has_learnt_something_else_is_evaluated_anew():
     assert (after.mean_return, after.exact_std) == (anew.mean_return, anew.exact_std)
     assert after.mean_return != before.mean_return
     assert evaluator.values(evaluator.policy(agent, True))[0] != values[0]
+
+
+# With four cells there are as many states as actions, where rows can be mistaken for columns.
+MAPS = {"four cells": ["SF", "FG"], "six cells": ["SFF", "FHG"]}
+LIMIT = 12
+
+
+def trained(name, env_kwargs, **arguments):
+    """A run's specification, and an agent that has learned for a while."""
+    entry = {"n_timesteps": 1, "env_kwargs": {**env_kwargs, "max_episode_steps": LIMIT}}
+    spec = TrainSpec(name, "FrozenLake-v1", split(entry), entry, seed=0)
+    agent = load_algorithm(name)(env=make_training_env(spec, None), seed=0, **arguments)
+    return spec, agent.learn(400)
+
+
+def epsilon_greedy(row, agent):
+    """As the agent chooses where values differ; equal ones share."""
+    best = [value == max(row) for value in row]
+    epsilon = agent.exploration_rate
+    return [epsilon / len(row) + (1 - epsilon) * is_best / sum(best) for is_best in best]
+
+
+def boltzmann(row, agent):
+    weights = [math.exp(value / 0.3) for value in row]
+    return [weight / sum(weights) for weight in weights]
+
+
+STRATEGIES = {
+    "epsilon_greedy": (epsilon_greedy, {"exploration_final_eps": 0.25}),
+    "boltzmann": (boltzmann, {"exploration": "boltzmann", "temperature": 0.3}),
+}
+
+
+def added_up(agent, choose, env):
+    """Mean return and mean length of an episode, by going through all of them at once."""
+    outcomes = env.unwrapped.P
+    at = {env.unwrapped.s: 1.0}
+    mean_return = mean_length = 0.0
+    for _ in range(LIMIT):
+        following = defaultdict(float)
+        for state, chance in at.items():
+            mean_length += chance
+            chosen = choose(agent.policy.q_table[state].tolist(), agent)
+            for action, probability in enumerate(chosen):
+                for share, next_state, reward, terminated in outcomes[state][action]:
+                    likelihood = chance * probability * share
+                    mean_return += likelihood * reward
+                    if not terminated:
+                        following[next_state] += likelihood
+        at = following
+    return mean_return, mean_length
+
+
+@pytest.mark.parametrize("cells", MAPS)
+@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("name", ["qlearning", "sarsa"])
+def test_the_worth_of_exploring(name, strategy, cells):
+    choose, arguments = STRATEGIES[strategy]
+    env_kwargs = {"desc": MAPS[cells], "is_slippery": False}
+    spec, agent = trained(name, env_kwargs, **arguments)
+    found = exact_evaluator(spec)(agent, deterministic=False)
+    env = gym.make("FrozenLake-v1", **env_kwargs)
+    env.reset(seed=0)
+    mean_return, mean_length = added_up(agent, choose, env)
+    assert found.mean_return == pytest.approx(mean_return, abs=1e-12)
+    assert found.lengths[0] == pytest.approx(mean_length, abs=1e-12)
+    # It has learnt something, and exploring costs some of it.
+    assert 0.05 < mean_return < exact_evaluator(spec)(agent).mean_return
+
+
+def test_the_worth_of_noise_is_refused():
+    spec, agent = trained("qlearning", {"desc": MAPS["four cells"]}, exploration="gaussian_noise")
+    evaluator = exact_evaluator(spec)
+    with pytest.raises(ValueError, match="no closed-form action probabilities"):
+        evaluator(agent, deterministic=False)
+    # What it has learned can be told all the same.
+    assert evaluator(agent).is_exact

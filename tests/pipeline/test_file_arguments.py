@@ -13,9 +13,14 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from pipeline.errors import UserError
-from pipeline.settings.components import callbacks, vec_wrapper_factory, wrapper_factory
-from pipeline.settings.constructor_arguments import constructor_parameters
-from pipeline.settings.file_arguments import confined, names_a_place
+from pipeline.settings.components import (
+    callbacks,
+    confined,
+    names_a_place,
+    vec_wrapper_factory,
+    wrapper_factory,
+)
+from pipeline.settings.values import constructor_parameters
 from tests.peers.peer_environment import peer_folder
 
 CALLBACKS = "stable_baselines3.common.callbacks"

@@ -2,27 +2,32 @@
 
 import errno
 import json
+import math
 import os
 import signal
 import sys
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
 from pipeline import files
+from pipeline.digests import FIELD
 from pipeline.files import (
-    lasting,
+    json_text,
     naming,
+    plain,
     portable_name,
     put_in_place,
     replacing,
     write_json,
     write_text,
 )
-from pipeline.folder_lock import folder_lock
+from pipeline.locks import folder_lock
+from pipeline.runs import FINISHED, Run
 
 
 def names(folder):
@@ -109,32 +114,15 @@ def test_a_disk_that_fails_changes_nothing(tmp_path, monkeypatch):
     path = tmp_path / "model.zip"
     path.write_text("old")
 
-    def no_space(_):
+    def no_space(*_, **__):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, "fsync", no_space)
+    monkeypatch.setattr(files.os, "replace", no_space)
     with pytest.raises(OSError, match="No space left") as caught:
         write_json(path, "new")
     assert caught.value.filename == str(path)
     assert path.read_text() == "old"
     assert names(tmp_path) == ["model.zip"]
-
-
-def test_what_lasts_is_on_the_disk_before_it_has_its_name_and_the_name_is_after(
-    tmp_path, monkeypatch
-):
-    path, done = tmp_path / "model.zip", []
-    put_in_place = files.put_in_place
-    monkeypatch.setattr(
-        files.os, "fsync", lambda number: done.append(Path(f"/proc/self/fd/{number}").readlink())
-    )
-    monkeypatch.setattr(
-        files, "put_in_place", lambda *args: (put_in_place(*args), done.append("renamed"))
-    )
-    with lasting(path) as file:
-        file.write(b"whole")
-        draft = tmp_path / names(tmp_path)[0]
-    assert done == [draft, "renamed", tmp_path]
 
 
 def test_a_folder_that_cannot_be_flushed_is_passed_over_and_a_broken_disk_is_not(
@@ -312,3 +300,54 @@ def test_the_disk_is_waited_for_also_in_a_process_that_was_forked(tmp_path):
     _, status = os.waitpid(child, 0)
     watch.cancel()
     assert os.waitstatus_to_exitcode(status) == 7
+
+
+leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
+values = st.recursive(
+    leaves, lambda inner: st.lists(inner) | st.dictionaries(st.text(), inner), max_leaves=10
+)
+
+
+def strictly(text):
+    """The value of a text that a strict reader takes."""
+
+    def refuse(name):
+        raise AssertionError(f"{name} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+@given(values)
+def test_what_is_written_is_read_again_as_it_was(value):
+    assert strictly(json_text(value)) == value
+
+
+def test_what_is_no_json_is_written_as_the_nearest_that_is():
+    odd = {
+        "nan": math.nan,
+        "limits": (-math.inf, np.float32(np.inf)),
+        "array": np.arange(3, dtype=np.int8),
+        "NaN, Infinity": "NaN",
+        "surrogate": "\udcff",
+        1: np.bool_(True),
+    }
+    assert strictly(json_text(odd, indent=2)) == {
+        "nan": None,
+        "limits": [-math.inf, math.inf],
+        "array": [0, 1, 2],
+        "NaN, Infinity": "NaN",
+        "surrogate": "\udcff",
+        "1": True,
+    }
+    with pytest.raises(TypeError, match="object"):
+        plain([object()])
+
+
+def test_a_record_of_odd_values_is_valid_and_whole(tmp_path):
+    run = Run(tmp_path, "FrozenLake-v1")
+    run.end(state=FINISHED, spec={"clip": math.inf, "scale": np.float32(0.5)}, final=math.nan)
+    record = strictly(run.info_path.read_text(encoding="utf-8"))
+    assert record == run.read_info()  # which holds it against its own digest
+    assert record["spec"] == {"clip": math.inf, "scale": 0.5}
+    assert record["final"] is None
+    assert FIELD in record

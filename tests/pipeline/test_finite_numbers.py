@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from agents.bandits.score_policy import BanditPolicy
-from experiments.run_in_child import _check_rewards
+from experiments.bandits import _check_rewards
 from pipeline.finite_numbers import NotFiniteError, check_model, check_rows, is_finite
 from pipeline.number_watch import NumberWatch
 

@@ -19,11 +19,10 @@ from agents.common.model_files import JsonAlgorithm
 from pipeline import training
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.models.model_loading import load_model
-from pipeline.models.model_zips import _JSON_FAMILIES, hand_written_algorithm, read_model
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy, needs_policy
-from pipeline.settings.constructor_arguments import algorithm_parameters
+from pipeline.models.load import _JSON_FAMILIES, hand_written_algorithm, load_model, read_model
+from pipeline.settings.components import build_algorithm_kwargs, default_policy, needs_policy
 from pipeline.settings.hyperparams import split
+from pipeline.settings.values import algorithm_parameters
 from pipeline.train_spec import TrainSpec
 
 

@@ -6,7 +6,7 @@ import json
 import pytest
 
 from pipeline import files
-from pipeline.run_folder import ROOM, ROOM_BYTES, Run
+from pipeline.runs import ROOM, ROOM_BYTES, Run
 
 
 @pytest.fixture

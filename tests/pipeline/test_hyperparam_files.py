@@ -10,23 +10,29 @@ from pipeline.agent_checks import check_fit
 from pipeline.auto_settings import resolved_spec, without_auto
 from pipeline.environments import make_single_env, make_training_env
 from pipeline.preparation import algorithm_kwargs
-from pipeline.settings import hyperparams, tuned_seeds
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
-from pipeline.settings.components import callbacks, vec_wrapper_factory
-from pipeline.settings.constructor_arguments import constructor_parameters
-from pipeline.settings.hyperparam_entries import (
+from pipeline.settings import hyperparams
+from pipeline.settings.components import (
+    build_algorithm_kwargs,
+    callbacks,
+    default_policy,
+    vec_wrapper_factory,
+)
+from pipeline.settings.hyperparams import (
     entry_names,
     override,
     read_hyperparams,
     seeds_tuned_on,
+    split,
 )
-from pipeline.settings.hyperparams import split
-from pipeline.settings.strict_yaml import read_yaml
+from pipeline.settings.values import constructor_parameters
+from pipeline.settings.yaml import read_yaml
 
 FOLDER = Path(hyperparams.__file__).parents[2] / "hyperparams"
 FILES = sorted(FOLDER.glob("*.yml"))
 READ = {path.stem: read_yaml(path) for path in FILES}
-ENTRIES = [(algo, key) for algo, read in READ.items() for key in read if key != tuned_seeds.KEY]
+ENTRIES = [
+    (algo, key) for algo, read in READ.items() for key in read if key != hyperparams.TUNED_ON
+]
 
 # Agents of one environment alone have no entry that stands in for others.
 SPECIALISTS = {"angle"}
@@ -91,7 +97,7 @@ def test_every_file_is_an_agents_and_every_agent_has_one():
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
 def test_every_file_names_known_environments(path):
-    names = [name for name in READ[path.stem] if name != tuned_seeds.KEY]
+    names = [name for name in READ[path.stem] if name != hyperparams.TUNED_ON]
     assert set(names) - {"default"} <= set(gym.registry)
     assert entry_names(path.stem) == [name for name in names if name != "default"]
     assert ("default" in names) == (path.stem not in SPECIALISTS)

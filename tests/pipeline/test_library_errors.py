@@ -7,7 +7,7 @@ from contextlib import nullcontext
 import pytest
 import torch as th
 
-from pipeline.library_errors import LibraryError, blame_settings
+from pipeline.failures import LibraryError, blame_settings
 
 MODEL = types.SimpleNamespace(num_timesteps=1234)
 

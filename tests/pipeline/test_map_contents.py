@@ -3,8 +3,8 @@
 import gymnasium as gym
 import pytest
 
+from pipeline.environments import with_logs_located, with_maps_read
 from pipeline.errors import UserError
-from pipeline.map_contents import with_logs_located, with_maps_read
 
 ROWS = ["S..", ".#.", "..G"]
 

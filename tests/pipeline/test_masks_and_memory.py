@@ -15,10 +15,8 @@ import enjoy
 from agents import load_algorithm
 from pipeline.agent_checks import check_fit
 from pipeline.errors import UserError
-from pipeline.evaluation.asked_policies import policy_matrix
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.mask_telling import player, takes_masks
-from pipeline.evaluation.policy_kinds import has_memory
+from pipeline.evaluation.policies import has_memory, player, policy_matrix, takes_masks
 from pipeline.evaluation.sampled import evaluate
 from pipeline.playing import play_episodes
 from pipeline.settings.hyperparams import split

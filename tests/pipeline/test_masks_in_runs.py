@@ -15,11 +15,10 @@ from envs.known_models import action_masks_of_states
 from pipeline.agent_checks import check_fit
 from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
-from pipeline.evaluation.asked_policies import policy_matrix
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.evaluation.mask_telling import takes_masks
+from pipeline.evaluation.policies import policy_matrix, takes_masks
 from pipeline.evaluation.sampled import evaluate
-from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.playing import play_episodes, playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec

@@ -15,10 +15,14 @@ from agents import ALGORITHMS, load_algorithm
 from agents.common.model_files import JsonAlgorithm
 from envs.wrappers import ActionMasks
 from pipeline.errors import UserError
-from pipeline.models.admitted_classes import own_classes
-from pipeline.models.model_loading import load_model, load_replay_buffer, load_to_play
-from pipeline.models.model_zips import read_model
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs
+from pipeline.models.load import (
+    load_model,
+    load_replay_buffer,
+    load_to_play,
+    own_classes,
+    read_model,
+)
+from pipeline.settings.components import build_algorithm_kwargs
 from pipeline.user_modules import import_typed
 
 TINY = {"net_arch": [4]}

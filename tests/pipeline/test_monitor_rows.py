@@ -12,8 +12,7 @@ from pipeline.resuming.monitor_rows import LENGTHS, RETURNS, TIMES
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.resuming.unfinished_runs import go_on, recorded_training
-from pipeline.settings.hyperparam_entries import override, read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.settings.hyperparams import override, read_hyperparams, split
 from pipeline.training import carry_out, prepare
 
 LAKE = "FrozenLake-v1"

@@ -18,9 +18,9 @@ import pytest
 import yaml
 from rich.console import Console
 
+from pipeline.digests import sealed
 from pipeline.errors import UserError
-from pipeline.file_digests import sealed
-from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.packing.model_card import fenced
 from pipeline.packing.pack_files import check_pack, default_target, pack, unpacked
 from pipeline.packing.scrubbing import check_untold, without_places, zip_to_tell

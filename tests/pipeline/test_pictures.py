@@ -16,7 +16,7 @@ from agents import load_algorithm
 from pipeline.evaluation.sampled import Yardstick
 from pipeline.pictures import learning_curve
 from pipeline.pictures.learning_curve import draw_learning_curve, moving_average, read_monitors
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 
 
 def write_monitor(folder, name, rows, start=1000.0):

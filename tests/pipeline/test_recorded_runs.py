@@ -19,14 +19,13 @@ from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize, unwrap
 
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
-from pipeline.models.model_choice import ModelRequest, choose_model
-from pipeline.models.model_loading import load_to_play
-from pipeline.models.normalization import with_normalised_rewards
-from pipeline.models.recorded_runs import recorded_run, run_around, run_of
+from pipeline.models.choose import ModelRequest, choose_model
+from pipeline.models.find import recorded_run, run_around, run_of
+from pipeline.models.load import load_to_play, with_normalised_rewards
 from pipeline.playing import play_episodes, playing_env
-from pipeline.run_folder import Run
-from pipeline.settings.hyperparam_entries import NoEntryError
-from pipeline.settings.strict_yaml import read_saved_settings
+from pipeline.runs import Run
+from pipeline.settings.hyperparams import NoEntryError
+from pipeline.settings.yaml import read_saved_settings
 
 CONFIG = OrderedDict(
     [
@@ -361,14 +360,14 @@ def test_where_a_folder_says_nothing_the_default_entry_counts(zoo, tmp_path, mon
     """But whether a stranger's model saw normalised observations is not ours to say."""
     request = ModelRequest(hub(zoo, tmp_path), "a2c", "CartPole-v1")
     entry = {"normalize": True, "frame_stack": 2}
-    monkeypatch.setattr("pipeline.models.model_choice.read_hyperparams", lambda *_: entry)
+    monkeypatch.setattr("pipeline.models.choose.read_hyperparams", lambda *_: entry)
     hyperparams = choose_model(request).spec.hyperparams
     assert (hyperparams.normalize, hyperparams.frame_stack) == (None, 2)
 
     def no_entry(*_):
         raise NoEntryError("none")
 
-    monkeypatch.setattr("pipeline.models.model_choice.read_hyperparams", no_entry)
+    monkeypatch.setattr("pipeline.models.choose.read_hyperparams", no_entry)
     assert choose_model(request).spec.hyperparams.frame_stack is None
 
 

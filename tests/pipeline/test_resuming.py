@@ -15,9 +15,9 @@ from rich.console import Console
 
 from agents import ALGORITHMS
 from pipeline.auto_settings import resolved_spec
+from pipeline.digests import LOCK
 from pipeline.errors import UserError
-from pipeline.evaluation import evaluation_shares
-from pipeline.file_digests import LOCK
+from pipeline.evaluation import sampled
 from pipeline.resuming import saved_states
 from pipeline.resuming.log_positions import cut_back, log_positions
 from pipeline.resuming.saved_states import SavedState
@@ -29,10 +29,8 @@ from pipeline.resuming.unfinished_runs import (
     recorded_training,
     tell_changes,
 )
-from pipeline.run_folder import Run
-from pipeline.run_lock import at_work_on
-from pipeline.settings.hyperparam_entries import override, read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.runs import Run, at_work_on
+from pipeline.settings.hyperparams import override, read_hyperparams, split
 from pipeline.training import carry_out, prepare, train
 from pipeline.user_modules import import_typed
 from snapshots.recording import Snapshot
@@ -108,7 +106,7 @@ TRAININGS = [
 @pytest.fixture(autouse=True)
 def short_evaluations(monkeypatch):
     """As many steps as a test can wait for, shared out as ever."""
-    monkeypatch.setattr(evaluation_shares, "STEPS_IN_ANY_CASE", 600)
+    monkeypatch.setattr(sampled, "STEPS_IN_ANY_CASE", 600)
 
 
 class CutOffError(BaseException):
@@ -494,7 +492,7 @@ def test_models_are_on_the_disk_before_a_state_that_comes_after_them(tmp_path, m
     """They are not written again by a run that goes on from it."""
     held, save = [], saved_states.save_state
     monkeypatch.setattr(
-        "pipeline.run_folder.sync_together",
+        "pipeline.runs.sync_together",
         lambda files, _: held.extend(path.name for path in files),
     )
     seen = []

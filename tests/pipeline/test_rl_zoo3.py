@@ -18,7 +18,7 @@ from stable_baselines3.common.results_plotter import ts2xy
 
 import train
 from pipeline.packing.pack_files import pack
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from tests.peers.peer_environment import peer_python
 
 ROOT = Path(train.__file__).parent

@@ -10,15 +10,13 @@ from agents import load_algorithm
 from pipeline.auto_settings import resolved_spec, without_auto
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation.sampled import evaluate, evaluation_seed
-from pipeline.settings import hyperparam_entries
-from pipeline.settings.hyperparam_entries import read_hyperparams
-from pipeline.settings.hyperparams import split
-from pipeline.settings.strict_yaml import read_yaml
-from pipeline.settings.tuned_seeds import KEY as TUNED_ON
+from pipeline.settings import hyperparams
+from pipeline.settings.hyperparams import TUNED_ON, read_hyperparams, split
+from pipeline.settings.yaml import read_yaml
 from pipeline.train_spec import TrainSpec
 
 PURPOSES = (1, 2, 3, 4)  # in training, at its end, of the page's film, of films of training
-FILES = sorted((Path(hyperparam_entries.__file__).parents[2] / "hyperparams").glob("*.yml"))
+FILES = sorted((Path(hyperparams.__file__).parents[2] / "hyperparams").glob("*.yml"))
 TUNED, JUDGED = range(10), range(1000, 1010)
 
 

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
+from pipeline.digests import LOCK
 from pipeline.errors import UserError
-from pipeline.file_digests import LOCK
-from pipeline.liveness import mark
-from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.locks import mark
+from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.packing.pack_files import check_pack, unpacked
 from pipeline.packing.study_packs import is_study, pack_study
 from pipeline.settings.hyperparams import split

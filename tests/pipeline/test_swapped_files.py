@@ -13,9 +13,8 @@ from rich.console import Console
 
 from experiments.off_policy.logged_policies import read_policy
 from pipeline.errors import UserError
-from pipeline.models.continuation import agent_to_continue
-from pipeline.models.model_choice import ModelRequest, choose_model, model_of_run
-from pipeline.models.model_loading import load_model, load_to_play
+from pipeline.models.choose import ModelRequest, agent_to_continue, choose_model, model_of_run
+from pipeline.models.load import load_model, load_to_play
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec

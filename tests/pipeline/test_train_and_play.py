@@ -14,8 +14,8 @@ from stable_baselines3.common.vec_env import unwrap_vec_normalize
 
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
-from pipeline.models.model_choice import ChosenModel, with_statistics
-from pipeline.models.model_zips import ModelFile
+from pipeline.models.choose import ChosenModel, with_statistics
+from pipeline.models.load import ModelFile
 from pipeline.playing import playing_env
 from pipeline.settings.hyperparams import split
 from pipeline.stopping import stops_noticed

@@ -8,7 +8,7 @@ from pipeline.resuming import saved_states
 from pipeline.resuming.state_keeping import SaveInterval
 from pipeline.resuming.state_saver import StateSaver
 from pipeline.resuming.user_state import put_back, user_state
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 from pipeline.user_modules import import_typed
 from snapshots.recording import Snapshot, record
 from snapshots.restoring import restore

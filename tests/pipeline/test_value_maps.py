@@ -11,7 +11,7 @@ from pipeline.environments import make_training_env
 from pipeline.evaluation import value_maps
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal, value_map
-from pipeline.models.model_loading import load_model
+from pipeline.models.load import load_model
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train

@@ -18,8 +18,7 @@ from pipeline.environments import make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.preparation import algorithm_kwargs, make_model
-from pipeline.settings.hyperparam_entries import read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.settings.hyperparams import read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
 from pipeline.watching import map_recorder, table_recorder, watch_choice

@@ -9,8 +9,8 @@ import pytest
 
 from experiments.child_processes import TaskFailedError
 from experiments.run_files import difference
+from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
-from pipeline.file_digests import DamagedFileError
 from report.learning_page import first_runs, kept_pages
 from report.learning_page.first_runs import _train_again, write_first_pages
 from report.page import write_report
@@ -101,7 +101,7 @@ def test_runs_are_held_against_each_other_to_the_last_bit(analysis, monkeypatch)
 
 def test_what_is_no_zip_is_damaged(analysis, monkeypatch):
     run = first_of(analysis).run
-    monkeypatch.setattr("pipeline.file_digests.RecordedFiles.read", lambda *_: b"PK")
+    monkeypatch.setattr("pipeline.digests.RecordedFiles.read", lambda *_: b"PK")
     with pytest.raises(DamagedFileError, match="is no whole zip"):
         difference(run, run)
 

@@ -23,9 +23,9 @@ from experiments.run_files import read_episodes
 from experiments.run_in_child import do_run
 from experiments.study import QuickSpec, read_study
 from mdp import value_iteration
-from pipeline.models.model_loading import load_model
+from pipeline.models.load import load_model
 from pipeline.preparation import algorithm_kwargs
-from pipeline.settings.hyperparam_entries import read_hyperparams
+from pipeline.settings.hyperparams import read_hyperparams
 from tuning.search_spaces import read_search_space
 
 ROOT = Path(compare.__file__).parent

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.settings.hyperparam_entries import read_hyperparams, seeds_tuned_on
+from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
 from tuning.entry_files import entry_text
 from tuning.retesting import (
     Outcome,

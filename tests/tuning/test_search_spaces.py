@@ -11,12 +11,10 @@ from optuna.trial import FixedTrial
 from agents import ALGORITHMS, load_algorithm
 from pipeline.auto_settings import resolved_spec
 from pipeline.errors import UserError
-from pipeline.settings import hyperparam_entries
-from pipeline.settings.algorithm_kwargs import build_algorithm_kwargs, default_policy
-from pipeline.settings.components import wrapper_factory
-from pipeline.settings.hyperparam_entries import entry_names, read_hyperparams
-from pipeline.settings.hyperparams import split
-from pipeline.settings.strict_yaml import read_yaml
+from pipeline.settings import hyperparams
+from pipeline.settings.components import build_algorithm_kwargs, default_policy, wrapper_factory
+from pipeline.settings.hyperparams import entry_names, read_hyperparams, split
+from pipeline.settings.yaml import read_yaml
 from tuning import search_spaces
 from tuning.dimensions import same
 from tuning.search_spaces import corners, read_search_space
@@ -64,7 +62,7 @@ class Masked(gym.Env):
 def files_read_once():
     """They hold a dozen entries each, and reading them is most of what these tests take."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (search_spaces, hyperparam_entries):
+        for module in (search_spaces, hyperparams):
             patch.setattr(module, "read_yaml", cache(read_yaml))
         yield
 

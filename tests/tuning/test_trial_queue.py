@@ -2,7 +2,7 @@
 
 import pytest
 
-from pipeline import liveness
+from pipeline import locks
 from tuning import trial_queue
 from tuning.trial_queue import DRIVER
 
@@ -34,8 +34,8 @@ def test_a_trial_of_a_driver_that_is_gone_is_taken_up_again(toy, kind, tmp_path,
     storage = storage_of(kind, tmp_path)
     first = toy.opened(toy.tuning(), tmp_path, storage).queue
     first._add_places()
-    mark = liveness.mark()
-    monkeypatch.setattr(liveness, "mark", lambda: {**mark, "began": 1})  # not this process
+    mark = locks.mark()
+    monkeypatch.setattr(locks, "mark", lambda: {**mark, "began": 1})  # not this process
     lost = first.claim(lambda _: {})
     monkeypatch.undo()
     kept = toy.opened(toy.tuning(), tmp_path, storage).queue
@@ -50,8 +50,8 @@ def test_a_trial_of_a_driver_that_is_gone_is_taken_up_again(toy, kind, tmp_path,
 def test_one_elsewhere_counts_as_gone_once_it_has_been_silent(toy, tmp_path, monkeypatch):
     far = toy.opened(toy.tuning(), tmp_path).queue
     far._add_places()
-    mark = liveness.mark()
-    monkeypatch.setattr(liveness, "mark", lambda: {**mark, "host": "far", "boot": "another"})
+    mark = locks.mark()
+    monkeypatch.setattr(locks, "mark", lambda: {**mark, "host": "far", "boot": "another"})
     trial = far.claim(lambda _: {})
     monkeypatch.undo()
     clock = [0.0]

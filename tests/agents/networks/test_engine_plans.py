@@ -127,7 +127,7 @@ def test_engines_of_the_table_are_those_of_the_classes():
 
 
 def engine_default(name):
-    from pipeline.settings.constructor_arguments import algorithm_parameters
+    from pipeline.settings.values import algorithm_parameters
 
     parameter = algorithm_parameters(load_algorithm(name)).get("engine")
     return None if parameter is None else parameter.default

@@ -1,15 +1,19 @@
-"""Finding the model to play, and what it is played on: the newest of a run, or one by its path.
+"""Choosing the model to play or to train further, and what it is played on.
 
 What the environment is made of comes from, the first first:
 
 1. the request: agent, environment, arguments of the environment, statistics;
 2. for hand-written agents, the zip, which says what agent it holds;
-3. what the model's folder says, see `pipeline.models.recorded_runs`;
+3. what the model's folder says, see `pipeline.models.find`;
 4. the entry of ``hyperparams/<algo>.yml``, apart from ``normalize``, where the folder says nothing.
 
-Statistics of VecNormalize are used wherever there are some that belong to the model, see
-`pipeline.models.companions`, since they lie there for no other reason than that it was trained on
-them.
+Statistics of VecNormalize are used wherever there are some that belong to the model, since they lie
+there for no other reason than that it was trained on them.
+
+Further training begins a new run, in a folder of its own. As in rl_zoo3, the agent's networks or
+tables, its statistics and its replay buffer go on, and hyperparameters are those of the new run's
+entry. Other than there, the agent's steps are counted on, and schedules are where so many of all
+steps put them, rather than at their beginning.
 """
 
 from __future__ import annotations
@@ -17,79 +21,79 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.agent_checks import check_algorithm
 from pipeline.auto_settings import without_auto
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
-from pipeline.models.companions import statistics_of
-from pipeline.models.model_finding import Which, model_at, model_of
-from pipeline.models.model_zips import (
+from pipeline.models.find import (
+    RecordedRun,
+    Which,
+    check_digest,
+    model_at,
+    model_of,
+    recorded_run,
+    replay_buffer_of,
+    run_around,
+    statistics_of,
+)
+from pipeline.models.load import (
     ModelFile,
+    Statistics,
+    agent_class,
     hand_written_algorithm,
+    load_model,
+    load_replay_buffer,
+    normalising,
     read_model,
+    read_statistics,
     telling_masks,
 )
-from pipeline.models.normalization import Statistics, normalising, read_statistics
-from pipeline.models.recorded_runs import RecordedRun, recorded_run, run_around
 from pipeline.module_records import check_recorded
-from pipeline.run_folder import Run
-from pipeline.settings.hyperparam_entries import NoEntryError, read_hyperparams
-from pipeline.settings.hyperparams import split
+from pipeline.runs import Run
+from pipeline.settings.hyperparams import NoEntryError, read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import UserModule
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
 
 
 @dataclass(frozen=True)
 class ModelRequest:
-    """Which model is asked for.
+    """Which model is asked for."""
 
-    Attributes:
-        path: a zip or a run folder, instead of looking for a run.
-        algo: name of the agent; None for what the zip or its run folder says, or else ``"ppo"``.
-        env_id: id of the environment; None for what the run folder says, or else
-            ``"CartPole-v1"``.
-        log_folder: the folder above all runs.
-        run_number: number of the run; 0 for the newest, -1 for one without a number.
-        which: the model at the end of training, the best, that of the last checkpoint, or that of
-            the checkpoint after so many steps.
-        statistics: a file of VecNormalize's statistics, instead of those that lie with the model.
-        env_kwargs: arguments of the environment, to change those of the run.
-        user_modules: modules of the user's, imported already; a run has no others imported.
-        seed: of the episodes.
-        device: torch device of the networks.
-        zipped_in: the pack that the folder was unpacked from.
-    """
-
-    path: Path | None = None
+    path: Path | None = None  # a zip or a run folder, instead of looking for a run
+    # name of the agent; None for what the zip or its run folder says, or else ``"ppo"``
     algo: str | None = None
+    # id of the environment; None for what the run folder says, or else ``"CartPole-v1"``
     env_id: str | None = None
-    log_folder: Path = Path("logs")
-    run_number: int = 0
+    log_folder: Path = Path("logs")  # the folder above all runs
+    run_number: int = 0  # number of the run; 0 for the newest, -1 for one without a number
+    # the model at the end of training, the best, that of the last checkpoint, or that of the
+    # checkpoint after so many steps
     which: Which = "final"
+    # a file of VecNormalize's statistics, instead of those that lie with the model
     statistics: Path | None = None
+    # arguments of the environment, to change those of the run
     env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    # modules of the user's, imported already; a run has no others imported
     user_modules: tuple[UserModule, ...] = ()
-    seed: int = 0
-    device: str = "auto"
-    zipped_in: Path | None = None
+    seed: int = 0  # of the episodes
+    device: str = "auto"  # torch device of the networks
+    zipped_in: Path | None = None  # the pack that the folder was unpacked from
 
 
 @dataclass(frozen=True)
 class ChosenModel:
-    """A model and the run that it comes from; its files have been read, and are not read again.
+    """A model and the run that it comes from; its files have been read, and are not read again."""
 
-    Attributes:
-        file: the zip.
-        spec: how its environments are made.
-        run: the run folder, or None for a zip that lies elsewhere.
-        statistics: VecNormalize's statistics that it is played with, or None.
-    """
-
-    file: ModelFile
-    spec: TrainSpec
-    run: Run | None
+    file: ModelFile  # the zip
+    spec: TrainSpec  # how its environments are made
+    run: Run | None  # the run folder, or None for a zip that lies elsewhere
+    # VecNormalize's statistics that it is played with, or None
     statistics: Statistics | None = None
 
     @property
@@ -104,11 +108,7 @@ def choose_model(request: ModelRequest) -> ChosenModel:
 
 
 def find_model(request: ModelRequest) -> ChosenModel:
-    """Find the model that is asked for, without loading a library that takes long.
-
-    Raises:
-        UserError: if there is no such model, or it may not be loaded.
-    """
+    """Find the model that is asked for, without loading a library that takes long."""
     if request.statistics is not None and not request.statistics.is_file():
         raise UserError(f"no such file of statistics: {request.statistics}")
     if request.path is None:
@@ -119,11 +119,7 @@ def find_model(request: ModelRequest) -> ChosenModel:
 
 
 def model_of_run(path: Path, spec: TrainSpec, run: Run) -> ChosenModel:
-    """A model of a run whose spec is known, ready to be played.
-
-    Raises:
-        UserError: if it, or what goes with it, is not as the run left it.
-    """
+    """A model of a run whose spec is known, ready to be played."""
     return with_statistics(ChosenModel(read_model(path, run), spec, run))
 
 
@@ -202,15 +198,7 @@ def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
 
 
 def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenModel:
-    """The model with the statistics that it is played with, which are there and may be read.
-
-    Args:
-        chosen: the model.
-        named: a file of them, instead of those that lie with the model.
-
-    Raises:
-        UserError: if they are not.
-    """
+    """The model with the statistics that it is played with, which are there and may be read."""
     params_path = None if chosen.run is None else chosen.run.params_path
     path, normalize = (
         named or statistics_of(chosen.path, params_path),
@@ -226,3 +214,58 @@ def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenMod
     statistics = read_statistics(path, chosen.run)
     spec = normalising(chosen.spec, statistics.settings)
     return replace(chosen, spec=spec, statistics=statistics)
+
+
+def agent_to_continue(path: Path) -> Path:
+    """The zip that a path means, with or without its suffix, or of a run folder.
+
+    What goes with it is looked at too, before a run begins that could not.
+    """
+    model = model_at(path)
+    run = run_around(model)
+    read_model(model, run)
+    for file in (_statistics_path(model), replay_buffer_of(model)):
+        if file is not None:
+            check_digest(run, file)
+    return model
+
+
+def model_to_continue(spec: TrainSpec) -> ModelFile | None:
+    """The zip of the agent to go on with, read once and for all; None for a new agent."""
+    if spec.trained_agent is None:
+        return None
+    return read_model(spec.trained_agent, run_around(spec.trained_agent))
+
+
+def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
+    """The statistics that go on with the agent; None where there are none, or none are wanted."""
+    if spec.trained_agent is None or spec.saved_hyperparams.get("normalize") is False:
+        return None
+    path = _statistics_path(spec.trained_agent)
+    return None if path is None else read_statistics(path, run_around(spec.trained_agent))
+
+
+def continuing(spec: TrainSpec, statistics: Statistics) -> TrainSpec:
+    """The spec with environments that normalise as before, but for what its entry says of that."""
+    return normalising(spec, {**statistics.settings, **(spec.hyperparams.normalize or {})})
+
+
+def load_to_continue(spec: TrainSpec, file: ModelFile, env: VecEnv, **kwargs: Any) -> BaseAlgorithm:
+    """The agent as it was, with its replay buffer, on ``env`` and with these hyperparameters."""
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    # The networks are those of the file: their shape cannot change.
+    kwargs = {k: v for k, v in kwargs.items() if k not in ("policy", "policy_kwargs")}
+    if "n_steps" in kwargs and issubclass(agent_class(spec.algo), OffPolicyAlgorithm):
+        # The library chooses a kind of buffer by it, and would leave that of the file.
+        kwargs = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, **kwargs}
+    model = load_model(spec.algo, file, env, spec.user_modules, device=spec.device, **kwargs)
+    replay_buffer = replay_buffer_of(file.path)
+    if replay_buffer is not None:
+        load_replay_buffer(model, replay_buffer, run_around(file.path))
+    return model
+
+
+def _statistics_path(model: Path) -> Path | None:
+    run = run_around(model)
+    return statistics_of(model, None if run is None else run.params_path)

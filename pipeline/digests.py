@@ -9,20 +9,27 @@ lost it, or never came to its end, is ``record_version``, which is written when 
 from __future__ import annotations
 
 import hashlib
+import io
 import json
+import tokenize
+import warnings
+import zipfile
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError, one_line
-from pipeline.files import files_below
-from pipeline.json_text import plain
+from pipeline.files import files_below, plain
 from safe_files.limits import Budget
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import NO_LIMIT, hold, opened, read_file
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 RECORD = "run.json"
 FIELD = "files"
@@ -36,6 +43,25 @@ LARGEST_RECORD = 64 << 20  # bytes
 LARGEST_READ = 2 << 30  # bytes, of a file that is read whole
 _PIECE = 1 << 20  # bytes
 _DEEPEST_RECORD = 100  # lists and objects inside each other
+
+MOST_ARRAYS = 1000  # in an archive
+_KINDS = "biuf"  # booleans, integers, floats
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# What the two libraries raise at files that are cut off, damaged, encrypted or unknown to them.
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    OSError,
+    ValueError,
+    TypeError,
+    SyntaxError,
+    RuntimeError,
+    EOFError,
+    OverflowError,
+    MemoryError,
+    tokenize.TokenError,  # of headers that are read as if Python 2 had written them
+    Warning,
+)
 
 
 class DamagedFileError(UserError):
@@ -52,14 +78,10 @@ class DamagedFileError(UserError):
 
 @dataclass(frozen=True)
 class RecordedFiles:
-    """The files of a run, each held against what it was when the run ended.
+    """The files of a run, each held against what it was when the run ended."""
 
-    Attributes:
-        folder: the run folder.
-        digests: by name relative to the folder; None where the run recorded none.
-    """
-
-    folder: Path
+    folder: Path  # the run folder
+    # by name relative to the folder; None where the run recorded none
     digests: Mapping[str, str] | None
 
     def matching(self, pattern: str) -> list[Path]:
@@ -73,11 +95,7 @@ class RecordedFiles:
         return [self.folder / name for name in sorted(names)]
 
     def read(self, path: Path, limit: int = LARGEST_READ) -> bytes:
-        """All of a file of no more than ``limit`` bytes, which is as the run left it.
-
-        Raises:
-            DamagedFileError: if it is not, or cannot be read.
-        """
+        """All of a file of no more than ``limit`` bytes, which is as the run left it."""
         with _as_damage(path):
             content = read_file(path, limit)
         recorded = self._recorded(path)
@@ -86,11 +104,7 @@ class RecordedFiles:
         return content
 
     def check(self, path: Path) -> None:
-        """Make sure of the same for a file that need not fit the memory.
-
-        Raises:
-            DamagedFileError: if it is missing or changed.
-        """
+        """Make sure of the same for a file that need not fit the memory."""
         recorded = self._recorded(path)
         with _as_damage(path):
             if recorded is not None and digest_of(path) != recorded:
@@ -139,12 +153,7 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The contents of a ``run.json``, which is as it was written.
-
-    Raises:
-        FileNotFoundError: if there is none.
-        DamagedFileError: if it holds anything else than a run's record, or was changed.
-    """
+    """The contents of a ``run.json``, which is as it was written."""
     hold(path.parent)
     try:
         content = read_file(path, LARGEST_RECORD)
@@ -204,3 +213,32 @@ def _is_too_deep(value: Any) -> bool:
         if not level:
             return False
     return True
+
+
+def read_arrays(path: Path, content: bytes) -> dict[str, NDArray[Any]]:
+    """The arrays of numbers in an archive of NumPy's, by name."""
+    import numpy as np
+    from numpy.lib.npyio import NpzFile
+
+    try:
+        with (
+            warnings.catch_warnings(action="error"),
+            NpzFile(io.BytesIO(content), allow_pickle=False) as archive,
+        ):
+            assert archive.zip is not None  # it is open
+            infos = archive.zip.infolist()
+            if len({info.filename for info in infos}) != len(infos) or len(infos) > MOST_ARRAYS:
+                raise ValueError("it holds an array twice, or too many of them")
+            if not all(info.compress_type in _METHODS for info in infos):
+                raise ValueError("it is compressed in a way that is not read here")
+            # The bytes, those without the header, and the array.
+            Budget(len(content)).charge(3 * sum(info.file_size for info in infos))
+            arrays = {name: archive[name] for name in archive.files}
+            for array in arrays.values():
+                if not isinstance(array, np.ndarray):
+                    raise ValueError("it holds what is no array")
+                if array.dtype.kind not in _KINDS:
+                    raise ValueError(f"it holds {array.dtype} where numbers belong")
+            return arrays
+    except _DAMAGE as error:
+        raise DamagedFileError(path, f"is damaged: {one_line(error)}") from error

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.errors import UserError, did_you_mean, one_line, unknown
-from pipeline.settings.literals import DottedName, contains_name, parse_assignments, parse_literal
+from pipeline.settings.values import DottedName, contains_name, parse_assignments, parse_literal
 
 SCALARS = (
     st.none()

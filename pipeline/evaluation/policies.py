@@ -1,26 +1,117 @@
-"""Policies as arrays: agents asked what they do in every state at once."""
+"""What policies are, what they have to be told, and what they do in every state, as arrays."""
 
 from __future__ import annotations
 
+import inspect
+import sys
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from functools import lru_cache, partial
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
+from agents.common.mask_reading import check_masks_exist, present_masks
 from agents.linear.tile_algorithm import TileAlgorithm
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from agents.tabular.q_table_policy import QTablePolicy
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from mdp.array_types import Bools, Floats, Ints
-from pipeline.evaluation.mask_telling import takes_masks
-from pipeline.evaluation.policy_kinds import has_memory, is_network
-from pipeline.evaluation.sampled import KNOWN_LIBRARIES
+from pipeline.errors import UserError
+
+# The agents of these packages take any number of observations at once.
+KNOWN_LIBRARIES = ("agents", "stable_baselines3")
+
+
+def is_network(model: BaseAlgorithm) -> bool:
+    """Whether the agent's policy has weights."""
+    policy = getattr(model, "policy", None)
+    return isinstance(policy, th.nn.Module) and next(policy.parameters(), None) is not None
+
+
+def has_memory(agent: BaseAlgorithm) -> bool:
+    """Whether the agent's policy is recurrent, and acts by what it saw before as well."""
+    # Where sb3-contrib is not imported, no policy can be of its classes.
+    module = sys.modules.get("sb3_contrib.common.recurrent.policies")
+    return module is not None and isinstance(
+        getattr(agent, "policy", None), module.RecurrentActorCriticPolicy
+    )
+
+
+def takes_masks(model: Any) -> bool:
+    """Whether `predict` takes ``action_masks``, and the agent goes by them."""
+    predict = getattr(model.predict, "__func__", model.predict)
+    return _knows_masks(predict) and bool(getattr(model, "mask_actions", True))
+
+
+@lru_cache(maxsize=64)
+def _knows_masks(predict: Callable[..., Any]) -> bool:
+    return "action_masks" in inspect.signature(predict).parameters
+
+
+def player(model: BaseAlgorithm, env: VecEnv) -> Any:
+    """What to ask by ``predict`` on ``env``: the agent, told the masks where it takes them."""
+    if not takes_masks(model):
+        return model
+    try:
+        check_masks_exist(env)
+    except ValueError as error:
+        raise UserError(
+            f"{type(model).__name__} has to be told which actions are valid, and the environment "
+            "has no action masks"
+        ) from error
+    return MaskTold(model, env)
+
+
+class MaskTold:
+    """An agent, and the environments that tell it what may be done.
+
+    Args:
+        model: the agent.
+        env: the environments that it is played on.
+    """
+
+    def __init__(self, model: Any, env: VecEnv) -> None:
+        self.model = model
+        self.env = env
+
+    def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
+        """The agent's own, for what the environments show now."""
+        masks = present_masks(self.env, observation)
+        actions, state = self.model.predict(observation, action_masks=masks, **kwargs)
+        return actions, state
+
+
+Result = TypeVar("Result")
+
+
+class OfLastPolicy(Generic[Result]):
+    """A function of a policy that remembers its last result.
+
+    An agent is evaluated many times, and mostly acts as it did the time before.
+
+    Args:
+        work: the function; its result is not to be changed.
+    """
+
+    def __init__(self, work: Callable[[NDArray[Any]], Result]) -> None:
+        self._work = work
+        self._last: tuple[NDArray[Any], Result] | None = None
+
+    def __call__(self, policy: NDArray[Any]) -> Result:
+        """The result for a policy in one of the forms of `mdp.policies`."""
+        last = self._last
+        if last is not None and last[0].dtype == policy.dtype and np.array_equal(last[0], policy):
+            return last[1]
+        result = self._work(policy)
+        self._last = policy.copy(), result
+        return result
+
 
 # Numbers that a network is handed at once, and at all: beyond, asking for every state takes longer
 # than playing.
@@ -39,15 +130,7 @@ def obstacle(
     horizon: int,
     deterministic: bool = True,
 ) -> str:
-    """Why exact evaluation is out of reach, or dearer than playing; empty where it is neither.
-
-    Args:
-        agent: any agent with discrete actions.
-        observations: what it observes in each state, states along the first axis.
-        masks: what may be done in each state, bool of shape (S, A), or None if that is not known.
-        horizon: the time limit.
-        deterministic: whether it is its best actions that count.
-    """
+    """Why exact evaluation is out of reach, or dearer than playing; empty where it is neither."""
     n_states = len(observations)
     if reason := _cannot_be_asked(agent, masks):
         return reason
@@ -68,10 +151,6 @@ def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
 
     Agents of this project and of Stable-Baselines3 can. Of others, what `predict` returns is looked
     at: it has to be one action a state, the same when it is asked again, and nothing to remember.
-
-    Args:
-        agent: any agent with discrete actions.
-        observations: what it observes in each state, states along the first axis.
     """
     if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return ""
@@ -132,11 +211,7 @@ def policy_matrix(
 def best_actions(
     agent: BaseAlgorithm, observations: NDArray[Any], masks: Bools | None = None
 ) -> Ints:
-    """What the agent does in each state, shape (S,); arguments as of `policy_matrix`.
-
-    Raises:
-        TypeError: if that does not depend on the state alone.
-    """
+    """What the agent does in each state, shape (S,); arguments as of `policy_matrix`."""
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
 

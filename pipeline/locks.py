@@ -1,8 +1,15 @@
 """One process at a time on a study or a run: a file says who is at work, and the dead hold none.
 
 The file appears in one step, as a link to one that is written already; that works on network
-folders too. Its owner gives signs of life. On the machine where it was made the process itself is
-looked for; elsewhere an owner counts as gone once it has been silent for a minute.
+folders too. Its owner gives signs of life, by the clock of the folder: all machines that share it
+agree on that one. On the machine where it was made the process itself is looked for; elsewhere an
+owner counts as gone once it has been silent for a minute.
+
+A number alone does not name a process: numbers are used again, after a reboot, in each container
+and on each machine that shares a folder. On Linux, what names one is the number with the time it
+began, in ticks since the machine booted, which no change of the clock moves; the identity of that
+boot; and the namespace that the number belongs to. Elsewhere it is the number on that host, and a
+process that was given it anew passes for the one before.
 """
 
 from __future__ import annotations
@@ -11,31 +18,193 @@ import contextlib
 import hashlib
 import json
 import os
+import platform
+import re
 import secrets
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pipeline import liveness
+from pipeline.digests import LOCK
 from pipeline.errors import UserError, visible
-from pipeline.file_digests import LOCK
-from pipeline.folder_clock import (
-    SECONDS_BETWEEN_SIGNS,
-    give_sign,
-    last_sign,
-    remove_remains,
-    seconds_silent,
-)
-from pipeline.signs_of_life import Heartbeat
 from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NEW, open_number, read_file
+from safe_files.regular_files import NEW, NO_LIMIT, open_number, opened, read_file
 
+_BOOT = "/proc/sys/kernel/random/boot_id"
+_MACHINES = ("/etc/machine-id", "/var/lib/dbus/machine-id")
+_STATE, _BEGAN = 0, 19  # places in /proc/<pid>/stat, counted from behind the program's name
+_ENDED = "ZXx"
+
+SECONDS_BETWEEN_SIGNS = 5.0
 SECONDS_OF_SILENCE = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2
 _LARGEST = 10_000  # bytes
 _GONE: dict[str, Any] = {}  # told from others by being this one
+
+# What is written beside its place for an instant, here and by `pipeline.files.replacing`.
+_FOR_AN_INSTANT = re.compile(r"\..*[0-9a-f]{16}(\.dead)?\.tmp")
+_SECONDS_OF_AN_INSTANT = 5.0
+
+
+def mark() -> dict[str, Any]:
+    """What names this process, as JSON holds it; what the platform does not tell is None."""
+    pid = os.getpid()
+    return {
+        "pid": pid,
+        "host": platform.node(),
+        "machine": _machine(),
+        "boot": _first_line(_BOOT),
+        "namespace": _pid_namespace(),
+        "began": _ticks_at_begin(pid),
+    }
+
+
+def is_alive(record: object) -> bool | None:
+    """Whether the process that a `mark` names is still there.
+
+    Args:
+        record: the mark, as it was read from a file: anything.
+
+    Returns:
+        None where one cannot tell: of another host, of another container, of what is no mark.
+    """
+    if not isinstance(record, Mapping):
+        return None
+    pid = record.get("pid")
+    if not isinstance(pid, int) or isinstance(pid, bool) or not 0 < pid < 2**31:
+        return None
+    boot, is_same_host = _first_line(_BOOT), record.get("host") == platform.node()
+    if boot is None or record.get("boot") is None:
+        if boot is not None or record.get("boot") is not None or not is_same_host:
+            return None
+        return _has_process(pid)
+    if record.get("boot") != boot:
+        machine = _machine()
+        is_same_machine = machine is not None and record.get("machine") == machine
+        return False if is_same_host and is_same_machine else None
+    if record.get("namespace") != _pid_namespace():
+        return None
+    began = _ticks_at_begin(pid)
+    if began is None or record.get("began") is None:  # gone, or hidden from this user
+        return _has_process(pid)
+    return began == record.get("began")
+
+
+def _first_line(*files: str) -> str | None:
+    for file in files:
+        try:
+            line = Path(file).read_text(encoding="utf-8", errors="replace").partition("\n")[0]
+        except OSError:
+            continue
+        if line.strip():
+            return line.strip()
+    return None
+
+
+def _machine() -> str | None:
+    """What the machine is told apart by: a digest, since the identity itself is not for others."""
+    identity = _first_line(*_MACHINES)
+    return identity and hashlib.sha256(f"yardstick {identity}".encode()).hexdigest()[:32]
+
+
+def _pid_namespace() -> str | None:
+    try:
+        return os.readlink("/proc/self/ns/pid")  # noqa: PTH115  # it leads to no path
+    except OSError:
+        return None
+
+
+def _ticks_at_begin(pid: int) -> int | None:
+    """When the process began, by the kernel's ticks since the boot; -1 for one that has ended."""
+    try:
+        text = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return None
+    # The program's name stands in brackets, and may hold some itself.
+    fields = text.rpartition(")")[2].split()
+    if len(fields) <= _BEGAN:
+        return None
+    return -1 if fields[_STATE] in _ENDED else int(fields[_BEGAN])
+
+
+if sys.platform == "win32":
+    import _winapi
+
+    def _has_process(pid: int) -> bool:
+        # Here `os.kill` would end the process or send Ctrl-C to it, whatever the signal.
+        try:
+            process = _winapi.OpenProcess(_winapi.SYNCHRONIZE, False, pid)
+        except PermissionError:
+            return True
+        except OSError:
+            return False
+        try:
+            return _winapi.WaitForSingleObject(process, 0) == _winapi.WAIT_TIMEOUT
+        finally:
+            _winapi.CloseHandle(process)
+else:
+
+    def _has_process(pid: int) -> bool:
+        try:
+            os.kill(pid, 0)
+        except ProcessLookupError:
+            return False
+        except PermissionError:
+            return True
+        return True
+
+
+def give_sign(path: Path) -> None:
+    """Show that the owner of a file or folder is alive."""
+    # Without a time, so that a network folder takes that of its server.
+    os.utime(path, follow_symlinks=os.utime not in os.supports_follow_symlinks)
+
+
+def seconds_silent(path: Path) -> float:
+    """How long ago `give_sign` was last called for a path, or it was written to."""
+    return _now_in(path.parent) - last_sign(path)
+
+
+def last_sign(path: Path) -> float:
+    """When that was, by the folder's clock."""
+    if path.is_dir():
+        return path.stat().st_mtime
+    # Network folders remember for a while what a file was, but not beyond its being opened.
+    with opened(path, NO_LIMIT) as file:
+        return os.fstat(file.fileno()).st_mtime
+
+
+def _now_in(folder: Path) -> float:
+    probe = folder / f".{secrets.token_hex(8)}.tmp"
+    try:
+        probe.touch()
+        return probe.stat().st_mtime
+    finally:
+        with contextlib.suppress(OSError):
+            probe.unlink()
+
+
+def remove_remains(root: Path) -> None:
+    """Remove what processes that were killed have left half written, in a folder or one below."""
+    for folder in (root, *(root / name for name in _names_in(root))):
+        for name in filter(_FOR_AN_INSTANT.fullmatch, _names_in(folder)):
+            path = folder / name
+            with contextlib.suppress(OSError, UnsafeFileError):
+                if seconds_silent(path) > _SECONDS_OF_AN_INSTANT:
+                    if path.is_dir():
+                        path.rmdir()
+                    else:
+                        path.unlink()
+
+
+def _names_in(folder: Path) -> list[str]:
+    """What lies in a folder; nothing where it is none, or has gone meanwhile, as others' do."""
+    with contextlib.suppress(OSError):
+        return [path.name for path in folder.iterdir()]
+    return []
 
 
 class FolderInUseError(UserError):
@@ -62,11 +231,7 @@ def is_gone(path: Path) -> bool:
 
 @contextmanager
 def told_if_gone(root: Path) -> Iterator[None]:
-    """Say that a folder is gone, in place of whatever fails by that in the ``with`` statement.
-
-    Raises:
-        FolderGoneError: if it is.
-    """
+    """Say that a folder is gone, in place of whatever fails by that in the ``with`` statement."""
     try:
         yield
     except Exception as error:
@@ -100,6 +265,8 @@ def folder_lock(
         if not lost:
             lost.append(error)
             on_loss()
+
+    from pipeline.signs_of_life import Heartbeat  # with all that draws on terminals
 
     made = _make_folders(root)
     path, token = root / LOCK, secrets.token_hex(16)
@@ -135,8 +302,8 @@ def _make_folders(root: Path) -> list[Path]:
 
 
 def _take(path: Path, token: str, say: Callable[[str], object]) -> None:
-    mark = {**liveness.mark(), "token": token, "since": time.strftime("%Y-%m-%d %H:%M:%S")}
-    while not _appears(path, json.dumps(mark)):
+    own = {**mark(), "token": token, "since": time.strftime("%Y-%m-%d %H:%M:%S")}
+    while not _appears(path, json.dumps(own)):
         owner = _read(path)
         if _is_at_work(path, owner, say):
             raise FolderInUseError(_words(path.parent, owner))
@@ -188,9 +355,9 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object]) -> bool:
     """Whether the owner of a lock is there; one that is elsewhere is waited for, until it shows."""
-    is_alive = liveness.is_alive(owner)
-    if is_alive is not None:
-        return is_alive
+    alive = is_alive(owner)
+    if alive is not None:
+        return alive
     has_said = False
     try:
         first = last_sign(path)

@@ -1,6 +1,7 @@
 """Run folders: each run has one of its own, and is found again."""
 
 import json
+import platform
 import shutil
 import subprocess
 import sys
@@ -10,13 +11,12 @@ from uuid import uuid4
 
 import pytest
 
-from pipeline import run_folder
+from pipeline import runs
 from pipeline.errors import UserError
-from pipeline.liveness import mark
-from pipeline.run_files import environment_name
-from pipeline.run_folder import NoRunError, Run, numbered_runs
+from pipeline.locks import mark
+from pipeline.runs import NoRunError, Run, environment_name, numbered_runs
 
-ROOT = Path(run_folder.__file__).parent.parent
+ROOT = Path(runs.__file__).parent.parent
 
 
 def claim_names(folder, env_id, n, **kwargs):
@@ -71,7 +71,7 @@ def test_folders_of_other_names_do_not_count(tmp_path, neighbour):
 def test_a_number_taken_meanwhile_is_passed_over(tmp_path, monkeypatch):
     claim_names(tmp_path, "Taxi-v4", 3)
     # As if the other runs had been started after this one looked.
-    monkeypatch.setattr(run_folder, "numbered_runs", lambda parent, name: [])
+    monkeypatch.setattr(runs, "numbered_runs", lambda parent, name: [])
     assert claim_names(tmp_path, "Taxi-v4", 1) == ["Taxi-v4_4"]
 
 
@@ -96,7 +96,7 @@ def test_processes_never_share_a_folder(tmp_path):
     program = """
 import sys
 from pathlib import Path
-from pipeline.run_folder import Run
+from pipeline.runs import Run
 print("ready", flush=True)
 sys.stdin.readline()
 for _ in range(25):
@@ -248,3 +248,25 @@ def test_a_damaged_info_is_told_and_not_written_over(tmp_path, content):
         with pytest.raises(UserError, match=r"run\.json is damaged: \S"):
             act()
     assert run.info_path.read_bytes() == content
+
+
+@pytest.mark.parametrize(
+    ("content", "processor"),
+    [
+        ("processor\t: 0\nmodel name\t: Fast CPU @ 3GHz\nmodel name\t: other\n", "Fast CPU @ 3GHz"),
+        ("processor\t: 0\n", "arm"),
+        (None, "arm"),
+    ],
+)  # fmt: skip
+def test_the_processor_is_named_where_it_is_told(tmp_path, monkeypatch, content, processor):
+    if content is not None:
+        (tmp_path / "cpuinfo").write_text(content)
+    monkeypatch.setattr(runs, "_PROCESSORS", tmp_path / "cpuinfo")
+    monkeypatch.setattr(platform, "processor", lambda: "arm")
+    runs.recorded_machine.cache_clear()
+    machine = runs.recorded_machine()
+    runs.recorded_machine.cache_clear()
+    assert machine["processor"] == processor
+    assert machine["system"].startswith(platform.system())
+    assert int(machine["cores"]) >= 1
+    assert platform.node() not in str(machine)

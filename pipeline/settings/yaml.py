@@ -1,13 +1,18 @@
-"""What YAML documents may hold, and how much: the loaders of `pipeline.settings.strict_yaml`.
+"""YAML without surprises: plain data only, no key twice, and errors that say where.
 
-What a document stands for is counted while it is read, what is shared at each of its places: a few
-lines cannot stand for more than the memory holds.
+Beside `yaml.safe_load`, three things differ: a repeated key is refused instead of winning silently,
+dates and other tags stay what they look like or are refused, and ``1e-4`` is a number, as YAML 1.2
+has it, not a text.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -15,7 +20,109 @@ from yaml.constructor import ConstructorError
 from yaml.events import AliasEvent
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
-from pipeline.errors import shown, visible
+from pipeline.errors import UserError, shown, visible
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import read_file
+
+# Twenty times what the longest file of settings has, and read in well under a second.
+_MAX_BYTES = 256 * 1024
+
+
+def parse_yaml(content: str | bytes, where: str) -> Any:
+    """Read one YAML document."""
+    return _parse(content, where, StrictLoader)
+
+
+def _parse(content: str | bytes, where: str, loader: type[StrictLoader]) -> Any:
+    if len(content) > _MAX_BYTES:
+        raise UserError(f"{where}: is larger than {_MAX_BYTES:,} bytes")
+    try:
+        loader_class: Any = loader  # mypy takes no class for hashable
+        return deepcopy(_load(content, loader_class))
+    except yaml.MarkedYAMLError as error:
+        mark = error.problem_mark or error.context_mark
+        place = f":{mark.line + 1}:{mark.column + 1}" if mark else ""
+        raise UserError(f"{where}{place}: {error.problem or error.context}") from error
+    except yaml.YAMLError as error:
+        raise UserError(f"{where}: is not a text file, or holds control characters") from error
+    except (RecursionError, ValueError) as error:
+        raise UserError(f"{where}: is nested too deeply, or too large") from error
+
+
+def read_yaml(path: Path) -> Any:
+    """Read the one YAML document in a file; see `parse_yaml`."""
+    return _parse(_content(path), str(path), StrictLoader)
+
+
+def read_saved_settings(path: Path) -> dict[str, Any]:
+    """Read the settings that a run folder keeps, ours or rl_zoo3's; see `parse_yaml`.
+
+    rl_zoo3 writes them as an OrderedDict with the name of its class, the one tag that is admitted.
+    """
+    value = _parse(_content(path), str(path), SavedSettingsLoader)
+    if not (isinstance(value, dict) and all(isinstance(key, str) for key in value)):
+        raise UserError(f"{path}: must map names to values")
+    return value
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return read_file(path, _MAX_BYTES)
+    except UnsafeFileError as error:
+        raise UserError(str(error)) from error
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise UserError(f"{path}: cannot be read: {reason}") from error
+
+
+def read_settings_text(path: Path) -> str:
+    """The text of a file of settings, for what needs no more than a look at it."""
+    try:
+        return _content(path).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is not a text file, or holds control characters") from error
+
+
+def key_lines(path: Path) -> dict[tuple[str | int, ...], int]:
+    """The line on which each value of a file stands, for messages about what it means.
+
+    Args:
+        path: a file that `read_yaml` has read.
+
+    Returns:
+        Line numbers, counted from 1, by the keys and indexes that lead to the value.
+    """
+    loader = StrictLoader(_content(path))
+    try:
+        node = loader.get_single_node()
+        return {} if node is None else dict(_node_lines(node, ()))
+    finally:
+        loader.dispose()
+
+
+def _node_lines(
+    node: Node, keys: tuple[str | int, ...]
+) -> Iterator[tuple[tuple[str | int, ...], int]]:
+    yield keys, node.start_mark.line + 1
+    if isinstance(node, MappingNode):
+        for key, value in node.value:
+            inner = (*keys, str(key.value))
+            yield from _node_lines(value, inner)
+            # Where the key stands, and not where its value begins.
+            yield inner, key.start_mark.line + 1
+    elif isinstance(node, SequenceNode):
+        for index, value in enumerate(node.value):
+            yield from _node_lines(value, (*keys, index))
+
+
+@lru_cache(maxsize=32)  # a study asks for the same entries again and again
+def _load(content: str | bytes, loader_class: Any) -> Any:
+    loader = loader_class(content)
+    try:
+        return loader.get_single_data()
+    finally:
+        loader.dispose()
+
 
 _TAG = "tag:yaml.org,2002:"
 _PLAIN_TAGS = frozenset(

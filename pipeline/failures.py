@@ -1,0 +1,179 @@
+"""What may go wrong in a run, whose fault it is, and what becomes of a run that breaks by it.
+
+A machine that has nothing left to give; code of the user's that raises what ends a program;
+libraries that give up in the midst of a training. Whatever it was, everything is closed, the reason
+noted, and the folder left true. Commands load this before their first words: what takes long to
+load is imported where it is needed.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.errors import UserError, one_line
+from pipeline.stopping import Stopped, current
+
+if TYPE_CHECKING:
+    from pipeline.preparation import Training
+
+
+# PyTorch's allocator, the dynamic linker, and Python's threads have no exception of their own.
+_SIGNS = {
+    "can't allocate memory": "memory",
+    "cannot allocate memory": "memory",
+    "failed to map segment": "memory",
+    "out of memory": "memory",
+    "can't start new thread": "threads or processes",
+}
+
+
+def exhaustion(error: BaseException) -> str | None:
+    """Say in one line what the machine has run out of; None where that was not it."""
+    text = one_line(error)
+    if isinstance(error, MemoryError):
+        detail = "" if text == type(error).__name__ else f": {text}"
+        return f"this machine gives no more memory{detail}"
+    for sign, what in _SIGNS.items():
+        if sign in text.lower():
+            return f"this machine gives no more {what}: {text}"
+    return None
+
+
+class OwnExit(SystemExit):  # no more an error than the one it is derived from
+    """The end of a command by its own will."""
+
+
+class ForeignExitError(UserError):
+    """SystemExit or KeyboardInterrupt from code of the user's, where nobody pressed Ctrl-C.
+
+    Args:
+        error: what was raised.
+    """
+
+    def __init__(self, error: BaseException) -> None:
+        kind, text = type(error).__name__, str(error)
+        origin = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{Path(origin.filename).name}:{origin.lineno}"
+        super().__init__(f"{place}: {kind}{f': {text}' if text else ''}, which ends no command")
+
+
+@contextmanager
+def exits_as_mistakes() -> Iterator[None]:
+    """Let what is called inside the ``with`` statement end no program: it has failed."""
+    try:
+        yield
+    except OwnExit:
+        raise
+    except (SystemExit, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt) and _may_be_of_a_signal(error):
+            raise
+        raise ForeignExitError(error) from error
+
+
+def _may_be_of_a_signal(error: KeyboardInterrupt) -> bool:
+    if isinstance(error, Stopped) or current().number is not None:
+        return True
+    # Where signals are noticed, or left to somebody else, Ctrl-C raises no bare KeyboardInterrupt.
+    return signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+_LIBRARIES = frozenset({"torch", "stable_baselines3", "sb3_contrib", "mabwiser", "numpy", "scipy"})
+_AROUND_THEM = frozenset({"agents", "pipeline", "gymnasium", *sys.stdlib_module_names})
+
+
+class LibraryError(UserError):
+    """A library cannot work with the settings of an agent."""
+
+
+def blame_weights(model: Any, error: Exception) -> None:
+    """Say that an agent's weights are at fault, where they are.
+
+    PyTorch refuses distributions of nan, and does not say where they come from.
+    """
+    from pipeline.finite_numbers import NotFiniteError, check_model
+
+    try:
+        check_model(model)
+    except NotFiniteError as cause:
+        raise cause from error
+
+
+def blame_settings(algo: str, model: Any, error: Exception) -> None:
+    """Say that an agent's settings are at fault, where a library gave up over them.
+
+    What went through an environment, a callback or a module of the user's may be a mistake in
+    there, and keeps its traceback.
+    """
+    frames = list(traceback.walk_tb(error.__traceback__))
+    packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame, _ in frames]
+    is_of_library = packages[-1] in _LIBRARIES and set(packages) <= _LIBRARIES | _AROUND_THEM
+    if is_of_library and exhaustion(error) is None:
+        frame, line = frames[-1]
+        place = f"{packages[-1]}, {Path(frame.f_code.co_filename).name}:{line}"
+        when = f"{algo} at step {model.num_timesteps:,}"
+        raise LibraryError(f"{when}: {one_line(error)} ({place})") from error
+
+
+@exits_as_mistakes()
+def close(training: Training) -> None:
+    """Close what is open, each part also where another cannot be closed."""
+    from pipeline.worker_processes import close_environments
+
+    model = training.model
+    with ExitStack() as stack:
+        if model.env is not None:
+            stack.callback(close_environments, model.env)
+        stack.callback(close_environments, training.eval_env)
+        if hasattr(model, "_logger"):
+            stack.callback(model.logger.close)
+
+
+def has_begun(training: Training) -> bool:
+    """Whether there is something that was learnt, by this process or the ones before it."""
+    model, is_back = training.model, training.saver.state is None
+    return is_back and model.num_timesteps > model._num_timesteps_at_start
+
+
+def give_up(training: Training, error: BaseException) -> None:
+    """Note the reason; or remove the folder, where the agent failed before its first step."""
+    from pipeline.files import DISK_ERRORS
+    from pipeline.locks import FolderGoneError, is_gone
+    from pipeline.runs import INTERRUPTED
+
+    run, is_new = training.run, not training.keeping.goes_on
+    if is_gone(run.path):
+        raise FolderGoneError(run.path) from error
+    is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt | LibraryError)
+    if is_new and is_expected and not has_begun(training):
+        run.discard()
+        if not isinstance(error, ValueError):  # the others say for themselves what it was
+            return
+        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
+        raise UserError(message) from error
+    with suppress(OSError):  # what the run has failed by says more
+        training.evaluation.write()
+    if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
+        run.update_info(state=INTERRUPTED)
+        return
+    run.fail(one_line(error))
+    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        when = f"the run has failed at step {training.model.num_timesteps:,}"
+        raise UserError(f"{error.filename}: {error.strerror}: {when}") from error
+
+
+def is_of_the_machine(error: BaseException | None) -> bool:
+    """Whether a run has failed by a full disk or memory, and by no fault of its own."""
+    from pipeline.files import DISK_ERRORS
+
+    while error is not None:
+        is_of_disk = isinstance(error, OSError) and error.errno in DISK_ERRORS
+        if is_of_disk or exhaustion(error) is not None:
+            return True
+        error = error.__cause__
+    return False

@@ -1,0 +1,290 @@
+"""Which files are a model and what belongs to it, and what their folder says of the agent.
+
+A folder is a run of ours, one of rl_zoo3, or a model hub's download:
+
+| who wrote it | what is read |
+|---|---|
+| this project | ``run.json`` |
+| rl_zoo3 | ``<env>/args.yml`` (agent, environment, its arguments) and ``<env>/config.yml`` |
+| a model hub | the same two beside the zip |
+
+The first that is there counts, and what ``args.yml`` says of ``env_kwargs`` replaces those of
+``config.yml``, as in rl_zoo3, whose ``enjoy`` does not read ``eval_env_kwargs`` either. Nothing in
+these files is run, and no module is imported because they ask for it.
+
+Statistics of VecNormalize and replay buffers lie beside the zip under the names that
+Stable-Baselines3's CheckpointCallback gives them, or where rl_zoo3 and model hubs have them.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from pipeline.digests import RECORD, DamagedFileError, read_record
+from pipeline.errors import UserError
+from pipeline.runs import INTERRUPTED, Run, environment_name
+from pipeline.settings.yaml import read_saved_settings
+from safe_files.regular_files import read_file
+
+_SETTINGS_FILES = ("args.yml", "config.yml")
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """What a folder says of the agent in it."""
+
+    algo: str | None = None  # name of the agent, or None
+    env_id: str | None = None  # id of the environment, or None
+    # the entry of hyperparameters that it was trained with, or None
+    hyperparams: dict[str, Any] | None = None
+    # modules that were imported for the environments that they register
+    gym_packages: tuple[str, ...] = ()
+    is_own: bool = False  # whether this project recorded it
+
+
+def run_of(path: Path) -> Run | None:
+    """The run folder that a model file lies in, or None if it lies elsewhere."""
+    # A link to a zip may lie in the run, or lead there.
+    folders = (path.parent.resolve(), path.resolve().parent)
+    folder = next((one for one in folders if os.path.lexists(one / RECORD)), None)
+    if folder is None:
+        return None
+    env_name = read_record(folder / RECORD).get("env_name")
+    if not isinstance(env_name, str):
+        return None
+    if env_name != environment_name(env_name):
+        # Names of files are made of it.
+        raise UserError(f"{folder / RECORD} is damaged: env_name is {env_name!r}")
+    return Run(folder, env_name)
+
+
+def run_around(model: Path) -> Run | None:
+    """The run folder that a zip lies in, or None where nothing beside it says how it was trained.
+
+    Where the settings lie beside the zip, as model hubs have them, the run's ``env_name`` is empty.
+    """
+    own = run_of(model)
+    if own is not None:
+        return own
+    folder = model.parent.resolve()
+    names = _settings_folders(folder)
+    if model.stem in names:
+        return Run(folder, model.stem)
+    if len(names) == 1:
+        return Run(folder, names[0])
+    return Run(folder, "") if _has_settings(folder) else None
+
+
+def run_in(folder: Path) -> Run:
+    """The run in a folder; where nothing says how it was trained, its ``env_name`` is empty."""
+    run = run_around(folder / "any.zip")
+    names = _settings_folders(folder)
+    if run is None and len(names) > 1:
+        raise UserError(f"{folder} holds models of {', '.join(names)}: name the zip")
+    return run or Run(folder, "")
+
+
+def recorded_run(run: Run | None) -> RecordedRun:
+    """What a run folder says, see the table above; of a folder that says nothing, nothing."""
+    if run is None:
+        return RecordedRun()
+    spec = run.recorded_spec()
+    if spec:
+        entry = spec.get("hyperparams")
+        return RecordedRun(
+            _text(spec.get("algo")),
+            _text(spec.get("env_id")),
+            entry if isinstance(entry, dict) else None,
+            _texts(spec.get("gym_packages")),
+            is_own=True,
+        )
+    if not _has_settings(run.params_path):
+        return RecordedRun()
+    args, config = _read(run.params_path / "args.yml"), _read(run.params_path / "config.yml")
+    if args.get("env_kwargs") is not None:
+        config = {**config, "env_kwargs": args["env_kwargs"]}
+    return RecordedRun(
+        _text(args.get("algo")), _text(args.get("env")), config, _texts(args.get("gym_packages"))
+    )
+
+
+def check_digest(run: Run | None, path: Path) -> None:
+    """Make sure that a file of a run is as the run left it, where the run recorded that."""
+    if run is None:
+        return
+    try:
+        run.files.check(path)
+    except DamagedFileError as error:
+        raise _with_way_out(error) from error
+
+
+def read_recorded(run: Run | None, path: Path, limit: int) -> bytes:
+    """All of a file; where a run recorded what it was, it is as the run left it.
+
+    Args:
+        run: the run that the file belongs to, or None.
+        path: the file.
+        limit: the most bytes that it may have.
+
+    Raises:
+        UserError: if it is not so.
+        UnsafeFileError: if a file of no run is no regular file, or too large.
+        OSError: if such a file cannot be read.
+    """
+    if run is None:
+        return read_file(path, limit)
+    try:
+        return run.files.read(path, limit)
+    except DamagedFileError as error:
+        raise _with_way_out(error) from error
+
+
+def _with_way_out(error: DamagedFileError) -> UserError:
+    return UserError(f"{error}: train again, or name another copy of it")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return read_saved_settings(path) if path.is_file() else {}
+
+
+def _has_settings(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in _SETTINGS_FILES)
+
+
+def _settings_folders(folder: Path) -> list[str]:
+    """Names of the folders inside that hold a run's settings, which are its environments' names."""
+    if not folder.is_dir():
+        return []
+    return sorted(path.name for path in folder.iterdir() if _has_settings(path))
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+def _texts(value: object) -> tuple[str, ...]:
+    return tuple(item for item in value if isinstance(item, str)) if isinstance(value, list) else ()
+
+
+_CHECKPOINT = re.compile(r"(.+)_(\d+)_steps")
+_REPLAY_BUFFER = "replay_buffer.pkl"
+
+
+def statistics_path(model: Path) -> Path:
+    """Where the statistics of a model's own moment lie.
+
+    ``best_model_vecnormalize.pkl`` for ``best_model.zip``, ``rl_model_vecnormalize_<n>_steps.pkl``
+    for ``rl_model_<n>_steps.zip``.
+    """
+    return _companion(model, "vecnormalize")
+
+
+def replay_buffer_path(model: Path) -> Path:
+    """Where the replay buffer of a checkpoint's moment lies, named likewise."""
+    return _companion(model, "replay_buffer")
+
+
+def final_replay_buffer_path(folder: Path) -> Path:
+    """Where the replay buffer of a run's end lies, as rl_zoo3 has it."""
+    return folder / _REPLAY_BUFFER
+
+
+def statistics_of(model: Path, params_path: Path | None) -> Path | None:
+    """The statistics that belong to a model, or None where there are none.
+
+    Args:
+        model: the zip.
+        params_path: the folder of its run's settings, if it has one.
+
+    Returns:
+        The first that there is of: those of its own moment; ``vecnormalize.pkl`` of its run's end;
+        ``vec_normalize.pkl`` or ``vecnormalize.pkl`` beside it, as model hubs have them.
+    """
+    settings = [] if params_path is None else [params_path / "vecnormalize.pkl"]
+    beside = [model.with_name(name) for name in ("vec_normalize.pkl", "vecnormalize.pkl")]
+    return _first(statistics_path(model), *settings, *beside)
+
+
+def replay_buffer_of(model: Path) -> Path | None:
+    """The replay buffer that belongs to a model: of its own moment, or else its run's last one."""
+    return _first(replay_buffer_path(model), model.with_name(_REPLAY_BUFFER))
+
+
+def _companion(model: Path, kind: str) -> Path:
+    checkpoint = _CHECKPOINT.fullmatch(model.stem)
+    if checkpoint is None:
+        return model.with_name(f"{model.stem}_{kind}.pkl")
+    prefix, n_steps = checkpoint.groups()
+    return model.with_name(f"{prefix}_{kind}_{n_steps}_steps.pkl")
+
+
+def _first(*paths: Path) -> Path | None:
+    return next((path for path in paths if path.is_file()), None)
+
+
+Which = Literal["final", "best", "last checkpoint"] | int
+
+# Zips in a run folder or on a model hub that are not the agent at the end of training.
+_OTHER_ZIPS = ("best_model.zip", "train_eval_metrics.zip")
+
+
+def model_at(path: Path, which: Which = "final") -> Path:
+    """The zip that a path means."""
+    with_suffix = path.with_name(f"{path.name}.zip") if path.name else path
+    if path.is_dir() and (os.path.lexists(path / RECORD) or not with_suffix.is_file()):
+        return model_of(run_in(path), which)
+    if which != "final":
+        raise UserError(
+            f"{path} is one model: give its folder for --load-best, --load-checkpoint or "
+            "--load-last-checkpoint"
+        )
+    path = with_suffix if with_suffix.is_file() else path
+    if not path.exists():
+        raise UserError(f"no such model file: {path}")
+    return path
+
+
+def model_of(run: Run, which: Which = "final") -> Path:
+    """The zip of a run."""
+    path = _path_in(run, which)
+    if not path.exists():
+        known = ", ".join(path.stem.split("_")[-2] for path in run.checkpoints())
+        reason = "its training may not have ended"
+        if run.state == INTERRUPTED:
+            reason = "its training was cut off before it was written"
+        if isinstance(which, int) and known:
+            reason = f"there are checkpoints after {known} steps"
+        raise UserError(f"{run.path} holds no {path.name}: {reason}")
+    return path
+
+
+def _path_in(run: Run, which: Which) -> Path:
+    if not run.path.is_dir():
+        raise UserError(f"{run.path} is no run folder")
+    if isinstance(which, int):
+        return run.checkpoint_path(which)
+    if which == "best":
+        return run.best_model_path
+    if which == "last checkpoint":
+        checkpoints = run.checkpoints()
+        if not checkpoints:
+            raise UserError(f"{run.path} holds no checkpoint: train with --save-freq")
+        return checkpoints[-1]
+    return run.model_path if run.env_name else _only_model(run)
+
+
+def _only_model(run: Run) -> Path:
+    """The one zip of a folder that does not name its environment."""
+    models = [
+        path
+        for path in sorted(run.path.glob("*.zip"))
+        if path.name not in _OTHER_ZIPS and path not in run.checkpoints()
+    ]
+    if len(models) != 1:
+        held = ", ".join(path.name for path in models) or "no model"
+        raise UserError(f"{run.path} is no run folder, and holds {held}: name the zip")
+    return models[0]

@@ -1,0 +1,463 @@
+"""Agents and their statistics, from files and into them; nothing in a file is run.
+
+What a zip says of its agent is plain JSON, and read without making an agent. What else it may hold
+are classes of the libraries and ours, and networks, optimizers and buffers of the user's: those of
+the modules that were typed on the command line, and of the agent's own module.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+import sys
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from agents import ALGORITHMS, load_algorithm
+from pipeline.errors import UserError, one_line
+from pipeline.files import replacing
+from pipeline.models.find import read_recorded
+from pipeline.runs import Run
+from pipeline.settings.values import algorithm_parameters
+from pipeline.train_spec import TrainSpec
+from pipeline.user_modules import UserModule
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.running_mean_std import RunningMeanStd
+    from stable_baselines3.common.vec_env import VecEnv
+
+
+# Folders of `agents` in which no agent has a zip with a pickle: known before any is imported.
+_JSON_FAMILIES = {"tabular", "linear", "bandits", "mabwiser"}
+
+
+@dataclass(frozen=True)
+class ModelFile:
+    """A zip, read once: what is held against its digest, looked into and loaded are these bytes.
+
+    Whoever puts another file in its place meanwhile changes nothing.
+    """
+
+    path: Path  # where it lay
+    content: bytes = field(repr=False)  # all of it
+    # the JSON in it; what is pickled in that stays text
+    data: Mapping[str, Any] = field(repr=False)
+
+    @property
+    def digest(self) -> str:
+        """The SHA-256 of the content, as ``run.json`` has those of files."""
+        return hashlib.sha256(self.content).hexdigest()
+
+    def stream(self) -> io.BytesIO:
+        """The content, for what reads files."""
+        return io.BytesIO(self.content)
+
+
+def read_model(path: Path, run: Run | None = None) -> ModelFile:
+    """Read a zip, which is a whole one of an agent; no agent is made of it."""
+    from safe_files.archives import first_look
+    from safe_files.limits import MAX_ARCHIVE_BYTES
+
+    try:
+        content = read_recorded(run, path, MAX_ARCHIVE_BYTES)
+        return ModelFile(path, content, first_look(content))
+    except FileNotFoundError:
+        raise UserError(f"no such model file: {path}") from None
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
+
+
+def saved_observation(model: ModelFile) -> str | None:
+    """What a library's zip says of the space that its agent observes; None if nothing plain."""
+    space = model.data.get("observation_space")
+    return shown_space(space) if isinstance(space, dict) else None
+
+
+def shown_space(attributes: Mapping[str, Any]) -> str | None:
+    """A space in words, by its attributes; None where they say nothing plain."""
+    if "n" in attributes:
+        return f"{attributes['n']} kinds"
+    shape = attributes.get("_shape")
+    return f"shape {tuple(shape)}" if shape else None
+
+
+def hand_written_algorithm(model: ModelFile) -> str | None:
+    """The name of the hand-written agent that a zip says it holds, or None for the library's.
+
+    It decides which agent is meant where nobody says so, and nothing about how the zip is read.
+    """
+    class_name = model.data.get("algorithm")
+    for name, entry in ALGORITHMS.items():
+        if (
+            isinstance(class_name, str)
+            and entry.entry_point.endswith(f":{class_name}")
+            and _is_hand_written(name)
+        ):
+            return name
+    return None
+
+
+def telling_masks(spec: TrainSpec, model: ModelFile) -> TrainSpec:
+    """The spec with environments that tell action masks, where the agent in a zip goes by them.
+
+    What the spec says of ``mask_actions`` itself holds.
+    """
+    algorithm, name = spec.hyperparams.algorithm, "mask_actions"
+    if name in algorithm or model.data.get(name) is not True:
+        return spec
+    hyperparams = replace(spec.hyperparams, algorithm={**algorithm, name: True})
+    saved = {**spec.saved_hyperparams, name: True}
+    return replace(spec, hyperparams=hyperparams, saved_hyperparams=saved)
+
+
+def _is_hand_written(algo: str) -> bool:
+    """Whether zips of the agent hold JSON; where there is no class, none is loaded."""
+    if ALGORITHMS[algo].family in _JSON_FAMILIES:
+        return True
+    from agents.common.model_files import JsonAlgorithm
+
+    try:
+        return issubclass(load_algorithm(algo), JsonAlgorithm)
+    except ImportError:
+        return True
+
+
+# Where the schedule lived that zips of library agents once held.
+_SCHEDULES = ("agents.schedules", "agents.common.schedules")
+
+
+def own_classes(
+    algorithm: type[BaseAlgorithm], modules: Iterable[UserModule]
+) -> Mapping[str, type]:
+    """Networks, optimizers and buffers of the user's, by their full names."""
+    from stable_baselines3.common.buffers import BaseBuffer
+    from torch import nn, optim
+
+    # No others: what a file names as a part of a network is called with what it says.
+    kinds = (nn.Module, optim.Optimizer, BaseBuffer)
+    homes = {module.name for module in modules} | {algorithm.__module__}
+    found: dict[str, type] = {}
+    for name, module in list(sys.modules.items()):
+        if any(f"{name}.".startswith(f"{home}.") for home in homes):
+            for value in list(vars(module).values()):
+                if isinstance(value, type) and issubclass(value, kinds):
+                    found |= {f"{value.__module__}.{value.__qualname__}": value}
+    return {name: cls for name, cls in found.items() if _lies_in(cls, homes)}
+
+
+def _lies_in(cls: type, homes: Iterable[str]) -> bool:
+    return any(f"{cls.__module__}.".startswith(f"{home}.") for home in homes)
+
+
+def own_makers() -> Mapping[str, Any]:
+    """What makes objects of ours, by the full names of their classes."""
+    from agents.common.schedules import ExponentialSchedule
+    from safe_files.pickle_trees import Made
+    from safe_files.rebuilding import Build, fields
+
+    def schedule(made: Made, build: Build) -> ExponentialSchedule:
+        return ExponentialSchedule(**fields(made, build))
+
+    return {f"{module}.ExponentialSchedule": schedule for module in _SCHEDULES}
+
+
+# What a class of the user's may stand for in a zip.
+_CLASS_KEYS = ("policy_class", "policy_kwargs", "replay_buffer_class", "rollout_buffer_class")
+
+
+def agent_class(algo: str) -> type[BaseAlgorithm]:
+    """Import the class of an agent."""
+    try:
+        return load_algorithm(algo)
+    except (ValueError, ImportError) as error:
+        raise UserError(one_line(error)) from error
+
+
+def load_model(
+    algo: str,
+    model: ModelFile | Path,
+    env: VecEnv | None = None,
+    modules: Iterable[UserModule] = (),
+    **kwargs: Any,
+) -> BaseAlgorithm:
+    """Load an agent from its zip, as data: nothing in it is run, whoever wrote it.
+
+    Args:
+        algo: name of the agent.
+        model: the zip, or where it lies.
+        env: environment to go on with, or None.
+        modules: those that the user typed: the zip may name classes of theirs.
+        kwargs: attributes to change.
+
+    Raises:
+        UserError: if the file is not a zip of such an agent, or does not fit ``env``.
+    """
+    file = _read(model)
+    algorithm = agent_class(algo)
+    try:
+        with warnings.catch_warnings():
+            # Said of the buffer that the library itself chose when the agent was made.
+            warnings.filterwarnings("ignore", r"`n_steps=\d+` is ignored because a custom")
+            agent = _loaded(algorithm, file, env, modules, kwargs)
+        agent.__class__ = algorithm
+        return agent
+    except UserError:
+        raise
+    except Exception as error:  # a file of another agent can fail anywhere in the library
+        raise UserError(
+            f"{file.path} cannot be loaded as a {algo} agent: {one_line(error)}"
+            f"{_way_out(algorithm, error)}"
+        ) from error
+
+
+def _loaded(
+    algorithm: type[BaseAlgorithm],
+    file: ModelFile,
+    env: VecEnv | None,
+    modules: Iterable[UserModule],
+    kwargs: Mapping[str, Any],
+) -> BaseAlgorithm:
+    """An agent by its class's own `load`, where it has one, or else read as data."""
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+    from agents.common.model_files import JsonAlgorithm
+    from safe_files import load_model
+
+    if _is_load_of(JsonAlgorithm, algorithm):
+        return algorithm.load(file.stream(), env=env, **kwargs)
+    if not _is_load_of(BaseAlgorithm, algorithm):
+        # Code of the user's, which may do with paths alone.
+        return algorithm.load(file.path, env=env, **kwargs)
+    return load_model(
+        _loadable(algorithm),
+        file.stream(),
+        env,
+        classes=own_classes(algorithm, modules),
+        makers=own_makers(),
+        **kwargs,
+    )
+
+
+def _read(model: ModelFile | Path) -> ModelFile:
+    return model if isinstance(model, ModelFile) else read_model(model)
+
+
+def _is_load_of(owner: type, algorithm: type[BaseAlgorithm]) -> bool:
+    """Whether the class loads as ``owner`` does."""
+    return getattr(algorithm.load, "__func__", None) is vars(owner)["load"].__func__
+
+
+def _way_out(algorithm: type[BaseAlgorithm], error: Exception) -> str:
+    """What to do about an attribute that a zip may not hold."""
+    key = getattr(error, "key", None)
+    if key in _CLASS_KEYS:
+        return "; a class of yours is admitted where you name its module: --gym-packages MODULE"
+    if key in algorithm_parameters(algorithm):
+        value = "3e-4" if key == "learning_rate" else "VALUE"
+        return f"; train.py -i goes on with another: -params {key}:{value}"
+    return ""
+
+
+def _loadable(algorithm: type[BaseAlgorithm]) -> type[BaseAlgorithm]:
+    """The class, or a subclass that does without the arguments that `load` hands a constructor."""
+    parameters = algorithm_parameters(algorithm)
+    lacking = {"policy", "device", "_init_setup_model"} - parameters.keys()
+    if not lacking:
+        return algorithm
+
+    def without_them(self: Any, **kwargs: Any) -> None:
+        initialise: Any = algorithm.__init__
+        # What `_init_setup_model=False` is for: `load` sets up once it has restored the attributes.
+        vars(self)["_setup_model"] = lambda: None
+        initialise(self, **{name: value for name, value in kwargs.items() if name not in lacking})
+        del vars(self)["_setup_model"]
+
+    return type(algorithm.__name__, (algorithm,), {"__init__": without_them})
+
+
+def load_to_play(
+    algo: str,
+    model: ModelFile | Path,
+    env: VecEnv,
+    device: str = "auto",
+    modules: Iterable[UserModule] = (),
+) -> BaseAlgorithm:
+    """As `load_model`, for an agent that is not to learn any more.
+
+    What only learning needs is left out: buffers, action noise, and schedules, which zips
+    of older versions hold as functions. Observations may have other bounds.
+    """
+    file = _read(model)
+    if _is_hand_written(algo):
+        return load_model(algo, file, env, device=device)
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+    from stable_baselines3.common.utils import ConstantSchedule
+
+    saved, given = saved_observation(file), shown_space(vars(env.observation_space))
+    if saved != given and saved is not None:
+        raise UserError(
+            f"{file.path} was trained on observations of {saved}, and the environment as it is "
+            f"made here gives {given}: args.yml and config.yml beside the zip would say how it was "
+            "made there, or --env-kwargs"
+        )
+    unused = ConstantSchedule(0.0)
+    replaced: dict[str, Any] = {
+        "learning_rate": 0.0,
+        **dict.fromkeys(("lr_schedule", "clip_range", "clip_range_vf"), unused),
+        "action_noise": None,
+        "n_steps": 1,
+    }
+    if saved is not None:
+        replaced["observation_space"] = env.observation_space
+    small = {"buffer_size": 1, "optimize_memory_usage": False}
+    extra = small if issubclass(agent_class(algo), OffPolicyAlgorithm) else {}
+    return load_model(algo, file, env, modules, device=device, custom_objects=replaced, **extra)
+
+
+def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None) -> None:
+    """Give an agent the replay buffer in a file, where it is of a kind that has one."""
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    from agents.dqn import MaskedReplayBuffer
+    from safe_files import load_replay_buffer as load_safely
+    from safe_files.limits import MAX_BUFFER_BYTES
+
+    if not isinstance(model, OffPolicyAlgorithm):
+        return
+    wanted: Any = model.replay_buffer
+    try:
+        content = io.BytesIO(read_recorded(run, path, MAX_BUFFER_BYTES))
+        load_safely(model, content, classes={MaskedReplayBuffer, type(wanted)})
+    except (OSError, ValueError, AssertionError) as error:
+        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+    buffer: Any = model.replay_buffer
+    if buffer.n_envs != model.n_envs:
+        raise UserError(
+            f"{path} was filled by {buffer.n_envs} environments at once, and cannot be by "
+            f"{model.n_envs}: give -params n_envs:{buffer.n_envs}"
+        )
+    kinds = [(type(one).__name__, getattr(one, "n_steps", 1)) for one in (buffer, wanted)]
+    if kinds[0] != kinds[1]:
+        found, needed = (f"{name} with n_steps {n_steps}" for name, n_steps in kinds)
+        raise UserError(f"{path} holds a {found}; these hyperparameters need a {needed}")
+
+
+# What a VecNormalize is told when it is made, beside whether it goes on learning.
+_SETTINGS = (
+    "norm_obs",
+    "norm_reward",
+    "clip_obs",
+    "clip_reward",
+    "gamma",
+    "epsilon",
+    "norm_obs_keys",
+)
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What a VecNormalize has seen, and how it normalises by it."""
+
+    path: Path  # where they were read
+    settings: Mapping[str, Any]  # arguments of VecNormalize
+    # of each observation, or by key; None where observations are left alone
+    observations: RunningMeanStd | dict[str, RunningMeanStd] | None
+    returns: RunningMeanStd  # of discounted returns, by which rewards are divided
+
+
+def read_statistics(path: Path, run: Run | None = None) -> Statistics:
+    """Read what VecNormalize saved, as data: nothing in the file is run."""
+    from safe_files.limits import MAX_STATISTICS_BYTES
+    from safe_files.vec_normalize import read_normalization
+
+    try:
+        saved = read_normalization(read_recorded(run, path, MAX_STATISTICS_BYTES))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read: {one_line(error)}") from error
+    settings = {key: saved.settings[key] for key in _SETTINGS if saved.settings[key] is not None}
+    return Statistics(
+        path,
+        {key: _plain(value) for key, value in settings.items()},
+        saved.obs_rms if saved.settings["norm_obs"] else None,
+        saved.ret_rms,
+    )
+
+
+def normalising(spec: TrainSpec, settings: Mapping[str, Any]) -> TrainSpec:
+    """The spec with environments under a VecNormalize that is made with ``settings``."""
+    return replace(
+        spec,
+        hyperparams=replace(spec.hyperparams, normalize=dict(settings)),
+        saved_hyperparams={**spec.saved_hyperparams, "normalize": dict(settings)},
+    )
+
+
+def take_over(env: VecEnv, statistics: Statistics) -> None:
+    """Let the VecNormalize in ``env`` go on from the statistics."""
+    from stable_baselines3.common.vec_env import unwrap_vec_normalize
+
+    normalization = unwrap_vec_normalize(env)
+    assert normalization is not None, "see `normalising`"
+    if normalization.norm_obs and statistics.observations is not None:
+        wanted, found = _shapes(normalization.obs_rms), _shapes(statistics.observations)
+        if wanted != found:
+            raise UserError(
+                f"{statistics.path} holds statistics of observations of shape {found}; the "
+                f"environment gives {wanted}"
+            )
+        normalization.obs_rms = statistics.observations  # type: ignore[assignment]
+    normalization.ret_rms = statistics.returns
+
+
+def with_normalised_rewards(env: VecEnv) -> VecEnv:
+    """The environments with rewards as training normalised them, episodes' returns too."""
+    from stable_baselines3.common.vec_env import VecMonitor, unwrap_vec_normalize
+
+    normalization = unwrap_vec_normalize(env)
+    if normalization is None:
+        raise UserError("--norm-reward: no statistics of VecNormalize belong to this model")
+    normalization.norm_reward = True
+    with warnings.catch_warnings():
+        # That the statistics of the Monitor inside are overwritten is what is wanted.
+        warnings.filterwarnings("ignore", "The environment is already wrapped with a `Monitor`")
+        return VecMonitor(env)
+
+
+def _plain(value: Any) -> Any:
+    """NumPy's numbers as Python's, which a settings file can hold."""
+    return value.item() if hasattr(value, "item") else value
+
+
+def _shapes(statistics: Any) -> Any:
+    if isinstance(statistics, dict):
+        return {key: value.mean.shape for key, value in statistics.items()}
+    return statistics.mean.shape
+
+
+def save_model(model: BaseAlgorithm, path: Path) -> None:
+    """Write the agent to ``path``, whole or not at all."""
+    from pipeline.finite_numbers import check_model
+
+    check_model(model)
+    with replacing(path) as file:
+        model.save(file)
+
+
+def save_normalization(model: BaseAlgorithm, path: Path) -> None:
+    """Write the running statistics of VecNormalize, where the agent trains under one."""
+    normalization = model.get_vec_normalize_env()
+    if normalization is not None:
+        with replacing(path) as file:
+            pickle.dump(normalization, file)  # as its own `save`, which takes paths alone
+
+
+def save_replay_buffer(model: BaseAlgorithm, path: Path) -> None:
+    """Write the replay buffer, where the agent has one."""
+    if getattr(model, "replay_buffer", None) is not None:
+        with replacing(path) as file:
+            model.save_replay_buffer(file)  # type: ignore[attr-defined]

@@ -1,0 +1,486 @@
+"""One run folder: the names of its files, its number, and what it says of itself.
+
+The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, and so are names of files where it
+has them too, so that its tools read our runs; ``run.json`` is ours and says what was asked for, how
+far it came, and what came out. One process at a time is at work on a run; what processes that are
+gone have left among the runs is cleared away before the next is begun.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import platform
+import re
+import secrets
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache, cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.digests import (
+    FIELD,
+    RECORD,
+    STATE_FOLDER,
+    VERSION,
+    VERSION_FIELD,
+    RecordedFiles,
+    digest_of,
+    digests_of,
+    read_record,
+    sealed,
+)
+from pipeline.errors import UserError
+from pipeline.files import (
+    drafts_in,
+    portable_name,
+    put_in_place,
+    replacing,
+    sync_together,
+    write_json,
+    write_text,
+)
+from pipeline.locks import is_alive, mark
+from pipeline.module_records import keep_copies
+from safe_files.regular_files import hold
+
+if TYPE_CHECKING:
+    from pipeline.train_spec import TrainSpec
+import _thread
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+from pipeline.digests import LOCK
+from pipeline.locks import folder_lock
+from pipeline.module_records import COPIES
+from safe_files.regular_files import take_up
+
+PULLS_FILE = "pulls.npz"
+
+
+def environment_name(env_id: str) -> str:
+    """The environment's id as a file name: no module before it, and no slash in it."""
+    return portable_name(env_id.rpartition(":")[2].replace("/", "-"))
+
+
+RUNNING = "running"
+FINISHED = "finished"
+INTERRUPTED = "interrupted"
+FAILED = "failed"
+
+# What ``run.json`` says of the end of a run.
+OUTCOME = (
+    "state",
+    "reason",
+    "stopped_by",
+    "n_timesteps",
+    "seconds",
+    "cpu_seconds",
+    "final",
+    "best_mean_return",
+    "best_timesteps",
+    "best_episodes",
+    "evaluation_steps",
+    "engine",
+    "regret",
+    "pulls",
+    FIELD,
+)
+# The field of ``run.json`` that says, while a run is running, which process is at work on it.
+PROCESS = "process"
+# Kept by a run that is under way: where nothing else fits on the disk, its last word does.
+ROOM = ".room"
+ROOM_BYTES = 16 << 10
+
+
+class NoRunError(UserError):
+    """An agent has not been trained on an environment yet."""
+
+    def __init__(self, algo: str, env_id: str, log_folder: Path) -> None:
+        super().__init__(f"no run of {algo} on {environment_name(env_id)} in {log_folder}")
+        self.algo, self.env_id, self.log_folder = algo, env_id, log_folder
+
+
+def _run_number(name: str, env_name: str) -> int:
+    """The number in a run folder's name, with or without a unique suffix; 0 if it is none."""
+    match = re.fullmatch(re.escape(env_name) + r"_(\d+)(?:_[0-9a-f-]{36})?", name)
+    return int(match[1]) if match else 0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run folder, and what it says of itself.
+
+    It is held: nothing in it is read or written through a link.
+    """
+
+    path: Path
+    env_name: str  # the environment's name in file names
+
+    def __post_init__(self) -> None:
+        hold(self.path)
+
+    @classmethod
+    def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
+        """Make the folder of a new run, with the first number that is free.
+
+        It says from its first moment on which process is at work on it.
+        """
+        name = environment_name(env_id)
+        parent = log_folder / algo
+        draft = cls(parent / f".{name}.{secrets.token_hex(8)}.tmp", name)
+        try:
+            draft.params_path.mkdir(parents=True)
+            draft.update_info(state=RUNNING)
+            number = max((n for n, _ in numbered_runs(parent, name)), default=0) + 1
+            # Renaming is what claims the number: two runs never share one.
+            while not _renamed(draft.path, path := parent / f"{name}_{number}{suffix}"):
+                number += 1
+        except OSError as error:
+            draft.discard()
+            raise UserError(f"cannot make a run folder in {parent}: {error.strerror}") from error
+        return cls(path, name)
+
+    @classmethod
+    def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
+        """The run of that number, the newest where it is 0, that without a number where it is -1.
+
+        The one without a number lies in ``<log folder>/<algo>/`` itself, and is also the newest
+        where no other is, as in rl_zoo3.
+        """
+        name = environment_name(env_id)
+        runs = numbered_runs(log_folder / algo, name)
+        has_unnumbered = (log_folder / algo / f"{name}.zip").exists()
+        if number < 0 or (number == 0 and not runs and has_unnumbered):
+            return cls(log_folder / algo, name)
+        if not runs:
+            raise NoRunError(algo, env_id, log_folder)
+        if number == 0:
+            return cls(runs[-1][1], name)
+        for known, path in runs:
+            if known == number:
+                return cls(path, name)
+        numbers = ", ".join(str(known) for known, _ in runs)
+        raise UserError(f"no run {number} of {algo} on {name} in {log_folder}: there is {numbers}")
+
+    @property
+    def params_path(self) -> Path:
+        """The folder of the run's settings and normalisation statistics."""
+        return self.path / self.env_name
+
+    @property
+    def model_path(self) -> Path:
+        """The agent at the end of training."""
+        return self.path / f"{self.env_name}.zip"
+
+    @property
+    def best_model_path(self) -> Path:
+        """The agent that evaluated best."""
+        return self.path / "best_model.zip"
+
+    def checkpoint_path(self, n_steps: int) -> Path:
+        """The agent after ``n_steps`` steps."""
+        return self.path / f"rl_model_{n_steps}_steps.zip"
+
+    def checkpoints(self) -> list[Path]:
+        """The checkpoints that there are, by rising number of steps."""
+        steps = (
+            re.fullmatch(r"rl_model_(\d+)_steps\.zip", path.name) for path in self.path.iterdir()
+        )
+        return [self.checkpoint_path(n) for n in sorted(int(match[1]) for match in steps if match)]
+
+    @property
+    def evaluations_path(self) -> Path:
+        """The evaluations during training."""
+        return self.path / "evaluations.npz"
+
+    @property
+    def vecnormalize_path(self) -> Path:
+        """The running statistics of VecNormalize."""
+        return self.params_path / "vecnormalize.pkl"
+
+    @property
+    def state_path(self) -> Path:
+        """The folder of the states that a training under way goes on from."""
+        return self.path / STATE_FOLDER
+
+    @property
+    def info_path(self) -> Path:
+        """What the run was asked for and what came out."""
+        return self.path / RECORD
+
+    @property
+    def curve_path(self) -> Path:
+        """The picture of the learning curve."""
+        return self.path / "learning_curve.png"
+
+    @property
+    def pulls_picture_path(self) -> Path:
+        """The picture of the pulls, on bandits."""
+        return self.path / "pulls.png"
+
+    @property
+    def value_maps_path(self) -> Path:
+        """The policy and its values during training, on grid worlds."""
+        return self.path / "value_maps.npz"
+
+    @property
+    def value_map_path(self) -> Path:
+        """The picture of the policy at the end of training, on grid worlds."""
+        return self.path / "value_map.png"
+
+    @property
+    def number(self) -> int:
+        """The number in the folder's name; 0 if there is none."""
+        return _run_number(self.path.name, self.env_name)
+
+    def read_info(self) -> dict[str, Any]:
+        """The contents of ``run.json``; empty where there is none."""
+        try:
+            return read_record(self.info_path)
+        except FileNotFoundError:
+            return {}
+
+    @property
+    def state(self) -> str | None:
+        """What became of the run: one whose process is gone before its end was interrupted."""
+        info = self.read_info()
+        state = info.get("state")
+        if state == RUNNING and is_alive(info.get(PROCESS)) is False:
+            return INTERRUPTED
+        return state if isinstance(state, str) else None
+
+    def recorded_spec(self) -> dict[str, Any]:
+        """What ``run.json`` says was asked for; empty where it says nothing."""
+        spec = self.read_info().get("spec")
+        return spec if isinstance(spec, dict) else {}
+
+    def update_info(self, **fields: Any) -> None:
+        """Set fields of ``run.json``, which names this process while the run is running."""
+        info = {**self.read_info(), **fields}
+        info.pop(PROCESS, None)
+        if info.get("state") == RUNNING:
+            info[PROCESS] = mark()
+        write_json(self.info_path, sealed(info))
+
+    def reopen(self) -> None:
+        """Take out of ``run.json`` what came out so far: the run goes on."""
+        info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
+        write_json(self.info_path, {**info, "state": RUNNING, PROCESS: mark()})
+
+    def keep_room(self) -> None:
+        """Take the room on the disk that the run's last word needs."""
+        with replacing(self.path / ROOM) as file:
+            file.write(bytes(ROOM_BYTES))
+
+    def _give_room(self) -> None:
+        (self.path / ROOM).unlink(missing_ok=True)
+
+    def fail(self, reason: str) -> None:
+        """Note in ``run.json`` that the run has failed, if anything can be written at all."""
+        with contextlib.suppress(OSError):
+            self._give_room()
+            self.update_info(state=FAILED, reason=reason)
+
+    def end(self, **fields: Any) -> None:
+        """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
+        self._give_room()
+        for draft in drafts_in(self.path):  # of a file that was not to be finished any more
+            draft.unlink(missing_ok=True)
+        self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
+
+    def add_file(self, path: Path) -> None:
+        """Let the record name a file that came into the folder after the end of the run."""
+        digests = self.files.digests
+        if digests is not None and path.parent.resolve() == self.path.resolve():
+            self.update_info(**{FIELD: {**digests, path.name: digest_of(path)}})
+
+    def wait_for_disk(self, files: Sequence[Path]) -> None:
+        """Wait until the disk has files of the run, and the way to them."""
+        way = [self.path, *self.path.parents][:3]
+        sync_together(files, {*(path.parent for path in files), *way})
+
+    @property
+    def files(self) -> RecordedFiles:
+        """The files that the run left, each held against what it was then."""
+        return RecordedFiles(self.path, self.read_info().get(FIELD))
+
+    def discard(self) -> None:
+        """Remove the folder of a run that left nothing, and those above it that are empty then."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        for folder in list(self.path.parents)[:2]:
+            try:
+                folder.rmdir()
+            except OSError:
+                return
+
+
+@dataclass(frozen=True)
+class ReadRun(Run):
+    """A run folder that is only read: all goes by what it said when it was first asked."""
+
+    @cached_property
+    def _info(self) -> dict[str, Any]:
+        return super().read_info()
+
+    def read_info(self) -> dict[str, Any]:
+        return self._info
+
+    @cached_property
+    def files(self) -> RecordedFiles:
+        """The files that the run left, each held against what it was then."""
+        return super().files
+
+
+def _renamed(draft: Path, path: Path) -> bool:
+    """Rename a folder that holds something, unless something has the name already."""
+    if os.path.lexists(path):
+        return False
+    try:
+        put_in_place(draft, path)
+    except OSError:
+        if os.path.lexists(path):  # since a moment ago
+            return False
+        raise
+    return True
+
+
+def numbered_runs(parent: Path, env_name: str) -> list[tuple[int, Path]]:
+    """The run folders of one environment, by rising number."""
+    if not parent.is_dir():
+        return []
+    numbered = [(_run_number(path.name, env_name), path) for path in parent.iterdir()]
+    return sorted((number, path) for number, path in numbered if number > 0)
+
+
+# The field of ``run.json`` with the digest of the zip that a run goes on with.
+TRAINED_AGENT = "trained_agent_digest"
+_PROCESSORS = Path("/proc/cpuinfo")
+RECORDED_PACKAGES = ("rl-yardstick", "stable-baselines3", "gymnasium", "torch", "numpy", "numba")
+
+
+def write_settings(run: Run, spec: TrainSpec, command: str) -> None:
+    """Write the hyperparameters and the command, where rl_zoo3 has them; keep the user's files."""
+    write_text(run.params_path / "config.yml", _yaml(spec.saved_hyperparams))
+    write_text(run.params_path / "command.txt", command + "\n")
+    keep_copies(spec.user_modules, run.path)
+
+
+def write_arguments(run: Run, spec: TrainSpec, args: Mapping[str, Any]) -> None:
+    """Write the arguments of the command, as rl_zoo3 does."""
+    # Its tools take env_kwargs for the environment's arguments and let them win over config.yml.
+    args = {**args, "env_kwargs": spec.saved_hyperparams.get("env_kwargs")}
+    write_text(run.params_path / "args.yml", _yaml(args))
+
+
+def _yaml(data: Mapping[str, Any]) -> str:
+    """As `yaml.safe_dump`, by the library's faster half where that was built."""
+    import yaml
+
+    return str(yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
+
+
+@cache
+def recorded_versions() -> dict[str, str]:
+    """The versions that a run's results may depend on."""
+    from importlib.metadata import version
+
+    packages = {package: version(package) for package in RECORDED_PACKAGES}
+    return {"python": platform.python_version(), **packages}
+
+
+@cache
+def recorded_machine() -> dict[str, str]:
+    """What times may depend on, and the bits of networks; nothing that names this very machine."""
+    return {
+        "processor": _processor(),
+        "cores": str(os.cpu_count() or "unknown"),
+        "system": f"{platform.system()} {platform.release()}, {platform.machine()}",
+    }
+
+
+def _processor() -> str:
+    """The model, as Linux tells it; Python itself knows the family alone."""
+    try:
+        lines = _PROCESSORS.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    return next(named, "") or platform.processor() or platform.machine() or "unknown"
+
+
+@contextmanager
+def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
+    """Keep others from going on with a run inside the ``with`` statement."""
+    take_up(run.path)
+    with folder_lock(run.path, partial(_thread.interrupt_main, signal.SIGTERM), say):
+        yield
+
+
+def check_left(run: Run) -> None:
+    """Make sure that nobody is at work on a run that has no lock, as those of a study."""
+    info = run.read_info()
+    process: Any = info.get(PROCESS)
+    if info.get("state") == RUNNING and is_alive(process):
+        raise UserError(f"{run.path}: process {process['pid']} is at work on it")
+
+
+_CLAIM = re.compile(r"\.(.+)\.[0-9a-f]{16}\.tmp")
+
+
+def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
+    """Remove half-written files of runs that were killed, and runs killed before their first step.
+
+    Only what a process that is certainly gone has written is touched, and no folder that holds
+    anything else. What cannot be removed stays.
+    """
+    for run in _unfinished(log_folder / algo, environment_name(env_id)):
+        with contextlib.suppress(OSError, UserError):
+            drafts = drafts_in(run.path)  # before looking: who goes on with a run may write some
+            info = run.read_info()
+            if info.get("state") != RUNNING or is_alive(info.get(PROCESS)) is not False:
+                continue
+            if "spec" not in info and _is_mere_set_up(run):
+                _remove(run.path)
+                continue
+            for draft in drafts:
+                draft.unlink(missing_ok=True)
+
+
+def _unfinished(parent: Path, env_name: str) -> Iterator[Run]:
+    """The runs that have no model, or half-written files; also those that have no number yet."""
+    for _, path in numbered_runs(parent, env_name):
+        run = Run(path, env_name)
+        is_own = path.is_dir() and not path.is_symlink()
+        if is_own and (not run.model_path.exists() or drafts_in(path)):
+            yield run
+    for path in list(parent.glob(".*.tmp")):
+        claim = _CLAIM.fullmatch(path.name)
+        if claim is not None and path.is_dir() and not path.is_symlink():
+            yield Run(path, claim[1])
+
+
+def _is_mere_set_up(run: Run) -> bool:
+    """Whether nothing lies in the folder but what is written before the first step."""
+    own_files = "|".join(map(re.escape, (RECORD, LOCK, ROOM)))
+    own = re.compile(
+        rf"{own_files}|\d+\.monitor\.csv|{re.escape(run.env_name)}(/(config|args)\.yml|/command\.txt)?"
+        rf"|{COPIES}(/.+\.py)?|(.+/)?\.[^/]+\.[0-9a-f]{{16}}\.tmp"
+    )
+    paths = (
+        p for p in run.path.rglob("*") if p.is_symlink() or not (p.is_dir() and any(p.iterdir()))
+    )
+    names = (path.relative_to(run.path).as_posix() for path in paths)
+    return all(own.fullmatch(name) and not (run.path / name).is_symlink() for name in names)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder, unless something comes into it meanwhile."""
+    for parent, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            (Path(parent) / name).unlink(missing_ok=True)
+        Path(parent).rmdir()
