@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from commands import compare_agents, enjoy_agent, train_agent
-from commands.enjoy_request import model_request
-from commands.study_request import study_spec
-from commands.train_request import train_spec
+from commands import compare, enjoy, train
+from commands.compare import study_spec
+from commands.enjoy import model_request
+from commands.train import train_spec
 from experiments.study_plan import plan
 from experiments.study_spec import StudySpec
 from pipeline.environments import training_changes
@@ -38,7 +38,7 @@ COMPARE = ["--algos", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
     ],
 )
 def test_a_flag_of_train_reaches_the_specification(words, name, value):
-    args = train_agent.build_parser().parse_args([*TRAIN, *words])
+    args = train.build_parser().parse_args([*TRAIN, *words])
     assert getattr(train_spec(args), name) == value
 
 
@@ -46,7 +46,7 @@ def test_the_page_that_plays_a_training(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def spec_of(*words):
-        return train_spec(train_agent.build_parser().parse_args([*TRAIN, *words]))
+        return train_spec(train.build_parser().parse_args([*TRAIN, *words]))
 
     page = ("--watch-learning", "page.html")
     assert (spec_of(*page).watch_learning, spec_of(*page).watch_episodes) == (Path("page.html"), 0)
@@ -65,7 +65,7 @@ def test_the_page_that_plays_a_training(tmp_path, monkeypatch):
 
 
 def test_without_flags_a_run_is_the_default_one():
-    spec = train_spec(train_agent.build_parser().parse_args(TRAIN))
+    spec = train_spec(train.build_parser().parse_args(TRAIN))
     own = {"algo", "env_id", "hyperparams", "saved_hyperparams", "seed"}
     # A study has the same number of episodes in all its runs; a run by itself as few as will do.
     assert (spec.eval_episodes, spec.final_episodes) == (None, None)
@@ -95,14 +95,14 @@ def test_without_flags_a_run_is_the_default_one():
     ],
 )
 def test_a_flag_of_compare_reaches_the_study(words, name, value):
-    study = study_spec(compare_agents.build_parser().parse_args([*COMPARE, *words]))
+    study = study_spec(compare.build_parser().parse_args([*COMPARE, *words]))
     assert getattr(study, name) == value
 
 
 def test_everybody_is_trained_on_the_environment_as_it_comes(tmp_path):
     words = ["--env", "Warehouse-v0", "--algos", "ppo", "qlearning"]
     for flags, changed in ((), {"ppo"}), (["--as-it-comes"], set()):
-        study = study_spec(compare_agents.build_parser().parse_args([*words, *flags]))
+        study = study_spec(compare.build_parser().parse_args([*words, *flags]))
         planned = plan(study, tmp_path)
         assert {one.agent for one in planned if training_changes(one.spec)} == changed
 
@@ -111,8 +111,8 @@ def test_what_a_study_says_of_its_runs_reaches_them(tmp_path):
     study = StudySpec(
         "s",
         "S",
-        study_spec(compare_agents.build_parser().parse_args(COMPARE)).agents,
-        study_spec(compare_agents.build_parser().parse_args(COMPARE)).environments,
+        study_spec(compare.build_parser().parse_args(COMPARE)).agents,
+        study_spec(compare.build_parser().parse_args(COMPARE)).environments,
         n_seeds=1,
         eval_freq=11,
         eval_episodes=13,
@@ -134,4 +134,4 @@ def test_what_a_study_says_of_its_runs_reaches_them(tmp_path):
     ],
 )
 def test_which_model_is_played(words, which):
-    assert model_request(enjoy_agent.build_parser().parse_args(words)).which == which
+    assert model_request(enjoy.build_parser().parse_args(words)).which == which

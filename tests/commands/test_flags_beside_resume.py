@@ -2,7 +2,7 @@
 
 import pytest
 
-from commands.train_flags import build_parser
+from commands.train import build_parser
 
 ALLOWED = {
     "--save-state-every": "30s",

@@ -9,12 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from commands import compare_agents, enjoy_agent, train_agent
-from commands.enjoy_request import model_request
-from commands.flag_values import LARGEST, folder_name, number_at_least_zero, whole_number
-from commands.parsing import check_device
-from commands.study_request import study_spec
-from commands.train_request import train_spec
+from commands import compare, enjoy, train
+from commands.cli import LARGEST, check_device, folder_name, number_at_least_zero, whole_number
+from commands.compare import study_spec
+from commands.enjoy import model_request
+from commands.train import train_spec
 from pipeline.environments import make_env
 from pipeline.errors import UserError
 from pipeline.training import carry_out, prepare
@@ -22,11 +21,11 @@ from pipeline.training import carry_out, prepare
 ODD = ("0", "-1", "-5", "7", "1e5", "100_000", "9" * 30, "1e999999999", "-1e999999999", "\u0663")
 ODD = (*ODD, "1.5", "nan", "sNaN", "inf", "-inf", "", " ", "text", "a:b", "/", "..")
 BASES = {
-    train_agent: ["--algo", "random", "--env", "FrozenLake-v1", "-n", "5"],
-    enjoy_agent: ["--algo", "random", "--env", "FrozenLake-v1"],
-    compare_agents: ["--algos", "random", "--env", "FrozenLake-v1", "-n", "5"],
+    train: ["--algo", "random", "--env", "FrozenLake-v1", "-n", "5"],
+    enjoy: ["--algo", "random", "--env", "FrozenLake-v1"],
+    compare: ["--algos", "random", "--env", "FrozenLake-v1", "-n", "5"],
 }
-REQUESTS = {train_agent: train_spec, enjoy_agent: model_request, compare_agents: study_spec}
+REQUESTS = {train: train_spec, enjoy: model_request, compare: study_spec}
 
 
 def parsers():
@@ -46,7 +45,7 @@ FLAGS = [
 def test_an_odd_value_has_a_meaning_or_is_refused_in_one_line(module, flag, capsys):
     for value in ODD:
         base = BASES[module]
-        if flag == "--n-episodes" and module is not enjoy_agent:
+        if flag == "--n-episodes" and module is not enjoy:
             base = base[:-2]
         refusal = ""
         try:
@@ -58,7 +57,7 @@ def test_an_odd_value_has_a_meaning_or_is_refused_in_one_line(module, flag, caps
         assert refusal.count("\n") == bool(refusal)
 
 
-TRAIN, ENJOY, COMPARE = train_agent, enjoy_agent, compare_agents
+TRAIN, ENJOY, COMPARE = train, enjoy, compare
 MEANINGS = [
     (TRAIN, "-n", {"1e5": 100_000, "100_000": 100_000, "-1": -1}, "0 -5 1.5 nan inf text 1e13"),
     (TRAIN, "--n-episodes", {"1e3": 1000, "-1": -1}, "0 -2"),
@@ -133,15 +132,15 @@ def test_any_other_text_is_refused(text):
     ],
 )
 def test_what_is_taken_trains(words, tmp_path):
-    words = [*BASES[train_agent], "-f", str(tmp_path), *words]
-    spec = train_spec(train_agent.build_parser().parse_args(words))
+    words = [*BASES[train], "-f", str(tmp_path), *words]
+    spec = train_spec(train.build_parser().parse_args(words))
     outcome = carry_out(prepare(spec, Console(file=io.StringIO()), {}, ""))
     assert outcome.n_steps in (5, 6)
 
 
 def test_tensorboard_calls_a_run_after_its_agent(tmp_path):
-    words = [*BASES[train_agent], "-f", str(tmp_path), "-tb", str(tmp_path / "tb")]
-    spec = train_spec(train_agent.build_parser().parse_args(words))
+    words = [*BASES[train], "-f", str(tmp_path), "-tb", str(tmp_path / "tb")]
+    spec = train_spec(train.build_parser().parse_args(words))
     for _ in range(2):
         carry_out(prepare(spec, Console(file=io.StringIO()), {}, ""))
     assert {path.name for path in (tmp_path / "tb" / "FrozenLake-v1").iterdir()} == {
@@ -157,7 +156,7 @@ def test_a_budget_in_settings_may_be_written_as_a_float(place, text, tmp_path):
     words = ["--algo", "random", "--env", "FrozenLake-v1"]
     where = {"-params": [f"n_timesteps:{text}"], "file": [str(tmp_path / "own.yml")]}[place]
     flag = {"-params": "-params", "file": "-conf"}[place]
-    args = train_agent.build_parser().parse_args([*words, flag, *where])
+    args = train.build_parser().parse_args([*words, flag, *where])
     assert train_spec(args).hyperparams.n_timesteps == 100_000
 
 
@@ -191,7 +190,7 @@ def test_arguments_of_environments(env_id, kwargs, complaint):
 
 def test_a_random_seed_to_play_with():
     words = ["--seed", "-1", "--algo", "random", "--env", "FrozenLake-v1"]
-    args = enjoy_agent.build_parser().parse_args(words)
+    args = enjoy.build_parser().parse_args(words)
     seeds = {model_request(args).seed for _ in range(5)}
     assert len(seeds) == 5
     assert min(seeds) >= 0
@@ -199,7 +198,7 @@ def test_a_random_seed_to_play_with():
 
 def test_a_folder_is_not_left_to_chance(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for module in (train_agent, enjoy_agent, compare_agents):
+    for module in (train, enjoy, compare):
         with pytest.raises(SystemExit):
             module.build_parser().parse_args(["-f", ""])
     assert list(Path.cwd().iterdir()) == []

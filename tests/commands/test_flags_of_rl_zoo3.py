@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from commands import enjoy_agent, train_agent
+from commands import enjoy, train
 from tests.peers.peer_environment import peer_folder
 
 PAGE = Path(__file__).parents[2] / "docs" / "from-rl-zoo3.md"
-COMMANDS = {"train": train_agent, "enjoy": enjoy_agent}
+COMMANDS = {"train": train, "enjoy": enjoy}
 FLAG = re.compile(r"`(--?[a-zA-Z][\w-]*)")
 
 
@@ -57,7 +57,7 @@ def test_what_is_said_not_to_be_here_is_answered(capsys):
     assert len(refused) > 15
     for flag in (flag for flags in refused for flag in flags):
         with pytest.raises(SystemExit):
-            train_agent.build_parser().parse_args([flag, "1"])
+            train.build_parser().parse_args([flag, "1"])
         err = capsys.readouterr().err
         assert err.count("\n") == 1
         assert re.search(rf"unknown argument {flag} 1: .*not", err)

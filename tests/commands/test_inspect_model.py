@@ -14,7 +14,7 @@ from stable_baselines3 import PPO
 
 import train
 from agents import load_algorithm
-from commands import yardstick
+from commands import main
 
 
 @pytest.fixture
@@ -24,7 +24,7 @@ def inspect(monkeypatch, capsys, tmp_path):
     def run(*words):
         monkeypatch.setattr(sys, "argv", ["yardstick", "inspect", *map(str, words)])
         with pytest.raises(SystemExit) as stop:
-            yardstick.main()
+            main()
         captured = capsys.readouterr()
         return stop.value.code, captured.out, captured.err
 
@@ -79,11 +79,11 @@ def test_what_is_no_model(inspect, tmp_path):
 
 def test_from_a_checkout(tmp_path):
     done = subprocess.run(
-        [sys.executable, "-m", "commands.inspect_model", "nowhere.zip"],
+        [sys.executable, "-m", "commands.share", "inspect", "nowhere.zip"],
         cwd=Path(train.__file__).parent,
         capture_output=True,
         text=True,
         check=False,
     )
     assert done.returncode == 2
-    assert done.stderr == "inspect_model.py: error: no such model file: nowhere.zip\n"
+    assert done.stderr == "yardstick inspect: error: no such model file: nowhere.zip\n"

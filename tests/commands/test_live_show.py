@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 import train
-from commands import live_show, playing_output
-from commands.enjoy_agent import build_parser
-from commands.enjoy_request import check_playing
-from commands.live_show import LiveShow, figures_table
-from commands.playing_output import PlayingRequest, play
+from commands import enjoy
+from commands.enjoy import LiveShow, build_parser, check_playing, figures_table, play
 from commands.terminal import TextConsole
 from pipeline.action_figures import ActionFigures
 from pipeline.errors import UserError
 from pipeline.models.model_choice import ModelRequest, choose_model
+from pipeline.models.model_loading import load_to_play
 
 REPLACED = "\x1b[1A\x1b[2K"  # up a line, and it is empty
 
@@ -47,19 +45,23 @@ def pauses(monkeypatch):
     """How long it would have waited between pictures."""
     waited = []
     clock = SimpleNamespace(sleep=waited.append, monotonic=time.monotonic)
-    monkeypatch.setattr(live_show, "time", clock)
+    monkeypatch.setattr(enjoy, "time", clock)
     return waited
 
 
-def played(chosen, width=100, **fields):
+def letters(*words):
+    return build_parser().parse_args(["--render", "ansi", *map(str, words)])
+
+
+def played(chosen, *words, width=100):
     console = TextConsole(file=io.StringIO(), force_terminal=True, width=width, height=40)
-    play(console, chosen, PlayingRequest(render="ansi", **fields))
+    play(console, chosen, letters(*words))
     return console.file.getvalue()
 
 
 def test_pictures_replace_each_other_at_their_pace(lake, pauses, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
-    shown = played(lake, n_episodes=2, fps=5)
+    shown = played(lake, "--n-episodes", 2, "--fps", 5)
     # Six steps to the goal: seven pictures an episode.
     assert pauses == [0.2] * 14
     assert shown.count("step 0") == 2
@@ -73,16 +75,16 @@ def test_pictures_replace_each_other_at_their_pace(lake, pauses, monkeypatch):
 
 def test_what_the_table_holds_stands_beside_the_map(lake, pauses, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
-    shown = played(lake, n_episodes=1)
+    shown = played(lake, "--n-episodes", 1)
     first = shown[: shown.index("step 1")]
     for name in ("left", "down", "right", "up"):
         assert name in first
-    model = playing_output.load_to_play("qlearning", lake.file, None, "cpu", ())
+    model = load_to_play("qlearning", lake.file, None, "cpu", ())
     for number in model.policy.q_table[0]:
         assert f"{number:.4g}" in first
     assert any("SFFF" in line and "left" in line for line in without_style(first).splitlines())
     # Where there is no room beside the map, they stand below it.
-    narrow = without_style(played(lake, width=30, n_episodes=1))
+    narrow = without_style(played(lake, "--n-episodes", 1, width=30))
     assert any(line.strip() == "SFFF" for line in narrow.splitlines())
 
 
@@ -94,7 +96,7 @@ def without_style(text):
 
 def test_elsewhere_pictures_stand_one_below_the_other(lake, pauses):
     console = TextConsole(file=io.StringIO())
-    play(console, lake, PlayingRequest(render="ansi", n_episodes=1))
+    play(console, lake, letters("--n-episodes", 1))
     shown = console.file.getvalue()
     assert without_style(shown).count("SFFF") == 7
     assert pauses == []
@@ -104,7 +106,7 @@ def test_elsewhere_pictures_stand_one_below_the_other(lake, pauses):
 
 def test_a_playing_that_is_broken_off_shows_where_it_was(lake, pauses, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
-    assert "episode 1, step 3" in played(lake, n_episodes=None, n_steps=3)
+    assert "episode 1, step 3" in played(lake, "-n", 3)
 
 
 def test_bars_lie_between_the_lowest_and_the_highest():
@@ -185,13 +187,13 @@ def wall(on_ice):
 def test_what_repeats_itself_is_shown_for_a_while(wall, pauses, monkeypatch):
     """The start, one step against the wall, and 20 that look like it, of 100; then it is told."""
     console = TextConsole(file=io.StringIO())
-    play(console, wall, PlayingRequest(render="ansi", n_episodes=2))
+    play(console, wall, letters("--n-episodes", 2))
     shown = without_style(console.file.getvalue())
     assert shown.count("SFFF") == 2 * 22
     assert shown.count("... 79 steps left out, which repeat pictures from above") == 2
     assert shown.count("return 0.00, 100 steps") == 2
     monkeypatch.setenv("TERM", "xterm")
-    shown = without_style(played(wall, n_episodes=2))
+    shown = without_style(played(wall, "--n-episodes", 2))
     assert shown.count("step 22: it repeats itself, and is not shown any more") == 2
     assert shown.count("return 0.00, 100 steps") == 2
     assert len(pauses) == 2 * 23  # the last one after the end

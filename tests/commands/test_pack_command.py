@@ -9,8 +9,8 @@ import zipfile
 import gymnasium
 import pytest
 
-from commands import compare_agents
-from commands.study_request import study_spec
+from commands import compare
+from commands.compare import study_spec
 
 pytestmark = pytest.mark.usefixtures("pictures")
 
@@ -135,7 +135,7 @@ def test_a_study_with_a_module_of_ones_own_is_played_elsewhere(
     assert (code, err) == (0, "")
     assert "my_cells" in sys.modules
     command = re.search("yardstick compare (.*)", (elsewhere / "README.md").read_text())[1]
-    args = compare_agents.build_parser().parse_args(shlex.split(command))
+    args = compare.build_parser().parse_args(shlex.split(command))
     study = study_spec(args)
     assert [agent.settings["n_timesteps"] for agent in study.agents] == [200, 200]
 

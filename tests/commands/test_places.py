@@ -4,15 +4,15 @@ import contextlib
 
 import pytest
 
-from commands.compare_agents import build_parser
-from commands.places import held, place_of
+from commands.compare import RunContext, build_parser, run_context
+from commands.terminal import TextConsole
 from experiments.child_processes import NO_LIMITS
 from pipeline.errors import UserError
 
 
 def place(tmp_path, *words):
     args = build_parser().parse_args(["study", *words])
-    return place_of(args, tmp_path / "study", "c", NO_LIMITS, pytest.fail)
+    return run_context(args, tmp_path / "study", "c", NO_LIMITS, TextConsole())
 
 
 def test_places_by_their_flags(tmp_path):
@@ -51,19 +51,21 @@ def test_without_the_library_it_is_named(tmp_path, monkeypatch):
         place(tmp_path, "--cluster", "local:2")
 
 
-def test_a_place_that_is_held_is_opened_once_and_left_at_the_end():
+def test_a_place_that_is_held_is_opened_once_and_left_at_the_end(tmp_path, monkeypatch):
     told = []
 
     @contextlib.contextmanager
-    def launchers():
+    def launcher_of(*_):
         told.append("opened")
         yield "launcher"
         told.append("left")
 
-    with held(launchers) as again:
+    monkeypatch.setattr("experiments.launching.local_launcher", launcher_of)
+    context = RunContext(tmp_path, "c", NO_LIMITS, TextConsole())
+    with context.held():
         assert told == []
         for _ in range(2):
-            with again() as launcher:
+            with context.launchers() as launcher:
                 assert launcher == "launcher"
         assert told == ["opened"]
     assert told == ["opened", "left"]

@@ -8,10 +8,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from commands import live_progress, study_progress, tune_progress
-from commands.study_progress import StudyProgress
+from commands import compare, terminal, tune
+from commands.compare import StudyProgress
 from commands.terminal import TextConsole
-from commands.tune_progress import TuningProgress
+from commands.tune import TuningProgress
 from experiments.launching import RunFailure
 from experiments.study_plan import plan
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
@@ -22,11 +22,11 @@ from pipeline import signs_of_life
 def clock(monkeypatch):
     """A clock that stands until it is told to go on."""
     fake = SimpleNamespace(now=1000.0)
-    for place in (study_progress, tune_progress, live_progress, signs_of_life):
+    for place in (compare, tune, terminal, signs_of_life):
         monkeypatch.setattr(place, "time", SimpleNamespace(monotonic=lambda: fake.now))
     # Nothing beats by itself.
     still = SimpleNamespace(start=skip, stop=skip)
-    monkeypatch.setattr(live_progress, "Heartbeat", lambda *_: still)
+    monkeypatch.setattr(terminal, "Heartbeat", lambda *_: still)
     return fake
 
 
