@@ -36,11 +36,8 @@ from safe_files.refusals import UnsafeFileError
 MISTAKE = 2  # exit code
 
 # The command that installing the project brings, and its own commands: the scripts of a checkout.
-
-
 # The command that installing the project brings, and its own commands: the scripts of a checkout.
 NAME = "yardstick"
-
 
 COMMANDS = {
     "train": "train an agent on an environment",
@@ -169,7 +166,8 @@ _TYPED_FOR: Mapping[str, Sequence[str]] = {
 # Arguments of constructors that are flags.
 SET_BY_FLAGS = {"env", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 _CONSTRUCTOR = re.compile(
-    r"def __init__\(\s*self,\s*((?:policy\b|\*args).*?)\)(?: -> None)?:\n", re.DOTALL
+    r"def __init__\(\s*self,\s*((?:policy: (?:Union\[)?str\b|\*args).*?)\)(?: -> None)?:\n",
+    re.DOTALL,
 )
 
 

@@ -16,9 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress_bar import ProgressBar
-from rich.table import Table
-from rich.text import Text
 
 from commands.cli import (
     COUNT,
@@ -44,6 +41,7 @@ from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
     import pandas as pd
+    from rich.table import Table
 
     from experiments.analysis import StudyAnalysis
     from experiments.cluster.addresses import Cluster
@@ -61,7 +59,6 @@ if TYPE_CHECKING:
 # --- flags ----------------------------------------------------------------------------------------
 
 SEEDS = whole_number(1, 1_000_000)
-
 
 EPILOG = """\
 examples:
@@ -848,6 +845,10 @@ class StudyProgress(LiveProgress):
 
     def picture(self) -> Table:
         """The same by agent and environment."""
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
         table = Table(box=None, pad_edge=False, caption=self.figures(), caption_justify="left")
         for heading in ("agent", "environment", "runs", "", "failed"):
             table.add_column(heading)

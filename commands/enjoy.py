@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from secrets import randbelow
 from typing import TYPE_CHECKING, Any
 
 from commands.cli import (
@@ -50,7 +49,6 @@ FRAMES = whole_number(1, 60)
 FRAMES_PER_SECOND = 4
 STEPS = whole_number(1, besides={-1: "as many as the episodes take"})
 RUN_NUMBER = whole_number(0, besides={-1: "the run without a number"})
-
 
 EPILOG = """\
 examples:
@@ -161,6 +159,8 @@ def check_playing(args: argparse.Namespace) -> None:
 
 def model_request(args: argparse.Namespace) -> ModelRequest:
     """The model that the arguments ask for."""
+    from secrets import randbelow
+
     from pipeline.models.model_choice import ModelRequest
     from pipeline.settings.literals import parse_assignments
     from pipeline.user_modules import import_typed
@@ -203,8 +203,10 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest) -> None:
     place = args.model if wanted.zipped_in is not None else found.path
     say(console, f"{found.spec.algo} on {found.spec.env_id}: {place}")
     with doing(console, "loading the libraries"), loading_libraries():
-        import pipeline.evaluation.exact
-        import pipeline.models.model_loading  # noqa: F401  # what plays, with all that it needs
+        # All that plays, so that nothing is loaded in the middle of it.
+        from pipeline import action_figures, environment_mistakes, playing  # noqa: F401
+        from pipeline.evaluation import asked_policies, bracketed, exact  # noqa: F401
+        from pipeline.models import model_loading, normalization  # noqa: F401
 
         chosen = with_statistics(found, wanted.statistics)
     if args.record is not None or args.reward_log:

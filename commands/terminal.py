@@ -12,9 +12,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.live import Live
 from rich.segment import Segment
-from rich.table import Table
 from rich.text import Text
 
 from pipeline.errors import visible
@@ -27,6 +25,7 @@ from pipeline.signs_of_life import (
 )
 
 if TYPE_CHECKING:
+    from rich.table import Table
     from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.callbacks import BaseCallback
 
@@ -108,6 +107,8 @@ class LiveProgress(ABC):
     """Shows how far something is while its ``with`` statement runs."""
 
     def __init__(self, console: Console) -> None:
+        from rich.live import Live
+
         self.console = console
         self.started = time.monotonic()
         self.silence = Silence(SECONDS_BETWEEN_LINES)
@@ -222,7 +223,6 @@ def episodes(n: int) -> str:
 
 
 LIBRARY = "library (Stable-Baselines3's own loop)"
-
 
 HOW_NOT_TO_BE_ASKED = (
     "made a BlockCallback, it would be asked only when it acts (docs/training.md#from-python)"

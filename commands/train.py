@@ -9,8 +9,6 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
-from secrets import randbelow
-from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Any
 
 from commands.cli import (
@@ -304,6 +302,8 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
 
 def train_spec(args: argparse.Namespace) -> TrainSpec:
     """The spec that the arguments ask for."""
+    from secrets import randbelow
+
     from pipeline.agent_checks import check_algorithm, check_fit
     from pipeline.auto_settings import resolved_spec
     from pipeline.environments import check_env_id
@@ -347,6 +347,8 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
 
 def _page_path(args: argparse.Namespace) -> Path | None:
     """Where the page is to be written that shows the learning; None where none is asked for."""
+    from tempfile import TemporaryFile
+
     if args.watch_learning is None:
         if args.watch_episodes:
             raise UserError("--watch-episodes says how much --watch-learning shows: give that too")

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.table import Table
 
 from commands.cli import (
     COUNT,
@@ -49,7 +48,6 @@ if TYPE_CHECKING:
 
 TRIALS = whole_number(1, 100_000)
 SEEDS = whole_number(1, 1000)
-
 
 EPILOG = """\
 examples:
@@ -206,6 +204,7 @@ def _tune(args: argparse.Namespace) -> int:
 
             context.get_ready([shipped_run(tuning, root)])
             from pipeline.folder_lock import FolderInUseError, told_if_gone
+            from tuning import record, retesting, searching, winner_files  # noqa: F401  # for later
             from tuning.opening import open_tuning
 
             with failing_in_a_line(args.storage):
@@ -459,6 +458,8 @@ def print_search(console: Console, opened: OpenTuning) -> None:
 
 def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> None:
     """Print what the re-test shows: a table, and what follows from it."""
+    from rich.table import Table
+
     held_out = opened.tuning.held_out
     console.print()
     title = f"re-test on the seeds {held_out.start} to {held_out.stop - 1}"

@@ -1,5 +1,7 @@
-"""From flags to specifications: a flag reaches the field that has its name."""
+"""From flags to specifications, and the flags of rl_zoo3."""
 
+import ast
+import re
 from dataclasses import fields
 from pathlib import Path
 
@@ -8,12 +10,16 @@ import pytest
 from commands import compare, enjoy, train
 from commands.compare import study_spec
 from commands.enjoy import model_request
-from commands.train import train_spec
+from commands.train import build_parser, train_spec
 from experiments.study_plan import plan
 from experiments.study_spec import StudySpec
 from pipeline.environments import training_changes
 from pipeline.errors import UserError
 from pipeline.train_spec import TrainSpec
+from tests.peers.peer_environment import peer_folder
+
+# --- from flags to specifications: a flag reaches the field that has its name ---------------------
+
 
 TRAIN = ["--algo", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
 COMPARE = ["--algos", "qlearning", "--env", "FrozenLake-v1", "-n", "60"]
@@ -135,3 +141,110 @@ def test_what_a_study_says_of_its_runs_reaches_them(tmp_path):
 )
 def test_which_model_is_played(words, which):
     assert model_request(enjoy.build_parser().parse_args(words)).which == which
+
+
+# --- what may be typed beside --resume: nothing that the run has already, not even as it has it----
+
+
+ALLOWED = {
+    "--save-state-every": "30s",
+    "--keep-state": None,
+    "--gym-packages": "math",
+    "--log-folder": "logs",
+    "--verbose": "0",
+    "--progress": None,
+}
+OTHERS = {
+    "--engine": "auto",
+    "--eval-freq": "5",
+    "--eval-episodes": "5",
+    "--hyperparams": "gamma:0.9",
+    "--env-kwargs": "a:1",
+    "--eval-env-kwargs": "a:1",
+    "--conf-file": "some.yml",
+    "--trained-agent": "some.zip",
+    "--tensorboard-log": "logs",
+}
+
+
+def flags():
+    """All flags, each with a value where it takes one: where it can be, what it is by default."""
+    for action in build_parser()._actions:
+        flag = action.option_strings[-1]
+        if flag not in ("--help", "--list", "--resume"):
+            value = ALLOWED.get(flag, OTHERS.get(flag, str(action.default)))
+            yield flag, None if action.nargs == 0 else value
+
+
+@pytest.mark.parametrize(("flag", "value"), list(flags()))
+def test_every_flag_beside_resume(type_in_own_folder, own_folder, flag, value):
+    (own_folder / "run").mkdir()
+    words = [flag] if value is None else [flag, value]
+    code, _, said = type_in_own_folder("train.py", "--resume", "run", *words)
+    assert (code, said.count("\n")) == (2, 1)
+    refusal = f"{flag} cannot be given with --resume: the run has its own"
+    assert (refusal in said) == (flag not in ALLOWED), said
+    assert not list((own_folder / "run").iterdir())
+
+
+def test_which_run_is_said_by_its_folder_or_by_its_agent_and_environment(type_in_own_folder):
+    code, _, said = type_in_own_folder("train.py", "--algo", "ppo", "--resume")
+    assert (code, said.count("\n")) == (2, 1)
+    assert "no run of ppo on CartPole-v1 in logs was interrupted" in said
+
+
+# --- the page for those who come from rl_zoo3 is complete, and says what is so --------------------
+
+
+PAGE = Path(__file__).parents[2] / "docs" / "from-rl-zoo3.md"
+COMMANDS = {"train": train, "enjoy": enjoy}
+FLAG = re.compile(r"`(--?[a-zA-Z][\w-]*)")
+
+
+def flags_of_rl_zoo3(command):
+    """The option strings of each argument, read off its source."""
+    calls = [
+        node
+        for node in ast.walk(ast.parse((peer_folder("rl_zoo3") / f"{command}.py").read_text()))
+        if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument"
+    ]
+    return {tuple(argument.value for argument in call.args) for call in calls}
+
+
+def rows(command):
+    """The cells of the command's table, without its head."""
+    section = PAGE.read_text().split(f"\n## {command}\n")[1].split("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_flag_has_its_row(command):
+    expected = flags_of_rl_zoo3(command)
+    assert len(expected) > 20
+    found = [tuple(FLAG.findall(first)) for first, _ in rows(command)]
+    assert len(found) == len(set(found))
+    assert set(found) == expected
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_is_said_to_be_here_is_here(command):
+    ours = {
+        flag
+        for action in COMMANDS[command].build_parser()._actions
+        for flag in action.option_strings
+    }
+    for theirs, here in rows(command):
+        assert set(FLAG.findall(here)) <= ours, theirs
+        assert FLAG.match(here) or here.startswith(("the same", "no", "what")), theirs
+
+
+def test_what_is_said_not_to_be_here_is_answered(capsys):
+    refused = [FLAG.findall(theirs) for theirs, here in rows("train") if here.startswith("no")]
+    assert len(refused) > 15
+    for flag in (flag for flags in refused for flag in flags):
+        with pytest.raises(SystemExit):
+            train.build_parser().parse_args([flag, "1"])
+        err = capsys.readouterr().err
+        assert err.count("\n") == 1
+        assert re.search(rf"unknown argument {flag} 1: .*not", err)
