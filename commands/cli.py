@@ -91,7 +91,8 @@ class OneLineParser(argparse.ArgumentParser):
     _placed: argparse.Namespace | None = None
 
     def __init__(self, epilog: str, **kwargs: Any) -> None:
-        kwargs = {"formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs}
+        kwargs.setdefault("prog", program_name())
+        kwargs.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         # Without abbreviations: --seed for --seeds would mean something else, and be taken.
         super().__init__(allow_abbrev=False, epilog=as_called(epilog), **kwargs)
 
@@ -353,7 +354,7 @@ ASSIGNMENTS: Mapping[str, Any] = {"nargs": "+", "default": [], "metavar": "KEY:V
 _MODULES: Mapping[str, Any] = {"nargs": "+", "type": filled, "default": [], "metavar": "MODULE"}
 
 # Flags that several commands have: their names, what they take, and what is said of them.
-_SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
+SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
     ("-params --hyperparams", ASSIGNMENTS, ""),
     ("-conf --conf-file", {"type": filled, "metavar": "YAML"}, "hyperparameters from another file"),
     ("--env-kwargs", ASSIGNMENTS, "environment arguments"),
@@ -406,7 +407,7 @@ _SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
 def add_shared(group: argparse._ActionsContainer, *flags: str, **changes: Any) -> None:
     """Add flags that several commands have, in which this one may change something."""
     for flag in flags:
-        names, options, words = next(each for each in _SHARED if flag in each[0].split())
+        names, options, words = next(each for each in SHARED if flag in each[0].split())
         group.add_argument(*names.split(), **{"help": words, **options, **changes})
 
 

@@ -29,7 +29,6 @@ from commands.cli import (
     folder_name,
     go_on_unread,
     number_at_least_zero,
-    program_name,
     whole_number,
 )
 from commands.terminal import LiveProgress, say, table_console
@@ -76,7 +75,6 @@ The same command again does the missing runs, and no others.
 def build_parser() -> argparse.ArgumentParser:
     """The flags; those of single runs mean what they mean to the command train."""
     parser = OneLineParser(
-        prog=program_name(),
         description="Compare agents on environments over seeds: tables, figures, and a page.",
         epilog=EPILOG,
     )

@@ -23,7 +23,6 @@ from commands.cli import (
     check_device,
     filled,
     go_on_unread,
-    program_name,
     whole_number,
 )
 from pipeline.errors import UserError
@@ -63,7 +62,6 @@ examples:
 def build_parser() -> argparse.ArgumentParser:
     """The flags; where rl_zoo3 has one, with its name and meaning."""
     parser = OneLineParser(
-        prog=program_name(),
         description="Play a trained agent and print the returns of its episodes.",
         epilog=EPILOG,
     )

@@ -132,9 +132,8 @@ def inspect() -> int:
 
 
 if __name__ == "__main__":
-    wanted = sys.argv.pop(1) if len(sys.argv) > 1 else ""
-    mains = {"pack": pack, "inspect": inspect}
-    if wanted not in mains:
-        sys.exit("usage: python -m commands.share pack|inspect ...")
-    sys.argv[0] = f"{NAME} {wanted}"
-    run_command(mains[wanted])
+    parser = OneLineParser(prog="commands.share", epilog="Each has its own help.")
+    parser.add_argument("command", choices=("pack", "inspect"))
+    wanted = parser.parse_args(sys.argv[1:2]).command
+    sys.argv = [f"{NAME} {wanted}", *sys.argv[2:]]
+    run_command(pack if wanted == "pack" else inspect)

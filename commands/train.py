@@ -28,7 +28,6 @@ from commands.cli import (
     exit_code,
     filled,
     go_on_unread,
-    program_name,
     save_interval,
     whole_number,
 )
@@ -72,7 +71,6 @@ examples:
 def build_parser() -> argparse.ArgumentParser:
     """The flags, with the names and meanings that rl_zoo3 gives them."""
     parser = OneLineParser(
-        prog=program_name(),
         description="Train an agent and leave a run folder with its models, curves and settings.",
         epilog=EPILOG,
     )

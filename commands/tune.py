@@ -28,7 +28,6 @@ from commands.cli import (
     filled,
     folder_name,
     go_on_unread,
-    program_name,
     whole_number,
 )
 from commands.compare import RunContext, conclude, do_missing, give_way, read, run_context
@@ -63,7 +62,6 @@ The same command again continues the search; several at once share the work.
 def build_parser() -> argparse.ArgumentParser:
     """The flags; those of runs mean what they mean to train and compare, the others to rl_zoo3."""
     parser = OneLineParser(
-        prog=program_name(),
         description="Search for an agent's hyperparameters: judge each setting over several seeds, "
         "run the best again on other seeds, and save a setting that is better there.",
         epilog=EPILOG,
