@@ -202,9 +202,11 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest) -> None:
     say(console, f"{found.spec.algo} on {found.spec.env_id}: {place}")
     with doing(console, "loading the libraries"), loading_libraries():
         # All that plays, so that nothing is loaded in the middle of it.
-        from pipeline import action_figures, environment_mistakes, playing  # noqa: F401
-        from pipeline.evaluation import asked_policies, bracketed, exact  # noqa: F401
-        from pipeline.models import model_loading, normalization  # noqa: F401
+        import pipeline.action_figures
+        import pipeline.evaluation.asked_policies
+        import pipeline.evaluation.bracketed
+        import pipeline.evaluation.exact
+        import pipeline.models.model_loading  # noqa: F401
 
         chosen = with_statistics(found, wanted.statistics)
     if args.record is not None or args.reward_log:

@@ -202,7 +202,6 @@ def _tune(args: argparse.Namespace) -> int:
 
             context.get_ready([shipped_run(tuning, root)])
             from pipeline.folder_lock import FolderInUseError, told_if_gone
-            from tuning import record, retesting, searching, winner_files  # noqa: F401  # for later
             from tuning.opening import open_tuning
 
             with failing_in_a_line(args.storage):
