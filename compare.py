@@ -1,8 +1,8 @@
 """Compare agents over seeds: ``python compare.py --env FrozenLake-v1 --algos qlearning dqn``."""
 
 try:
-    from commands.compare_agents import main
-    from commands.parsing import run_command
+    from commands.cli import run_command
+    from commands.compare import main
 except KeyboardInterrupt:  # before there is anything to be stopped
     raise SystemExit(130) from None
 

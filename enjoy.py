@@ -1,8 +1,8 @@
 """Watch a trained agent: ``python enjoy.py --env Warehouse-v0 --algo ppo``."""
 
 try:
-    from commands.enjoy_agent import main
-    from commands.parsing import run_command
+    from commands.cli import run_command
+    from commands.enjoy import main
 except KeyboardInterrupt:  # before there is anything to be stopped
     raise SystemExit(130) from None
 

@@ -1,8 +1,8 @@
 """Train an agent on an environment: ``python train.py --env Warehouse-v0 --algo ppo``."""
 
 try:
-    from commands.parsing import run_command
-    from commands.train_agent import main
+    from commands.cli import run_command
+    from commands.train import main
 except KeyboardInterrupt:  # before there is anything to be stopped
     raise SystemExit(130) from None
 

@@ -1,8 +1,8 @@
 """Search for an agent's hyperparameters: ``python tune.py --env Warehouse-v0 --algo ppo``."""
 
 try:
-    from commands.parsing import run_command
-    from commands.tune_agent import main
+    from commands.cli import run_command
+    from commands.tune import main
 except KeyboardInterrupt:  # before there is anything to be stopped
     raise SystemExit(130) from None
 

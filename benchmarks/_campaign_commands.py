@@ -223,7 +223,7 @@ def short_cases(folder: Path) -> list[Case]:
     """Those that are stopped at single system calls."""
     train = f"train.py {LAKE} -n 500 --seed 1 --resume-or-start --save-state-every 100".split()
     dqn = [*_training("CartPole-v1", "dqn", 400, EAGER), "--save-state-every", "100"]
-    pack = ["-m", "commands.pack_run", "{before}/qlearning/FrozenLake-v1_1", "{logs}/pack"]
+    pack = ["-m", "commands.share", "pack", "{before}/qlearning/FrozenLake-v1_1", "{logs}/pack"]
     commands = {
         "a table": train,
         "dqn": dqn,

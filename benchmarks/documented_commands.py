@@ -59,8 +59,7 @@ def outcome(training: str, seed: int, folder: Path) -> dict[str, Any]:
     """What one run reaches: its return, its score if there is one, and its processor time."""
     from rich.console import Console
 
-    from commands.train_flags import build_parser
-    from commands.train_request import train_spec
+    from commands.train import build_parser, train_spec
     from pipeline.training import train
 
     words = [*shlex.split(training), "--seed", str(seed), "--verbose", "0", "-f", str(folder)]

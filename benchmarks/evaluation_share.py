@@ -66,8 +66,8 @@ WORK: dict[str, tuple[str, ...]] = {
 TRAINING = """
 import json
 from rich.console import Console
-from commands.train_flags import build_parser
-from commands.train_request import train_spec
+from commands.train import build_parser
+from commands.train import train_spec
 from pipeline import training
 during = []
 finish = training._finish

@@ -166,8 +166,8 @@ def _do(case: Case, folder: Path, output: Path) -> None:
     sys.argv = ["train.py", *case.words, "-f", str(folder / "logs"), "--verbose", "0"]
     code = 1
     try:
-        from commands.parsing import run_command
-        from commands.train_agent import main
+        from commands.cli import run_command
+        from commands.train import main
 
         run_command(main)
     except SystemExit as stop:

@@ -49,7 +49,7 @@ n_timesteps: 50
 
 # The module behind which a command's libraries are.
 _LIBRARIES = {
-    "enjoy.py": "commands.playing_output",
+    "enjoy.py": "pipeline.models.load",
     "train.py": "pipeline.training",
     "compare.py": "experiments.off_policy.logged_policies",
 }

@@ -35,7 +35,7 @@ NETWORKS = ("--algo", "ppo", "--env", "CartPole-v1", "-params", "engine:compiled
 STUDY = ("--algos", "qlearning", "sarsa", "--env", "FrozenLake-v1", "--seeds", "2", "-n", "1000")
 PR_SET_CHILD_SUBREAPER = 36  # linux/prctl.h
 IMPORT = "import stable_baselines3"
-INSTALLED = "from commands.yardstick import main; main()"
+INSTALLED = "from commands import main; main()"
 COMMANDS: dict[str, tuple[str, ...]] = {
     "train.py --help": ("train.py", "--help"),
     "yardstick train --help": ("-c", INSTALLED, "train", "--help"),

@@ -1,1 +1,67 @@
-"""The commands: their arguments, and what they print."""
+"""The commands: their flags, what they do, and what they print; ``main`` is all under one name."""
+
+from __future__ import annotations
+
+import sys
+from functools import partial
+from typing import NoReturn
+
+
+def main() -> NoReturn:
+    """``yardstick``: run the command that the first argument names, and exit with its code."""
+    try:
+        from commands.cli import COMMANDS, NAME, run_command
+    except KeyboardInterrupt:  # before there is anything to be stopped
+        raise SystemExit(130) from None
+
+    command = sys.argv[1] if len(sys.argv) > 1 else ""
+    if command not in COMMANDS:
+        _explain()
+    # From here on it is as if the command had been called by a name of its own.
+    sys.argv = [f"{NAME} {command}", *sys.argv[2:]]
+    run_command(partial(_carry_out, command))
+
+
+def _carry_out(command: str) -> int:
+    """Do what the command does; the others' flags are not even looked at."""
+    if command == "train":
+        from commands import train
+
+        return train.main()
+    if command == "enjoy":
+        from commands import enjoy
+
+        return enjoy.main()
+    if command == "compare":
+        from commands import compare
+
+        return compare.main()
+    if command == "tune":
+        from commands import tune
+
+        return tune.main()
+    from commands import share
+
+    return share.pack() if command == "pack" else share.inspect()
+
+
+def _explain() -> NoReturn:
+    """Print the help or the version, or what is wrong with the first argument."""
+    from importlib.metadata import version
+
+    from commands.cli import COMMANDS, NAME, OneLineParser
+    from pipeline.errors import unknown
+
+    lines = [f"  {NAME} {command:<9}{summary}" for command, summary in COMMANDS.items()]
+    parser = OneLineParser(
+        prog=NAME,
+        usage=f"{NAME} [-h] [--version] COMMAND ...",
+        description="Tabular, bandit and deep reinforcement learning, measured by the optimum.",
+        epilog="\n".join(["commands:", *lines, "", f"Each has its own help: {NAME} train --help"]),
+    )
+    parser.add_argument("--version", action="version", version=version("rl-yardstick"))
+    parser.add_argument("command", nargs="?", metavar="COMMAND", help=" or ".join(COMMANDS))
+    given = parser.parse_args(sys.argv[1:2]).command
+    if given is None:
+        parser.error(f"which command? {', '.join(COMMANDS)}")
+    parser.error(str(unknown("unknown command", given, COMMANDS)))

@@ -1,18 +1,38 @@
-"""Where the commands print to."""
+"""Where the commands print to, and what several of them say: progress, evaluations, engines."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
 from shutil import get_terminal_size
-from typing import Any
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
-from rich.table import Table
 from rich.text import Text
 
 from pipeline.errors import visible
+from pipeline.signs_of_life import (
+    SECONDS_BETWEEN_LINES,
+    SECONDS_BETWEEN_LOOKS,
+    Heartbeat,
+    Silence,
+    can_move,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from stable_baselines3.common.base_class import BaseAlgorithm
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    from agents.networks.engine_setting import EnginePlan
+    from experiments.launching import Launcher, Launchers
+    from pipeline.engine_outlook import EngineOutlook
+    from pipeline.evaluation.sampled import Evaluation
 
 UNBOUNDED = 10_000  # columns
 
@@ -34,7 +54,7 @@ class TextConsole(Console):
         super().print(*objects, **options)
 
     def on_broken_pipe(self) -> None:
-        """Leave it to `commands.streams`; Rich would keep silent from then on.
+        """Leave it to `commands.cli.Output`; Rich would keep silent from then on.
 
         Where a thread was told that says how far things are, the main thread would not learn of it.
         """
@@ -70,3 +90,267 @@ def print_rows(console: Console, table: Table) -> None:
     wide.print(table, highlight=False)
     for line in wide.file.getvalue().splitlines():  # type: ignore[attr-defined]  # it is ours
         console.print(line.rstrip(), highlight=False, soft_wrap=True)
+
+
+def say(console: Console, line: str, style: str | None = None) -> None:
+    """Print a line as it is, however long."""
+    console.print(line, style=style, highlight=False, soft_wrap=True)
+
+
+def print_refusal(console: Console, refusal: str | None) -> None:
+    """Say why the environment's own model is not used, where that is so."""
+    if refusal is not None:
+        say(console, f"{refusal}; figures are sampled")
+
+
+class LiveProgress(ABC):
+    """Shows how far something is while its ``with`` statement runs."""
+
+    def __init__(self, console: Console) -> None:
+        from rich.live import Live
+
+        self.console = console
+        self.started = time.monotonic()
+        self.silence = Silence(SECONDS_BETWEEN_LINES)
+        self.live = Live(console=console, auto_refresh=False) if can_move(console) else None
+        self.heart = Heartbeat(self.look, SECONDS_BETWEEN_LOOKS)
+        self._launcher: Launcher | None = None
+
+    def watching(self, launchers: Launchers) -> Launchers:
+        """The same launchers, of which is shown what there is to say while one is open."""
+
+        @contextlib.contextmanager
+        def watched() -> Iterator[Launcher]:
+            with launchers() as self._launcher:
+                yield self._launcher
+            self._launcher = None
+
+        return watched
+
+    @property
+    def place_words(self) -> str:
+        """What there is to say of where runs are done, to go on a line with it; mostly nothing."""
+        words = self._launcher.words if self._launcher is not None else ""
+        return f", {words}" if words else ""
+
+    @abstractmethod
+    def figures(self) -> str:
+        """How far it is, in a line."""
+
+    def picture(self) -> RenderableType:
+        """The same where it can move."""
+        return Text(self.figures())
+
+    @property
+    def is_over(self) -> bool:
+        """Whether there is nothing more to wait for."""
+        return False
+
+    def __enter__(self) -> Self:
+        if self.live is not None:
+            self.live.start()
+            self.look()
+        self.heart.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.heart.stop()
+        if self.live is not None:
+            self.look()
+            self.live.stop()
+        if isinstance(error, KeyboardInterrupt):
+            self.say(f"{self.figures()}; the same command continues")
+
+    def look(self) -> None:
+        """Show how far it is, also while nothing ends."""
+        if self.live is not None:
+            self.live.update(self.picture(), refresh=True)
+        elif self.silence.is_too_long and not self.is_over:
+            self.say(self.figures())
+
+    def say(self, line: str) -> None:
+        """Print a line that stays."""
+        self.silence.end()
+        say(self.console, line)
+
+
+# --- evaluations in words -------------------------------------------------------------------------
+
+
+def describe(evaluation: Evaluation) -> str:
+    """An evaluation in a few words."""
+    text = f"return {evaluation.mean_return:.2f}"
+    if evaluation.is_exact:
+        text += " (exact)"
+    else:
+        text += f" ± {evaluation.std_return:.2f} over {episodes(len(evaluation.returns))}"
+    if evaluation.success_rate is not None:
+        text += f", success {evaluation.success_rate:.1%}"
+    measured = describe_measured(evaluation)
+    return f"{text}, {measured}" if measured else text
+
+
+def describe_measured(evaluation: Evaluation) -> str:
+    """How the return stands to the optimum; empty where that is neither known nor bracketed."""
+    yardstick, value = evaluation.yardstick, evaluation.mean_return
+    if yardstick is None:
+        return ""
+    optimum, score = f"optimum {yardstick.optimum:.2f}", f"score {yardstick.score(value):.2f}"
+    if yardstick.at_least is not None:
+        optimum = f"optimum between {yardstick.at_least:.2f} and {yardstick.optimum:.2f}"
+        most = f"{yardstick.lower_end.score(value):.2f}"
+        score += f" to {most} (bracketed)" if not score.endswith(most) else " (bracketed)"
+    text = f"{optimum}, best random or constant policy {yardstick.baseline:.2f}, {score}"
+    if evaluation.beats_optimum:
+        text += (
+            ". THIS IS MORE THAN ANY POLICY CAN REACH: the environment is not the one that the "
+            "bracket is of, or the bracket is wrong"
+        )
+    return text
+
+
+def episodes(n: int) -> str:
+    """So many episodes."""
+    return f"{n:,} episode{'s' if n != 1 else ''}"
+
+
+# --- engines in words -----------------------------------------------------------------------------
+
+
+LIBRARY = "library (Stable-Baselines3's own loop)"
+
+HOW_NOT_TO_BE_ASKED = (
+    "made a BlockCallback, it would be asked only when it acts (docs/training.md#from-python)"
+)
+
+
+def about(seconds: float) -> str:
+    """A time that is known to a factor of two."""
+    if seconds < 1:
+        return "less than 1 s"
+    if seconds < 120:
+        return f"about {seconds:.0f} s"
+    if seconds < 7200:
+        return f"about {seconds / 60:.0f} min"
+    return f"about {seconds / 3600:.0f} h"
+
+
+def training_line(
+    outlook: EngineOutlook | None, model: BaseAlgorithm, callback: BaseCallback
+) -> str:
+    """The line of one training; empty where there is nothing to say of its engine."""
+    from stable_baselines3.common.callbacks import CallbackList
+
+    from agents.common.callback_horizons import members, unknown_callbacks
+    from agents.networks.engine_costs import machine_pace
+
+    # Callbacks of the user's own that must be asked after each step.
+    told = [each for each in members(callback) if not isinstance(each, CallbackList)]
+    theirs = [each for each in told if not type(each).__module__.startswith("pipeline.")]
+    asked = [name for each in theirs for name in unknown_callbacks(each)]
+    if outlook is None:
+        if not asked or getattr(model, "engine", "compiled") != "auto":
+            return ""
+        return (
+            f"interpreted, about a hundred times slower or more: {', '.join(asked)} must be asked "
+            f"after each step; {HOW_NOT_TO_BE_ASKED}"
+        )
+    pace = machine_pace()
+    advice = ""
+    if asked and outlook.auto.is_compiled:
+        advice = f"; {HOW_NOT_TO_BE_ASKED}"
+        if outlook.work is not None:
+            advice += f", and training take {about(outlook.work.compiled_seconds * pace)}"
+    line = _words(outlook.plan, outlook, pace, "of processor time")
+    if outlook.plan.is_compiled:
+        if outlook.work is not None:
+            taken = about(outlook.work.library_seconds * pace)
+            line += f" (Stable-Baselines3's own loop: {taken})"
+    elif outlook.auto.is_compiled:
+        why = f" but for the environment ({outlook.auto.in_python})" * bool(outlook.auto.in_python)
+        taken = _takes(outlook.auto, outlook, pace, "")
+        line += f"; --engine auto: the same networks and updates compiled{why}{taken}"
+    return f"{line}{advice}"
+
+
+def _words(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> str:
+    """An engine, what it takes, and why it is not another."""
+    name = str(plan).partition(":")[0] if plan.is_compiled else LIBRARY
+    reason = plan.in_python or plan.reason
+    return f"{name}{_takes(plan, outlook, pace, unit)}{': ' if reason else ''}{reason}"
+
+
+def _takes(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> str:
+    work = outlook.work
+    if work is None:
+        return ""
+    from agents.networks.engine_costs import compiling_seconds
+
+    text = f", {about(seconds_of(plan, outlook) * pace)} {unit}".rstrip()
+    compiling = compiling_seconds(work) * pace if plan.is_compiled else 0.0
+    return f"{text} and once {about(compiling)} of compiling" if compiling else text
+
+
+def seconds_of(plan: EnginePlan, outlook: EngineOutlook) -> float:
+    """What a training takes where the constants were measured; 0 where nobody knows."""
+    if outlook.work is None:
+        return 0.0
+    if not plan.is_compiled:
+        return outlook.work.library_seconds
+    return outlook.work.bridged_seconds if plan.in_python else outlook.work.compiled_seconds
+
+
+def study_line(planned: Sequence[tuple[str, EngineOutlook, int]]) -> str:
+    """The line of many trainings; empty where there are none with networks.
+
+    Planned are labels of agents, the outlooks of their runs, and how many runs each stands for.
+    """
+    from agents.networks.engine_costs import machine_pace
+
+    pace, parts = machine_pace() if planned else 1.0, []
+    for is_compiled in (False, True):
+        group = [each for each in planned if each[1].plan.is_compiled is is_compiled]
+        if not group:
+            continue
+        names = ", ".join(dict.fromkeys(label for label, _, _ in group))
+        n_runs = sum(count for _, _, count in group)
+        runs = "1 run" if n_runs == 1 else f"{n_runs} runs"
+        taken = _together([(outlook, outlook.plan, n) for _, outlook, n in group], pace)
+        parts.append(
+            f"{names}: {'compiled' if is_compiled else LIBRARY}{taken}"
+            f"{' of processor time' if taken else ''} in {runs}"
+        )
+        if not is_compiled and any(outlook.auto.is_compiled for _, outlook, _ in group):
+            taken = _together([(outlook, outlook.auto, n) for _, outlook, n in group], pace)
+            parts.append(f"with --engine auto compiled{taken}")
+    return "; ".join(parts)
+
+
+def _together(trainings: Sequence[tuple[EngineOutlook, EnginePlan, int]], pace: float) -> str:
+    """What they take together; empty where nobody knows it of one."""
+    if any(outlook.work is None for outlook, _, _ in trainings):
+        return ""
+    seconds = sum(seconds_of(plan, outlook) * n for outlook, plan, n in trainings)
+    return f", {about(seconds * pace)}"
+
+
+def search_line(algo: str, search: EngineOutlook | None, retest: EngineOutlook | None) -> str:
+    """The line of a search and its re-test, of one run each; empty where both are the same."""
+    if search is None or retest is None:
+        return ""
+    from agents.networks.engine_costs import machine_pace
+
+    pace = machine_pace()
+    searched = _words(search.plan, search, pace, "of processor time a run")
+    if search.plan.is_compiled == retest.plan.is_compiled:
+        return f"search and re-test: {searched}"
+    again = _words(retest.plan, retest, pace, "a run")
+    return (
+        f"search: {searched}; re-test: {again}, in which train runs {algo}; "
+        "--engine auto re-tests compiled, for who trains so"
+    )

@@ -159,7 +159,7 @@ def type_in_own_folder(own_folder, monkeypatch, capsys):
     import enjoy
     import train
     import tune
-    from commands.parsing import run_command
+    from commands.cli import run_command
 
     commands = {f"{each.__name__}.py": each.main for each in (train, enjoy, compare, tune)}
 

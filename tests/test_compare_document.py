@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from commands.compare_agents import build_parser
-from commands.study_request import study_spec
+from commands.compare import build_parser, study_spec
 from experiments.plan import plan
 from experiments.study import _QUICK_VALUES, _STUDY_KEYS, read_study
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from commands import compare_agents, enjoy_agent, train_agent, tune_flags
-from commands.study_request import study_spec
-from commands.train_request import train_spec
-from commands.tune_request import tuning_spec
+from commands import compare, enjoy, train, tune
+from commands.compare import study_spec
+from commands.train import train_spec
+from commands.tune import tuning_spec
 
 ROOT = Path(__file__).parent.parent
 sys.path += [str(ROOT / "benchmarks"), str(ROOT / "docs" / "scripts")]
@@ -55,7 +55,7 @@ def checkout(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("document", "command"), commands("train.py"))
 def test_train_commands_can_be_carried_out(checkout, document, command):
-    parser = train_agent.build_parser()
+    parser = train.build_parser()
     args = parser.parse_args(arguments(command))
     if args.list:
         return
@@ -66,14 +66,14 @@ def test_train_commands_can_be_carried_out(checkout, document, command):
 
 @pytest.mark.parametrize(("document", "command"), commands("enjoy.py"))
 def test_enjoy_commands_are_accepted(document, command):
-    args = enjoy_agent.build_parser().parse_args(arguments(command))
+    args = enjoy.build_parser().parse_args(arguments(command))
     assert args.model is not None or args.env == "Warehouse-v0"
 
 
 @pytest.mark.parametrize(("document", "command"), commands("compare.py"))
 def test_compare_commands_are_accepted(monkeypatch, document, command):
     monkeypatch.chdir(ROOT)
-    args = compare_agents.build_parser().parse_args(arguments(command))
+    args = compare.build_parser().parse_args(arguments(command))
     assert bool(args.logged) == bool(args.policy)
     if not args.logged:
         assert study_spec(args).agents
@@ -81,7 +81,7 @@ def test_compare_commands_are_accepted(monkeypatch, document, command):
 
 @pytest.mark.parametrize(("document", "command"), commands("tune.py"))
 def test_tune_commands_are_accepted(document, command):
-    args = tune_flags.build_parser().parse_args(arguments(command))
+    args = tune.build_parser().parse_args(arguments(command))
     assert tuning_spec(args).environment.env_id == args.env
 
 

@@ -151,9 +151,9 @@ def test_no_module_needs_one_that_needs_it() -> None:
 
 def test_imports_inside_functions_and_for_types_count() -> None:
     graph = import_graph()
-    assert "commands.train_request" in graph["commands.train_agent"]  # inside a function
-    assert "pipeline.training" in graph["commands.run_output"]  # under TYPE_CHECKING
-    assert "commands.train_agent" in graph["train"]
+    assert "commands.terminal" in graph["commands.train"]  # inside a function
+    assert "pipeline.preparation" in graph["commands.train"]  # under TYPE_CHECKING
+    assert "commands.train" in graph["train"]
 
 
 def test_no_module_has_the_name_of_one_of_pythons_own() -> None:

@@ -7,12 +7,12 @@ import pytest
 
 import enjoy
 import train
-from commands import pack_run
-from commands.parsing import run_command
+from commands import share
+from commands.cli import run_command
 from pipeline.signs_of_life import Silence
 
 ROOT = Path(train.__file__).parent
-COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main, "pack": pack_run.main}
+COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main, "pack": share.pack}
 
 
 @pytest.fixture(autouse=True)

@@ -23,7 +23,7 @@ def do(words, plan, ignored=()):
         ignored: names of signals that are ignored from outside.
     """
     import train
-    from commands.parsing import run_command
+    from commands.cli import run_command
     from pipeline import stopping
 
     stopping.SECONDS_OF_ONE_REQUEST = 0.0  # here they are meant one by one
@@ -41,15 +41,21 @@ def do(words, plan, ignored=()):
 def moments():
     """What is called at each moment: its owner, its name, and on which of the calls."""
     from agents.compiled import engine
-    from commands import run_output
-    from pipeline import evaluation_callback, files, finishing, preparation, worker_processes
+    from commands import terminal
+    from pipeline import (
+        evaluation_callback,
+        files,
+        finishing,
+        preparation,
+        worker_processes,
+    )
     from pipeline.resuming.state_saver import StateSaver
     from pipeline.runs import Run
 
     calls = iter(range(10**9))
     return {
         "set-up": (preparation, "make_evaluation_env", always),
-        "between": (run_output, "print_refusal", always),
+        "between": (terminal, "print_refusal", always),
         "before the first step": (StateSaver, "_on_training_start", always),
         "compiling": (engine, "run_block", always),
         "training": (StateSaver, "_on_step", lambda *_: next(calls) == 3),

@@ -12,7 +12,7 @@ import pytest
 import compare
 import enjoy
 import train
-from commands.parsing import run_command
+from commands.cli import run_command
 
 ROOT = Path(train.__file__).parent
 ANGLE = ["--algo", "angle", "--env", "CartPole-v1"]

@@ -16,10 +16,9 @@ import pytest
 import yaml
 
 import train
-from commands import compare_agents
-from commands.study_request import study_spec
-from commands.train_flags import build_parser
-from commands.train_request import train_spec
+from commands import compare
+from commands.compare import study_spec
+from commands.train import build_parser, train_spec
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
@@ -438,7 +437,7 @@ def test_answers_without_loading_anything_heavy(words, code, tmp_path):
     program = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r}); import {words[0][:-3]} as command; "
         + (
-            "from commands.parsing import run_command\n"
+            "from commands.cli import run_command\n"
             "try: run_command(command.main)\n"
             "finally: print([name for name in sys.modules if name in {heavy}], file=sys.stderr)"
         ).replace("{heavy}", repr(HEAVY))
@@ -493,7 +492,7 @@ def test_typed_arguments_of_the_environment_win_over_what_an_entry_trains_on():
     asked = {**variant, "mine_reward": -1, "slip": 0.1}
     assert training_kwargs(train_spec(build_parser().parse_args(both))) == asked
     compared = ["--env", "MineMaze-v0", "--algos", "ppo", *both[4:]]
-    study = study_spec(compare_agents.build_parser().parse_args(compared))
+    study = study_spec(compare.build_parser().parse_args(compared))
     assert training_kwargs(plan(study, Path("nowhere"))[0].spec) == asked
     assert training_kwargs(spec) == {**variant, "mine_reward": -1}
     assert "without mine_reward: -20" in spec.origins["train_env_kwargs"]

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 
 import compare
-from commands.parsing import run_command
+from commands.cli import run_command
 
 ROOT = Path(compare.__file__).parent
 LAKE = ["--env", "FrozenLake-v1", "--no-report", "-f", "studies"]
@@ -491,8 +491,8 @@ def test_ctrl_c_while_the_libraries_load(folder):
 # The command as on Windows and macOS, where nothing is forked: each child imports this file anew.
 SPAWNING = """
 import multiprocessing
-from commands.compare_agents import main
-from commands.parsing import run_command
+from commands.compare import main
+from commands.cli import run_command
 
 if __name__ == "__main__":
     from experiments import child_processes
@@ -658,7 +658,7 @@ HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib")
 def test_answers_without_loading_anything_heavy(folder, words, code):
     program = (
         f"import sys, resource; sys.path.insert(0, {str(ROOT)!r}); import compare\n"
-        "from commands.parsing import run_command\n"
+        "from commands.cli import run_command\n"
         "try: run_command(compare.main)\n"
         f"finally: print([name for name in sys.modules if name in {HEAVY}], file=sys.stderr)\n"
     )

@@ -14,7 +14,7 @@ import pytest
 import compare
 import envs  # noqa: F401
 from agents import load_algorithm
-from commands.parsing import run_command
+from commands.cli import run_command
 from envs.bandits import log_uniformly, read_log
 from experiments.off_policy.estimators import difference_in_value, mean_reward
 from experiments.off_policy.logged_policies import compare_policies, probabilities, read_policy

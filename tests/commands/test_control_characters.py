@@ -11,8 +11,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from commands import compare_agents, enjoy_agent, terminal, train_agent
-from commands.parsing import run_command
+from commands import compare, enjoy, terminal, train
+from commands.cli import run_command
 from commands.terminal import TextConsole, print_rows, table_console
 from pipeline.errors import UserError, visible
 
@@ -109,9 +109,9 @@ def test_titles_and_labels_of_a_study(complaint, tmp_path):
         f"agents: {{qlearning: {{callback: {text}}}}}\nenvironments: [FrozenLake-v1]\n",
     ):
         study.write_text(lines)
-        assert r"\x1b" in complaint(compare_agents, study)
+        assert r"\x1b" in complaint(compare, study)
         study.write_text(lines.replace("\\u001b", "\\ud83d"))
-        assert r"\ud83d" in complaint(compare_agents, study)
+        assert r"\ud83d" in complaint(compare, study)
 
 
 def test_no_command_prints_by_another_console():
@@ -123,8 +123,8 @@ def test_names_of_files_and_modules(complaint, tmp_path):
     for name in (f"{HOSTILE}.zip", f"{HOSTILE}.yml"):
         path = tmp_path / name
         path.write_text("junk")
-        assert r"\x1b" in complaint(enjoy_agent, path)
-        assert r"\x1b" in complaint(compare_agents, path)
+        assert r"\x1b" in complaint(enjoy, path)
+        assert r"\x1b" in complaint(compare, path)
     words = ("--env", "FrozenLake-v1", "--algo", "qlearning")
     for extra in (
         ["--conf-file", tmp_path / HOSTILE],
@@ -132,13 +132,13 @@ def test_names_of_files_and_modules(complaint, tmp_path):
         ["-params", f"{HOSTILE}:1"],
         [HOSTILE],
     ):
-        assert r"\x1b" in complaint(train_agent, *words, *extra)
-    assert r"\x1b" in complaint(train_agent, "--env", f"{HOSTILE}:X-v0", "--algo", "qlearning")
+        assert r"\x1b" in complaint(train, *words, *extra)
+    assert r"\x1b" in complaint(train, "--env", f"{HOSTILE}:X-v0", "--algo", "qlearning")
 
 
 def test_headers_of_a_log(complaint, tmp_path):
     (tmp_path / "log.csv").write_text(f"arm,{HOSTILE}\n0,1\n")
-    assert r"\x1b" in complaint(compare_agents, "--logged", "log.csv", "--policy", "uniform")
+    assert r"\x1b" in complaint(compare, "--logged", "log.csv", "--policy", "uniform")
 
 
 @pytest.mark.parametrize("key", ["algo", "env_id"])
@@ -147,4 +147,4 @@ def test_what_a_run_folder_says(complaint, tmp_path, key):
     with zipfile.ZipFile(tmp_path / "x.zip", "w") as archive:
         archive.writestr("data", "{}")
     (tmp_path / "run.json").write_text(json.dumps({"state": "finished", "spec": spec}))
-    complaint(enjoy_agent, tmp_path / "x.zip")
+    complaint(enjoy, tmp_path / "x.zip")

@@ -9,11 +9,11 @@ from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from agents.networks import engine_costs
 from agents.networks.engine_costs import Work
 from agents.networks.engine_setting import TOO_SHORT, EnginePlan
-from commands import compare_agents, engine_lines, train_agent, tune_flags
-from commands.engine_lines import about, search_line, study_line, training_line
-from commands.study_request import study_spec
-from commands.train_request import train_spec
-from commands.tune_request import tuning_spec
+from commands import compare, train, tune
+from commands.compare import study_spec
+from commands.terminal import about, search_line, study_line, training_line
+from commands.train import train_spec
+from commands.tune import tuning_spec
 from experiments.plan import plan
 from pipeline.engine_outlook import EngineOutlook, planned_outlook
 from pipeline.errors import UserError
@@ -25,15 +25,15 @@ ENV = ["--env", "FrozenLake-v1"]
 
 
 def trained(*words):
-    return train_spec(train_agent.build_parser().parse_args([*ENV, *words]))
+    return train_spec(train.build_parser().parse_args([*ENV, *words]))
 
 
 def compared(*words):
-    return study_spec(compare_agents.build_parser().parse_args(list(words)))
+    return study_spec(compare.build_parser().parse_args(list(words)))
 
 
 def tuned(*words):
-    return tuning_spec(tune_flags.build_parser().parse_args([*ENV, *words]))
+    return tuning_spec(tune.build_parser().parse_args([*ENV, *words]))
 
 
 @pytest.mark.parametrize(
@@ -164,7 +164,7 @@ class Mine(BaseCallback):
 @pytest.fixture
 def a_warm_machine(monkeypatch):
     """One of the pace of that on which the constants were measured."""
-    monkeypatch.setattr(engine_lines, "machine_pace", lambda: 1.0)
+    monkeypatch.setattr(engine_costs, "machine_pace", lambda: 1.0)
     monkeypatch.setattr(engine_costs, "is_compiled_before", lambda name: True)
 
 
@@ -207,7 +207,7 @@ def test_the_head_where_nobody_knows_how_long_a_step_takes():
 
 
 def test_compiling_is_told_where_it_is_still_to_be_done(monkeypatch):
-    monkeypatch.setattr(engine_lines, "machine_pace", lambda: 1.0)
+    monkeypatch.setattr(engine_costs, "machine_pace", lambda: 1.0)
     monkeypatch.setattr(engine_costs, "is_compiled_before", lambda name: False)
     line = training_line(EngineOutlook(COMPILED, COMPILED, WORK), None, CallbackList([]))
     assert line.startswith(

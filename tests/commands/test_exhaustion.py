@@ -2,7 +2,7 @@
 
 import pytest
 
-from commands.parsing import run_command
+from commands.cli import run_command
 
 
 @pytest.mark.parametrize(

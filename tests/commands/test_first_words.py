@@ -10,7 +10,7 @@ import pytest
 import compare
 import enjoy
 import train
-from commands.parsing import run_command
+from commands.cli import run_command
 from pipeline.signs_of_life import Activity
 
 ROOT = Path(train.__file__).parent
@@ -29,7 +29,7 @@ class Heavy:
             sys.stdout.flush()
             raise Enough
 sys.meta_path.insert(0, Heavy())
-from commands.parsing import run_command
+from commands.cli import run_command
 import COMMAND
 try:
     run_command(COMMAND.main)

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 import compare
-from commands import study_output
-from commands.parsing import run_command
+from commands.cli import run_command
+from experiments import launching
 from pipeline.errors import UserError
 
 WALK = '''
@@ -87,7 +87,7 @@ def test_it_grows_until_decided_also_when_it_is_stopped_between(
     assert last_line(whole).startswith(
         f"{counts.sum()} runs, where 14 seeds of each agent would be 42; "
     )
-    do_runs, calls = study_output.execute, []
+    do_runs, calls = launching.execute, []
 
     def stopped(runs, *args):
         calls.append(len(runs))
@@ -97,7 +97,7 @@ def test_it_grows_until_decided_also_when_it_is_stopped_between(
         return do_runs(runs, *args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(study_output, "execute", stopped)
+        patch.setattr(launching, "execute", stopped)
         assert type_command(*words, "-f", "parts")[0] == 2
     code, out, _ = type_command("bandits.yml", "--until-decided", "-f", "parts")
     assert (code, last_line(out)) == (0, last_line(whole))

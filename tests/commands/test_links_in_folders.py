@@ -14,8 +14,8 @@ import compare
 import enjoy
 import train
 import tune
-from commands import inspect_model, pack_run
-from commands.parsing import run_command
+from commands import share
+from commands.cli import run_command
 from pipeline.digests import FIELD, RECORD, digests_of, sealed
 from pipeline.files import replacing
 from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
@@ -29,8 +29,8 @@ COMMANDS = {
     "enjoy": enjoy.main,
     "compare": compare.main,
     "tune": tune.main,
-    "inspect": inspect_model.main,
-    "pack": pack_run.main,
+    "inspect": share.inspect,
+    "pack": share.pack,
 }
 SECRET = b"GIF89a the key to everything"
 LAKE, CART, ARMS = "FrozenLake-v1", "CartPole-v1", "BernoulliBandit-v0"

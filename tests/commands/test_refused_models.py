@@ -12,8 +12,8 @@ from rich.console import Console
 
 import enjoy
 import train
-from commands.parsing import run_command
-from commands.study_progress import StudyProgress
+from commands.cli import run_command
+from commands.compare import StudyProgress
 
 WINDY = """
 import gymnasium as gym

@@ -12,15 +12,15 @@ import pytest
 from rich.console import Console
 
 from agents import ALGORITHMS
-from commands import listing
-from commands.run_output import (
-    describe,
+from commands import terminal
+from commands.terminal import TextConsole, describe
+from commands.train import (
     describe_pulls,
     print_header,
+    print_lists,
     print_outcome,
     watch_command,
 )
-from commands.terminal import TextConsole
 from mdp.work_time import WorkTime
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.runs import Run
@@ -215,9 +215,9 @@ def lists(monkeypatch):
 def listed(monkeypatch, width):
     file = io.StringIO()
     monkeypatch.setattr(
-        listing, "table_console", lambda **more: Console(file=file, width=width, **more)
+        terminal, "table_console", lambda **more: Console(file=file, width=width, **more)
     )
-    listing.print_lists()
+    print_lists()
     return [line.rstrip() for line in file.getvalue().splitlines()]
 
 
@@ -327,7 +327,7 @@ def test_redirected_tables_have_80_columns(columns, width, monkeypatch, capsys):
         monkeypatch.setenv("COLUMNS", columns)
     else:
         monkeypatch.delenv("COLUMNS", raising=False)
-    listing.print_lists()
+    print_lists()
     lines = capsys.readouterr().out.splitlines()
     # The last is a sentence, and on one line.
     assert width - 15 < max(map(len, lines[:-1])) <= width

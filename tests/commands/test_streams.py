@@ -13,9 +13,7 @@ import pytest
 
 import enjoy
 import train
-from commands import streams
-from commands.parsing import run_command
-from commands.streams import Output, go_on_unread
+from commands.cli import Output, go_on_unread, run_command, standard_streams
 from commands.terminal import TextConsole
 from pipeline.errors import UserError
 from pipeline.signs_of_life import Heartbeat
@@ -159,7 +157,7 @@ def test_a_stream_in_place_of_another_is_that_stream_otherwise():
 
 def test_streams_that_were_closed_are_opened_on_nothing(monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
-    with streams.standard_streams() as output:
+    with standard_streams() as output:
         assert output.name == os.devnull
         print("to nobody")  # noqa: T201  # as a library might
         output.close()

@@ -11,7 +11,7 @@ import pytest
 
 import train
 import tune
-from commands.parsing import run_command
+from commands.cli import run_command
 
 ROOT = Path(train.__file__).parent
 SPACE = """\
@@ -128,9 +128,7 @@ def test_mistakes_are_one_line_and_leave_nothing(folder, type_command, words, me
 
 
 def test_what_it_takes_is_named_where_it_is_not_installed(folder, type_command, monkeypatch):
-    from commands import tune_request
-
-    monkeypatch.setattr(tune_request, "NEEDED", {"no_such_library": "tune"})
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     assert (
         type_command(*WORDS)[2]
         == "tune.py: error: tuning needs: pip install 'rl-yardstick[tune]'\n"

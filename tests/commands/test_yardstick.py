@@ -15,13 +15,13 @@ import pytest
 import compare
 import enjoy
 import train
-from commands import yardstick
-from commands.parsing import COMMANDS, as_called, called_as, command_line, run_command
+from commands import main as yardstick
+from commands.cli import COMMANDS, as_called, called_as, command_line, run_command
 
 ROOT = Path(train.__file__).parent
 QUICK = ["--algo", "qlearning", "--env", "FrozenLake-v1", "--seed", "0", "-n", "500"]
 MAINS = {
-    "yardstick": yardstick.main,
+    "yardstick": yardstick,
     "train.py": partial(run_command, train.main),
     "enjoy.py": partial(run_command, enjoy.main),
     "compare.py": partial(run_command, compare.main),
@@ -141,7 +141,7 @@ HEAVY = ("torch", "numba", "stable_baselines3", "pandas", "scipy", "matplotlib",
 )
 def test_help_loads_nothing_heavy(words, tmp_path):
     program = (
-        "import sys; from commands.yardstick import main\n"
+        "import sys; from commands import main\n"
         "try: main()\n"
         f"finally: print([name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
     )
@@ -170,11 +170,11 @@ def test_a_study_of_ours_is_found_by_its_name(type_command, tmp_path):
 @pytest.mark.parametrize("program", ["train.py", "enjoy.py", "compare.py", "yardstick compare"])
 def test_ctrl_c_while_the_command_itself_is_imported(monkeypatch, capsys, program):
     """Which takes a tenth of a second, in which a traceback would be all that there is to say."""
-    wanted = f"{program.removesuffix('.py').split()[-1]}_agent"
+    wanted = program.removesuffix(".py").split()[-1]
     imported = builtins.__import__
 
     def interrupted(name, variables=None, local=None, names=(), level=0):
-        if wanted in name or any(wanted in one for one in names or ()):
+        if name == f"commands.{wanted}" or (name == "commands" and wanted in (names or ())):
             raise KeyboardInterrupt
         return imported(name, variables, local, names, level)
 
@@ -182,7 +182,7 @@ def test_ctrl_c_while_the_command_itself_is_imported(monkeypatch, capsys, progra
     monkeypatch.setattr(builtins, "__import__", interrupted)
     script = partial(runpy.run_path, str(ROOT / program), run_name="__main__")
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
-        (script if program.endswith(".py") else yardstick.main)()
+        (script if program.endswith(".py") else yardstick)()
     assert getattr(stop.value, "code", None) == 130
     assert "Traceback" not in capsys.readouterr().err
 
@@ -191,7 +191,7 @@ def test_ctrl_c_while_the_last_word_is_being_said(monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("commands.parsing.print", interrupted, raising=False)
+    monkeypatch.setattr("commands.cli.print", interrupted, raising=False)
     with pytest.raises((SystemExit, KeyboardInterrupt)) as stop:
         run_command(interrupted)
     assert getattr(stop.value, "code", None) == 130

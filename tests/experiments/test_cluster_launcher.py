@@ -245,7 +245,7 @@ def test_one_that_says_itself_that_it_is_open_is_refused(address):
 
 def test_without_a_cluster_nothing_of_dask_is_loaded():
     code = (
-        "import sys, experiments.launching, commands.compare_agents, commands.places\n"
+        "import sys, experiments.launching, commands.compare\n"
         "print([name for name in sys.modules if name.startswith(('dask', 'distributed'))])"
     )
     words = [sys.executable, "-c", code]

@@ -5,7 +5,6 @@ import runpy
 import shutil
 from collections import Counter
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,10 +14,9 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 import compare
-from commands.places import Place
-from commands.study_output import repair, run_study
+from commands.compare import RunContext, repair, run_study
 from experiments.bandits import STATISTICS_FILE
-from experiments.launching import local_launcher
+from experiments.child_processes import NO_LIMITS
 from experiments.plan import plan
 from experiments.results import read_results, read_run
 from experiments.run_files import read_episodes, read_evaluations, read_value_maps
@@ -228,8 +226,8 @@ def compare_again(capsys):
 
     def again(study, planned, root):
         console = Console(width=400)
-        place = Place(partial(local_launcher, root, "c", 1), "here", lambda _: None)
-        code = run_study(console, study, planned, root, "c", place, with_page=False)
+        context = RunContext(root, "c", NO_LIMITS, console, with_page=False)
+        code = run_study(context, study, planned)
         return code, capsys.readouterr().out
 
     return again

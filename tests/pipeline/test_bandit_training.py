@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 from stable_baselines3.common.callbacks import BaseCallback
 
-from commands.run_output import describe_pulls, print_outcome
+from commands.train import describe_pulls, print_outcome
 from envs.bandits import log_uniformly
 from pipeline.pull_recording import PullSummary, summarise_pulls
 from pipeline.runs import PULLS_FILE

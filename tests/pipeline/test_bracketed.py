@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from commands.playing_output import _print_measured
-from commands.run_output import describe
+from commands.enjoy import print_returns
+from commands.terminal import describe
 from envs.brackets.known_brackets import OptimumBracket
 from pipeline.evaluation import sampled
 from pipeline.evaluation.sampled import Evaluation, Yardstick, bracketed_yardstick
@@ -67,10 +67,14 @@ def test_more_than_any_policy_can_reach_is_said_aloud_and_not_clipped():
 def test_what_is_played_is_measured_too():
     console = Console(file=io.StringIO(), width=200)
     show = SimpleNamespace(returns=[-700.0, -600.0], lengths=[200, 200])
-    _print_measured(console, spec_of(), show)
-    assert console.file.getvalue().startswith("optimum between -140.86 and -134.44, best random")
-    _print_measured(console, spec_of(env_kwargs={"g": 5.0}), show)
-    assert console.file.getvalue().count("\n") == 1
+    print_returns(console, spec_of(), show)
+    said = "return -650.00 ± 50.00 over 2 episodes, length 200.0\n"
+    assert console.file.getvalue().startswith(
+        f"{said}optimum between -140.86 and -134.44, best random"
+    )
+    print_returns(console, spec_of(env_kwargs={"g": 5.0}), show)
+    assert console.file.getvalue().endswith(said)
+    assert console.file.getvalue().count("\n") == 3
 
 
 @pytest.mark.parametrize(

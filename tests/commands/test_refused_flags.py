@@ -1,6 +1,7 @@
-"""Every flag with every odd value: it has a meaning, or it is refused in one line."""
+"""What flags refuse: odd values, flags that there are not, and what was meant."""
 
 import argparse
+import inspect
 import io
 from pathlib import Path
 
@@ -9,24 +10,36 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from commands import compare_agents, enjoy_agent, train_agent
-from commands.enjoy_request import model_request
-from commands.flag_values import LARGEST, folder_name, number_at_least_zero, whole_number
-from commands.parsing import check_device
-from commands.study_request import study_spec
-from commands.train_request import train_spec
+from agents import ALGORITHMS, load_algorithm
+from commands import compare, enjoy, train
+from commands.cli import (
+    INSTEAD,
+    LARGEST,
+    SET_BY_FLAGS,
+    check_device,
+    folder_name,
+    hint,
+    number_at_least_zero,
+    whole_number,
+)
+from commands.compare import study_spec
+from commands.enjoy import model_request
+from commands.train import train_spec
 from pipeline.environments import make_env
-from pipeline.errors import UserError
+from pipeline.errors import OTHER_NAMES, UserError, did_you_mean
 from pipeline.training import carry_out, prepare
+
+# --- every flag with every odd value: it has a meaning, or it is refused in one line --------------
+
 
 ODD = ("0", "-1", "-5", "7", "1e5", "100_000", "9" * 30, "1e999999999", "-1e999999999", "\u0663")
 ODD = (*ODD, "1.5", "nan", "sNaN", "inf", "-inf", "", " ", "text", "a:b", "/", "..")
 BASES = {
-    train_agent: ["--algo", "random", "--env", "FrozenLake-v1", "-n", "5"],
-    enjoy_agent: ["--algo", "random", "--env", "FrozenLake-v1"],
-    compare_agents: ["--algos", "random", "--env", "FrozenLake-v1", "-n", "5"],
+    train: ["--algo", "random", "--env", "FrozenLake-v1", "-n", "5"],
+    enjoy: ["--algo", "random", "--env", "FrozenLake-v1"],
+    compare: ["--algos", "random", "--env", "FrozenLake-v1", "-n", "5"],
 }
-REQUESTS = {train_agent: train_spec, enjoy_agent: model_request, compare_agents: study_spec}
+REQUESTS = {train: train_spec, enjoy: model_request, compare: study_spec}
 
 
 def parsers():
@@ -46,7 +59,7 @@ FLAGS = [
 def test_an_odd_value_has_a_meaning_or_is_refused_in_one_line(module, flag, capsys):
     for value in ODD:
         base = BASES[module]
-        if flag == "--n-episodes" and module is not enjoy_agent:
+        if flag == "--n-episodes" and module is not enjoy:
             base = base[:-2]
         refusal = ""
         try:
@@ -58,7 +71,7 @@ def test_an_odd_value_has_a_meaning_or_is_refused_in_one_line(module, flag, caps
         assert refusal.count("\n") == bool(refusal)
 
 
-TRAIN, ENJOY, COMPARE = train_agent, enjoy_agent, compare_agents
+TRAIN, ENJOY, COMPARE = train, enjoy, compare
 MEANINGS = [
     (TRAIN, "-n", {"1e5": 100_000, "100_000": 100_000, "-1": -1}, "0 -5 1.5 nan inf text 1e13"),
     (TRAIN, "--n-episodes", {"1e3": 1000, "-1": -1}, "0 -2"),
@@ -133,15 +146,15 @@ def test_any_other_text_is_refused(text):
     ],
 )
 def test_what_is_taken_trains(words, tmp_path):
-    words = [*BASES[train_agent], "-f", str(tmp_path), *words]
-    spec = train_spec(train_agent.build_parser().parse_args(words))
+    words = [*BASES[train], "-f", str(tmp_path), *words]
+    spec = train_spec(train.build_parser().parse_args(words))
     outcome = carry_out(prepare(spec, Console(file=io.StringIO()), {}, ""))
     assert outcome.n_steps in (5, 6)
 
 
 def test_tensorboard_calls_a_run_after_its_agent(tmp_path):
-    words = [*BASES[train_agent], "-f", str(tmp_path), "-tb", str(tmp_path / "tb")]
-    spec = train_spec(train_agent.build_parser().parse_args(words))
+    words = [*BASES[train], "-f", str(tmp_path), "-tb", str(tmp_path / "tb")]
+    spec = train_spec(train.build_parser().parse_args(words))
     for _ in range(2):
         carry_out(prepare(spec, Console(file=io.StringIO()), {}, ""))
     assert {path.name for path in (tmp_path / "tb" / "FrozenLake-v1").iterdir()} == {
@@ -157,7 +170,7 @@ def test_a_budget_in_settings_may_be_written_as_a_float(place, text, tmp_path):
     words = ["--algo", "random", "--env", "FrozenLake-v1"]
     where = {"-params": [f"n_timesteps:{text}"], "file": [str(tmp_path / "own.yml")]}[place]
     flag = {"-params": "-params", "file": "-conf"}[place]
-    args = train_agent.build_parser().parse_args([*words, flag, *where])
+    args = train.build_parser().parse_args([*words, flag, *where])
     assert train_spec(args).hyperparams.n_timesteps == 100_000
 
 
@@ -191,7 +204,7 @@ def test_arguments_of_environments(env_id, kwargs, complaint):
 
 def test_a_random_seed_to_play_with():
     words = ["--seed", "-1", "--algo", "random", "--env", "FrozenLake-v1"]
-    args = enjoy_agent.build_parser().parse_args(words)
+    args = enjoy.build_parser().parse_args(words)
     seeds = {model_request(args).seed for _ in range(5)}
     assert len(seeds) == 5
     assert min(seeds) >= 0
@@ -199,7 +212,131 @@ def test_a_random_seed_to_play_with():
 
 def test_a_folder_is_not_left_to_chance(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for module in (train_agent, enjoy_agent, compare_agents):
+    for module in (train, enjoy, compare):
         with pytest.raises(SystemExit):
             module.build_parser().parse_args(["-f", ""])
     assert list(Path.cwd().iterdir()) == []
+
+
+# --- a flag that there is not is answered with what was meant -------------------------------------
+
+
+def answer(module, words, capsys):
+    with pytest.raises(SystemExit) as end:
+        module.build_parser().parse_args(words.split())
+    err = capsys.readouterr().err
+    assert (end.value.code, err.count("\n")) == (2, 1)
+    return err
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "meant"),
+    [
+        (TRAIN, "--lr 0.1", "behind -params: -params learning_rate:0.1 "),
+        (TRAIN, "--learning-rate 0.1 --algo qlearning", "-params learning_rate:0.1 "),
+        (TRAIN, "--learning_rate=0.1", "-params learning_rate:0.1 "),
+        (TRAIN, "--gamma", "-params gamma:VALUE "),
+        (TRAIN, "--gamma --seed 3", "-params gamma:VALUE "),
+        (TRAIN, "--alpha 0.1 --algo qlearning", "-params learning_rate:0.1 "),
+        (TRAIN, "--alpha 0.1 --algo linucb", "-params alpha:0.1 "),
+        (TRAIN, "--epsilon 0.1 --algo dqn", "-params exploration_final_eps:0.1 "),
+        (TRAIN, "--epsilon 0.1 --algo epsilon_greedy", "-params exploration_"),
+        (TRAIN, "--tie-breaking first --algo qlearning", "-params tie_breaking:first "),
+        (TRAIN, "--n-envs 4", "-params n_envs:4 "),
+        (TRAIN, "--n-steps 128", "-params n_steps:128 "),
+        (TRAIN, "--n-steps 128 --algo qlearning", "did you mean '--n-timesteps'?"),
+        (TRAIN, "--net-arch [64]", '-params policy_kwargs:"dict(net_arch=[64, 64])" '),
+        (TRAIN, "--policy MlpPolicy", "-params policy:MlpPolicy "),
+        (TRAIN, "--timesteps 5", "did you mean '--n-timesteps'?"),
+        (TRAIN, "--total-timesteps 5", "did you mean '--n-timesteps'?"),
+        (TRAIN, "--episodes 5", "did you mean '--n-episodes'?"),
+        (TRAIN, "--algorithm dqn", "did you mean '--algo'?"),
+        (TRAIN, "--environment x", "did you mean '--env'?"),
+        (TRAIN, "--num_threads 2", "did you mean '--num-threads'?"),
+        (TRAIN, "--folder x", "did you mean '--log-folder'?"),
+        (TRAIN, "-yaml x.yml", "did you mean '--conf-file'?"),
+        (TRAIN, "--n-jobs 2", "not searched for here"),
+        (TRAIN, "--wandb-entity=me", "-tb DIR writes TensorBoard logs"),
+        (ENJOY, "--render-mode human", "did you mean '--render'?"),
+        (ENJOY, "--episodes 5", "did you mean '--n-episodes'?"),
+        (ENJOY, "--log-folder x", "did you mean '--folder'?"),
+        (ENJOY, "--video x.gif", "did you mean '--record'?"),
+        (ENJOY, "--gamma 0.9", "a matter of training: train with -params gamma:VALUE "),
+        (COMPARE, "--seed 3", "did you mean '--seeds'?"),
+        (COMPARE, "--algo dqn", "did you mean '--algos'?"),
+        (COMPARE, "--n-jobs 2", "did you mean '--jobs'?"),
+        (COMPARE, "--gamma 0.9 --algos dqn --env x", "-params gamma:VALUE "),
+        (COMPARE, "x.yml --gamma 0.9", "-params gamma:0.9 "),
+    ],
+)
+def test_what_was_meant(module, words, meant, capsys):
+    assert meant in answer(module, words, capsys)
+
+
+@pytest.mark.parametrize("words", [[""], ["a\nb"], ["--"], ["--lr", "a\nb"], ["-x=\n"], [" "]])
+def test_whatever_is_unknown_is_told_in_one_line(words, capsys):
+    with pytest.raises(SystemExit):
+        TRAIN.build_parser().parse_args([*words, "--nonsense"])
+    err = capsys.readouterr().err
+    assert ": error: unknown argument " in err
+    assert err.count("\n") == 1
+
+
+def test_a_hyperparameter_of_another_agent_is_not_offered(capsys):
+    assert "-params" not in answer(TRAIN, "--batch-size 4 --algo qlearning", capsys)
+
+
+def test_an_abbreviation_does_not_mean_another_flag():
+    assert COMPARE.build_parser().parse_args(["--seeds", "3"]).seeds == 3
+    with pytest.raises(SystemExit):
+        COMPARE.build_parser().parse_args(["--see", "3"])
+
+
+def test_all_hyperparameters_are_known_by_name():
+    named = {
+        name
+        for algo, entry in ALGORITHMS.items()
+        if entry.is_installed
+        for name in inspect.signature(load_algorithm(algo)).parameters
+    }
+    missed = {
+        name
+        for name in named - SET_BY_FLAGS
+        if f"-params {name}:" not in hint([f"--{name}"], ["--hyperparams"], [])
+    }
+    assert missed == set()
+
+
+def test_what_is_answered_is_not_here():
+    flags = {
+        flag
+        for module in (TRAIN, ENJOY)
+        for action in module.build_parser()._actions
+        for flag in action.option_strings
+    }
+    assert flags.isdisjoint(INSTEAD)
+
+
+@pytest.mark.parametrize(
+    ("name", "known", "hint"),
+    [
+        ("lr", ["gamma", "learning_rate"], "did you mean 'learning_rate'?"),
+        ("alpha", ["gamma", "learning_rate"], "did you mean 'learning_rate'?"),
+        ("ALPHA", ["alphas", "learning_rate"], "did you mean 'learning_rate'?"),
+        ("eps", ["exploration_final_eps", "x"], "did you mean 'exploration_final_eps'?"),
+        ("alpha", ["alphas", "x"], "did you mean 'alphas'?"),
+    ],
+)
+def test_other_names_of_the_field(name, known, hint):
+    assert did_you_mean(name, known) == hint
+
+
+def test_other_names_lead_to_names_that_exist():
+    everything = {
+        name
+        for algo, entry in ALGORITHMS.items()
+        if entry.is_installed
+        for name in inspect.signature(load_algorithm(algo)).parameters
+    }
+    meant = {name for names in OTHER_NAMES.values() for name in names}
+    assert meant - everything == {"n_timesteps", "n_episodes", "n_envs"}

@@ -1,0 +1,858 @@
+"""``compare.py``: its flags, what it does with a study, and what it prints of it."""
+
+from __future__ import annotations
+
+import _thread
+import argparse
+import importlib.util
+import signal
+import time
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, field, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from commands.cli import (
+    COUNT,
+    COUNT_OR_NONE,
+    FIRST_SEED,
+    LONGEST_FOLDER_NAME,
+    OneLineParser,
+    add_shared,
+    check_tensorboard,
+    command_line,
+    folder_name,
+    go_on_unread,
+    number_at_least_zero,
+    whole_number,
+)
+from commands.terminal import LiveProgress, say, table_console
+from pipeline.errors import UserError, unknown
+from pipeline.failures import exits_as_mistakes
+from pipeline.library_loading import loading_libraries
+from pipeline.signs_of_life import doing, duration
+from pipeline.stopping import stops_noticed
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from rich.table import Table
+
+    from experiments.analysis import StudyAnalysis
+    from experiments.cluster.addresses import Cluster
+    from experiments.growing import Step
+    from experiments.launching import EarlyResults, Launcher, RunFailure
+    from experiments.looks import Standing
+    from experiments.plan import PlannedRun
+    from experiments.results import LeftOut, StudyResults
+    from experiments.run_limits import RunLimits
+    from experiments.study import StudySpec
+    from pipeline.signs_of_life import Activity
+    from report.page.sections import LearningPage
+
+# --- flags ----------------------------------------------------------------------------------------
+
+SEEDS = whole_number(1, 1_000_000)
+
+EPILOG = """\
+examples:
+  python compare.py --env FrozenLake-v1 --algos qlearning sarsa dqn ppo --seeds 10
+  python compare.py --env Warehouse-v0 MineMaze-v0 --algos qlearning ppo --engine auto
+  python compare.py studies/warehouse-learning-rate.yml
+  python compare.py studies/warehouse-learning-rate.yml --quick
+  python compare.py studies/warehouse-learning-rate.yml --until-decided
+  python compare.py --logged log.csv --policy logs/linucb/ReplayBandit-v0_1
+
+The same command again does the missing runs, and no others.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The flags; those of single runs mean what they mean to the command train."""
+    parser = OneLineParser(
+        description="Compare agents on environments over seeds: tables, figures, and a page.",
+        epilog=EPILOG,
+    )
+    add = parser.add_argument
+    add("study", nargs="?", metavar="STUDY.yml", help="a study file, or the name of a shipped one")
+    add("--env", nargs="+", default=[], metavar="ID", help="environments")
+    add("--algos", nargs="+", default=[], metavar="AGENT", help="agents (train --list has them)")
+    add("--seeds", type=SEEDS, metavar="N", help="how many seeds (default: the study's, or 10)")
+    first = "the first of these seeds (default: the study's, or 0)"
+    add("--first-seed", type=FIRST_SEED, metavar="N", help=first)
+    decided = "give agents in undecided pairs more seeds, at looks that are fixed beforehand"
+    add("--until-decided", action="store_true", help=decided)
+    add("--max-seeds", type=SEEDS, metavar="N", help="the most seeds for that (default: 50)")
+    add_shared(parser, "--n-timesteps", "--n-episodes")
+    add_shared(parser, "--hyperparams", help="hyperparameters to change in every agent")
+    add_shared(parser, "--engine")
+    add(
+        *("-conf", "--conf-file"),
+        nargs="+",
+        default=[],
+        metavar="[AGENT:]YAML",
+        help="hyperparameters from another file; with several agents, for which: dqn:mine.yml",
+    )
+    add_shared(parser, "--env-kwargs")
+    add(
+        "--as-it-comes",
+        action="store_true",
+        help="train every agent on the environment as it comes, without what settings change in "
+        "training alone (train_env_kwargs, train_env_wrapper)",
+    )
+    add_shared(parser, "--gym-packages")
+    quick = "few seeds and a small budget, for a first look"
+    add("--quick", action="store_true", dest="is_quick", help=quick)
+
+    group = parser.add_argument_group("runs")
+    add_shared(group, "--jobs", "--cluster", "--insecure-cluster", "--run-timeout", "--run-memory")
+    repaired = "do damaged runs again; the old folders are kept"
+    group.add_argument("--repair", action="store_true", help=repaired)
+    replaced = "do finished runs with other settings again; the old folders are kept"
+    group.add_argument("--replace", action="store_true", help=replaced)
+
+    group = parser.add_argument_group("judgement and output")
+    add = group.add_argument
+    add("--metric", help="what verdicts are about: final, best, area, regret, ...")
+    margin = "difference within which agents count as equivalent"
+    add("--margin", type=number_at_least_zero, help=margin)
+    add("--episodes-table", type=COUNT, metavar="N", help="average, min, max of every N episodes")
+    filmed = "film one episode after every N episodes"
+    add("--render-every", type=COUNT_OR_NONE, default=0, metavar="N", help=filmed)
+    add("--name", type=folder_name, help="name of the study's folder (default: from the study)")
+    add_shared(group, "--log-folder", default="logs/studies", help="folder of all studies")
+    add("-tb", "--tensorboard", action="store_true", help="write a TensorBoard log of each run")
+    watched = "train the first run of each agent again, and link pages that play how it learns"
+    add("--watch-learning", action="store_true", dest="learning_pages", help=watched)
+    add(
+        "--figures",
+        nargs="+",
+        choices=("png", "svg", "pdf"),
+        metavar="FORMAT",
+        help="formats of the figures: png, svg, pdf (default: png svg)",
+    )
+    add("--no-report", action="store_true", help="only tables: no figures and no page")
+
+    add = parser.add_argument_group("off-policy evaluation, instead of a study").add_argument
+    add("--logged", metavar="LOG.csv", help="judge trained agents on logged pulls of a bandit")
+    add("--policy", nargs="+", default=[], metavar="RUN", help="run folders or model zips to judge")
+    return parser
+
+
+# --- what is done ---------------------------------------------------------------------------------
+
+
+def main() -> int:
+    """Parse the arguments and do what they ask for; the exit code."""
+    args = build_parser().parse_args()
+    with stops_noticed(), exits_as_mistakes():
+        if args.logged or args.policy:
+            return _compare_on_log(args)
+        return _compare(args)
+
+
+def _compare(args: argparse.Namespace) -> int:
+    """Do a study, as the only one that does."""
+    study = study_spec(args)
+    from experiments.child_processes import end_server
+    from experiments.looks import read_looks
+    from experiments.plan import plan
+    from experiments.run_limits import RunLimits
+    from pipeline.locks import folder_lock, told_if_gone
+    from safe_files.regular_files import take_up
+
+    go_on_unread()
+    root = Path(args.log_folder) / study.name
+    take_up(root)
+    console = table_console()
+    limits = RunLimits(study.run_timeout, study.run_memory)
+    context = run_context(args, root, command_line(), limits, console)
+    planned = plan(study, root)
+    console.print(study.title, style="bold", highlight=False)
+    with folder_lock(root, give_way, partial(say, console)), told_if_gone(root):
+        try:
+            if args.until_decided:
+                return _grow_study(args, study, context)
+            read_looks(root)  # so that it is known how often the study was looked at
+            _prepare(args, study, planned, context)
+            return run_study(context, study, planned)
+        except KeyboardInterrupt:
+            end_server()
+            raise
+
+
+def _prepare(
+    args: argparse.Namespace,
+    study: StudySpec,
+    planned: Sequence[PlannedRun],
+    context: RunContext,
+) -> None:
+    """Make sure that the runs can be done, before any is; and load the libraries for them."""
+    if args.repair:
+        repair(context.console, study, planned)
+    with doing(context.console, "looking for runs that are there") as activity, loading_libraries():
+        from experiments.child_processes import do_aside
+        from experiments.plan import check_settings
+        from experiments.run_folders import check_settings_kept
+
+        if not args.replace:
+            check_settings_kept(planned, context.root)
+        if any(run.is_to_do for run in planned):
+            context.get_ready(planned)
+        activity.now("loading the libraries")
+        first = [run for run in planned if run.seed == study.first_seed]
+        do_aside(check_settings, study, first)
+        line, context.expected = _engines(planned)
+    if line:
+        say(context.console, f"engines: {line}")
+
+
+def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], float]]:
+    """On which engines the missing runs of networks will train, and what each run takes."""
+    from pipeline.train_spec import NETWORKS
+
+    missing: dict[tuple[str, str], list[PlannedRun]] = {}
+    for run in planned:
+        if run.spec.algo in NETWORKS and run.is_to_do:
+            missing.setdefault((run.agent, run.environment), []).append(run)
+    if not missing:  # without the libraries
+        return "", {}
+    from agents.networks.engine_costs import machine_pace
+    from commands.terminal import seconds_of, study_line
+    from experiments.launching import expected_seconds
+    from pipeline.engine_outlook import planned_outlook
+
+    found = {key: planned_outlook(runs[0].spec) for key, runs in missing.items()}
+    outlooks = {key: each for key, each in found.items() if each is not None}
+    pace = machine_pace() if outlooks else 1.0
+    expected = {
+        key: seconds
+        for key, each in outlooks.items()
+        if (seconds := expected_seconds(missing[key][0].spec, pace * seconds_of(each.plan, each)))
+    }
+    lines = [(key[0], each, len(missing[key])) for key, each in outlooks.items()]
+    return study_line(lines), expected
+
+
+def run_study(context: RunContext, study: StudySpec, planned: Sequence[PlannedRun]) -> int:
+    """Do a study as planned, and judge it; the exit code, 0 if all runs are there and sound."""
+    from experiments.launching import EarlyResults
+
+    early = EarlyResults(study)
+    failures = do_missing(context, planned, early)
+    return conclude(context, read(context, study, planned, early), failures)
+
+
+def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext) -> int:
+    """Do a study with more and more seeds until every pair is decided, and judge it at the end.
+
+    How many seeds there are at each look is settled before the first.
+    """
+    from experiments.growing import (
+        counts_after,
+        counts_of,
+        grown,
+        settle,
+        settled_looks,
+        take_planned_looks,
+    )
+    from experiments.launching import EarlyResults
+    from experiments.plan import plan
+    from report.wording import seeds
+
+    looks = settled_looks(study, context.root, args.max_seeds)
+    counts = counts_of(study, looks)
+    now = grown(study, counts)
+    planned = plan(now, context.root, counts)
+    _prepare(args, now, planned, context)
+    settle(context.root, looks)
+    failures: list[RunFailure] = []
+    said: set[tuple[str, int]] = set()
+    with context.held():  # from one look to the next
+        while True:
+            given_up = {failure.planned.path for failure in failures}
+            early = EarlyResults(now)
+            failures += do_missing(context, planned, early, given_up)
+            results = read(context, now, planned, early)
+            steps = take_planned_looks(results)
+            for step in steps:
+                if (step.environment, step.growth.n_looks) not in said:
+                    said.add((step.environment, step.growth.n_looks))
+                    say(context.console, _on_look(step))
+            if all(step.growth.is_done for step in steps):
+                break
+            counts = counts_after(counts, steps)
+            now = grown(study, counts)
+            planned = plan(now, context.root, counts)
+        code = conclude(
+            context, results, failures, {step.environment: step.standing for step in steps}
+        )
+    # How many runs it took, beside a design that gives every agent all seeds.
+    most = max((step.design.sizes[-1] for step in steps), default=0)
+    undecided = [
+        f"{first} and {second} on {step.environment}"
+        for step in steps
+        for first, second in step.undecided
+    ]
+    left = f"undecided: {'; '.join(undecided)}" if undecided else "all is decided"
+    design = f"{seeds(most)} of each agent would be {most * len(counts):,}"
+    say(context.console, f"{sum(counts.values()):,} runs, where {design}; {left}")
+    return code
+
+
+def _on_look(step: Step) -> str:
+    """What a look has decided, and who gets more seeds."""
+    from report.wording import enumeration, seeds
+
+    growth, sizes = step.growth, step.design.sizes
+    text = f"{step.environment}, look {growth.n_looks} of {len(sizes)}: "
+    n, n_undecided = len(growth.judged), len(step.undecided)
+    if not n_undecided:
+        return f"{text}all pairs are decided"
+    text += f"{n_undecided} of {n} pairs {'is' if n_undecided == 1 else 'are'} undecided"
+    if growth.is_done:
+        return text
+    size = sizes[growth.n_looks]
+    names = [name for name, wanted in growth.seeds.items() if wanted == size]
+    return f"{text}; {enumeration(names)} {'goes' if len(names) == 1 else 'go'} on to {seeds(size)}"
+
+
+def do_missing(
+    context: RunContext,
+    planned: Sequence[PlannedRun],
+    early: EarlyResults,
+    given_up: Collection[Path] = (),
+) -> list[RunFailure]:
+    """Do the runs that are missing, but for those whose folders are given up; which failed.
+
+    Each is read as soon as it has ended.
+    """
+    from experiments.launching import execute
+    from experiments.run_folders import move_replaced_aside
+
+    console, root = context.console, context.root
+    moved, place = move_replaced_aside(planned, root)
+    if place is not None:
+        runs = "1 run that is" if len(moved) == 1 else f"{len(moved)} runs that are"
+        say(console, f"{runs} done again: what was there is in {place} now")
+    missing = [run for run in planned if run.is_to_do and run.path not in given_up]
+    done = [run for run in planned if run.is_finished]
+    console.print(
+        f"{len(planned)} runs, {len(done)} of them there already; {context.words}, in {root}",
+        highlight=False,
+    )
+    begun = [*done, *missing]
+    with StudyProgress(console, begun, done, context.expected) as progress:
+        for run in done:
+            progress.note_refusal(run)
+
+        def note(planned: PlannedRun, failure: RunFailure | None) -> None:
+            progress.note(planned, failure)
+            if failure is None:
+                early.read(planned)
+
+        return execute(missing, root, progress.watching(context.launchers), note, early.get_ready)
+
+
+def read(
+    context: RunContext, study: StudySpec, planned: Sequence[PlannedRun], early: EarlyResults
+) -> StudyResults:
+    """Read the runs that there are, but for those that were read early."""
+    with doing(context.console, "reading the results") as activity:
+        from experiments.results import read_results
+
+        return read_results(study, planned, context.root, activity.at, early.of)
+
+
+def conclude(
+    context: RunContext,
+    results: StudyResults,
+    failures: Sequence[RunFailure],
+    looks: Mapping[str, Standing] | None = None,
+) -> int:
+    """Judge the runs that there are, and say which are missing and why; the exit code.
+
+    ``looks`` are those that have been taken, by environment; None for one that is taken now.
+    """
+    from experiments.run_files import mixed_versions
+
+    tell = partial(say, context.console)
+    results = replace(results, failures={one.planned.path: one.details for one in failures})
+    try:
+        if len(results.summary):
+            _judge(context, results, looks)
+            note = mixed_versions(run.run.read_info() for run in results.finished)
+            if note:
+                tell(note)
+    finally:
+        for failure in failures:
+            run, log = failure.planned, failure.log
+            details = "the details could not be written" if log is None else f"see {log}"
+            who = f"{run.agent} on {run.environment}, seed {run.seed}"
+            tell(f"failed: {who}: {failure.reason}; {details}")
+        for damaged in results.left_out:
+            tell(f"left out: {_whose(damaged)}")
+        if results.left_out:
+            n_runs = sum(damaged.planned.n_runs for damaged in results.left_out)
+            runs = "1 run is" if n_runs == 1 else f"{n_runs} runs are"
+            tell(f"{runs} damaged and in no figure; --repair does such runs again")
+    if results.n_unchecked:
+        runs = "1 run" if results.n_unchecked == 1 else f"{results.n_unchecked} runs"
+        tell(f"{runs} of an earlier version recorded no digests: damage may go unseen")
+    n_missing = len(results.planned) - len(results.finished)
+    if n_missing > len(failures) + len(results.left_out):
+        which = f"{n_missing} of {len(results.planned)} runs are missing"
+        tell(f"{which}; the same command continues")
+    return 1 if n_missing else 0
+
+
+def repair(console: Console, study: StudySpec, planned: Sequence[PlannedRun]) -> None:
+    """Move the folders of damaged runs aside, and say so."""
+    with doing(console, "looking for damaged runs") as activity:
+        from experiments.run_folders import move_damaged_aside
+
+        moved = move_damaged_aside(study, planned, activity.at)
+    for damaged, place in moved:
+        say(console, f"damaged: {_whose(damaged)}; its folder is {place.name} now")
+
+
+def _whose(damaged: LeftOut) -> str:
+    run = damaged.planned
+    seeds = (
+        f"seeds {run.seed} to {run.seed + run.n_runs - 1}" if run.n_runs > 1 else f"seed {run.seed}"
+    )
+    return f"{run.agent} on {run.environment}, {seeds}: {damaged.reason}"
+
+
+def _judge(
+    context: RunContext, results: StudyResults, looks: Mapping[str, Standing] | None
+) -> None:
+    """Print the judgement, and write tables, figures and page."""
+    console = context.console
+    with doing(console, "judging the agents") as activity:
+        from experiments.analysis import analyse, with_advice
+        from experiments.growing import take_looks
+        from report.terminal_tables import print_analysis, print_episodes_table
+
+        analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
+        activity.now("looking at runs that failed")
+        analysis = with_advice(analysis)
+    print_analysis(console, analysis)
+    width = results.study.episodes_table
+    with doing(console, "writing the tables") as activity:
+        from experiments.study import write_study
+        from report.result_files import write_tables, write_verdicts
+        from report.series.episode_blocks import episodes_table
+
+        files = [*write_tables(results), *write_verdicts(analysis, context.command)]
+        write_study(results.root, results.study)
+        blocks = episodes_table(results, width) if width else None
+        if blocks is not None:
+            print_episodes_table(console, blocks, width)
+        if results.study.render_every:
+            activity.now("filming")
+            from report.films import write_films
+
+            films, refused = write_films(results, activity.at)
+            files += films
+            for reason in refused:
+                activity.say(f"no film: {reason}")
+        if context.with_page:
+            files += _draw(context, analysis, blocks, activity)
+    console.print()
+    console.print(f"files: {results.root}", highlight=False)
+    for path in files:
+        console.print(f"  {path.relative_to(results.root)}", highlight=False)
+
+
+def _draw(
+    context: RunContext, analysis: StudyAnalysis, blocks: pd.DataFrame | None, activity: Activity
+) -> list[Path]:
+    """Figures and the page; the files."""
+    activity.now("working out the curves")
+    from report.figures.figure_files import write_figures
+    from report.page import write_report
+    from report.series.study_series import study_series
+
+    page = analysis.results.root / "report.html"
+    series = study_series(analysis, activity.at)
+    activity.now("drawing the figures")
+    files = write_figures(series, blocks, activity.at)
+    learning: list[LearningPage] = []
+    if analysis.study.learning_pages:
+        activity.now("watching")
+        from report.learning_page.first_runs import write_first_pages
+
+        learning = write_first_pages(analysis, context.n_workers, activity.at)
+    activity.now("writing the page")
+    write_report(series, page, context.command, activity.at, learning)
+    pages = [analysis.results.root / one.place for one in learning if one.place]
+    return [*files, *pages, page]
+
+
+# --- where runs are done --------------------------------------------------------------------------
+
+
+@dataclass
+class RunContext:
+    """What the runs of a study or a search have in common: where they are done, and by what."""
+
+    root: Path  # the folder of what is done
+    command: str  # as run folders note it
+    limits: RunLimits  # what each run may take
+    console: Console
+    with_page: bool = True  # draw the figures and write the page, beside the tables
+    n_workers: int = 1  # processes that may work on this machine at once
+    cluster: Cluster | None = None
+    address: str = ""  # of the cluster, as it was typed
+    n_jobs: int = 0  # jobs at once in the cluster's queue
+    is_insecure: bool = False  # whether the user has said that the cluster may be without TLS
+    # Seconds of a run by agent and environment, where something is known of them.
+    expected: Mapping[tuple[str, str], float] = field(default_factory=dict)
+    _warm_ups: str = "[]"  # what the cluster's workers compile once
+    _held: ExitStack | None = None
+    _launcher: Launcher | None = None  # what is held
+
+    @property
+    def words(self) -> str:
+        """Where runs are done, in words."""
+        here = f"{self.n_workers} at once"
+        return here if self.cluster is None else f"on the cluster {self.address}"
+
+    def get_ready(self, planned: Sequence[PlannedRun]) -> None:
+        """Start what runs are forked from here; what they compile is compiled once.
+
+        Only users' own modules are compiled so. The server imports the libraries while this process
+        does.
+        """
+        from experiments.child_processes import start_server
+
+        compiled = "[]"
+        if any(run.spec.user_modules for run in planned):
+            from experiments.warm_ups import warm_ups
+
+            compiled = warm_ups(planned)
+        if self.cluster is None:
+            start_server(compiled)
+        else:
+            self._warm_ups = compiled
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Leave the place open between two uses, until the ``with`` statement ends."""
+        with ExitStack() as self._held:
+            yield
+        self._held = self._launcher = None
+
+    def launchers(self) -> AbstractContextManager[Launcher]:
+        """Open the place where runs are done."""
+        if self._held is None:
+            return self._opened()
+        if self._launcher is None:
+            self._launcher = self._held.enter_context(self._opened())
+        return nullcontext(self._launcher)
+
+    def _opened(self) -> AbstractContextManager[Launcher]:
+        if self.cluster is None:
+            from experiments.launching import local_launcher
+
+            return local_launcher(self.root, self.command, self.n_workers, self.limits)
+        from experiments.cluster.cluster_launcher import cluster_launcher
+
+        return cluster_launcher(
+            self.cluster,
+            self.root,
+            self.command,
+            self.limits,
+            n_runs=self.n_jobs,
+            is_told=self.is_insecure,
+            warm_ups=self._warm_ups,
+            tell=partial(say, self.console),
+        )
+
+
+def run_context(
+    args: argparse.Namespace, root: Path, command: str, limits: RunLimits, console: Console
+) -> RunContext:
+    """What the flags ask for."""
+    context = RunContext(root, command, limits, console, with_page=not args.no_report)
+    if args.cluster is None:
+        if args.insecure_cluster:
+            raise UserError("--insecure-cluster belongs to --cluster: give --cluster too")
+        from experiments.launching import available_cores
+
+        return replace(context, n_workers=max(args.jobs, 0) or available_cores())
+    for library in ("distributed", "cryptography", "dask_jobqueue"):
+        if importlib.util.find_spec(library) is None:
+            raise UserError("--cluster needs Dask: pip install 'rl-yardstick[cluster]'")
+    from experiments.cluster.addresses import JobQueue
+    from experiments.cluster.schedulers import checked_cluster
+
+    cluster = checked_cluster(args.cluster, args.insecure_cluster)
+    if isinstance(cluster, JobQueue):
+        if args.jobs < 1:
+            raise UserError(f"{cluster.file}: say how many runs to do at once: --jobs N")
+    elif args.jobs > 0:
+        raise UserError("--jobs is for this machine or a queue of jobs; a cluster has its workers")
+    return replace(
+        context,
+        cluster=cluster,
+        address=args.cluster,
+        n_jobs=args.jobs,
+        is_insecure=args.insecure_cluster,
+    )
+
+
+def give_way() -> None:
+    """Stop, since the study's folder is another driver's, or gone."""
+    from experiments.child_processes import stop_all
+
+    stop_all()
+    _thread.interrupt_main(signal.SIGTERM)
+
+
+# --- from flags to a study ------------------------------------------------------------------------
+
+
+def study_spec(args: argparse.Namespace) -> StudySpec:
+    """The study that the arguments mean, with what they change in it."""
+    from experiments.study import METRICS, StudySpec, find_study, read_study
+    from pipeline.user_modules import import_typed
+
+    if args.max_seeds is not None and not args.until_decided:
+        raise UserError("--max-seeds belongs to --until-decided: give both, or --seeds")
+    for flag, is_given in (("quick", args.is_quick), ("replace", args.replace)):
+        if args.until_decided and is_given:
+            raise UserError(f"--until-decided and --{flag} do not go together: give one of them")
+    if args.learning_pages and args.no_report:
+        raise UserError("--watch-learning is a section of the page: leave out --no-report")
+    if args.metric is not None and args.metric not in METRICS:
+        raise unknown("--metric: unknown metric", args.metric, METRICS)
+    check_tensorboard(args.tensorboard)
+    modules = import_typed(args.gym_packages, args.env)
+    if not args.study:
+        study = _study_of_flags(args)
+    elif args.env or args.algos:
+        raise UserError("give a study file, or --env and --algos, not both")
+    else:
+        study = read_study(find_study(args.study))
+    # A flag that has the name of a field goes there as it is, where it is given.
+    named = {key.name: getattr(args, key.name) for key in fields(StudySpec) if key.name in args}
+    names = tuple(module.name for module in modules)
+    changes = {**named, "n_seeds": args.seeds, "gym_packages": names, "user_modules": modules}
+    changes = {key: value for key, value in changes.items() if value is not None}
+    study = replace(_with_settings(study, args), **changes)
+    return study.quickened() if args.is_quick else study
+
+
+def _study_of_flags(args: argparse.Namespace) -> StudySpec:
+    from agents import ALGORITHMS
+    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name
+    from pipeline.environments import check_env_id
+    from pipeline.runs import environment_name
+
+    if not (args.env and args.algos):
+        raise UserError("what to compare? give --env and --algos, or a study file")
+    for algo in args.algos:
+        if algo not in ALGORITHMS:
+            raise unknown("unknown agent", algo, ALGORITHMS)
+    for env_id in args.env:
+        check_env_id(env_id)
+    for flag, names in (("--env", args.env), ("--algos", args.algos)):
+        if len(set(names)) < len(names):
+            raise UserError(f"{flag} names one of them twice")
+    agents, environments = ", ".join(args.algos), ", ".join(args.env)
+    folders = "-".join(map(environment_name, args.env))
+    return StudySpec(
+        name=file_name(f"{folders}_{'-'.join(args.algos)}", LONGEST_FOLDER_NAME),
+        title=f"{agents} on {environments}",
+        agents=tuple(AgentSpec(algo, algo) for algo in args.algos),
+        environments=tuple(EnvironmentSpec(env_id, env_id) for env_id in args.env),
+    )
+
+
+def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
+    """The files of ``--conf-file``, by the agents' names in the table of agents."""
+    algos = list(dict.fromkeys(agent.algo for agent in study.agents))
+    files: dict[str, Path] = {}
+    for word in words:
+        algo, colon, name = word.partition(":")
+        if not (colon and algo in algos):
+            if len(algos) > 1:
+                example = f"{algos[0]}:{word}"
+                raise UserError(
+                    f"--conf-file {word}: whose hyperparameters? a file has those of one "
+                    f"agent ({', '.join(algos)}): {example}"
+                )
+            algo, name = algos[0], word
+        if algo in files:
+            raise UserError(f"--conf-file names two files for {algo}")
+        files[algo] = Path(name)
+        if not files[algo].is_file():
+            raise UserError(f"--conf-file: there is no file {files[algo]}")
+    return files
+
+
+def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
+    """The study with the settings of the command line in every agent."""
+    from experiments.study import AS_IT_COMES, layered
+    from pipeline.agent_checks import with_engine
+    from pipeline.settings.values import parse_assignments
+
+    files = _conf_files(study, args.conf_file)
+    changes: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
+    if args.env_kwargs:
+        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
+        changes = layered(changes, named)
+    if args.as_it_comes:
+        changes = {**AS_IT_COMES, **changes}
+    for key in ("n_timesteps", "n_episodes"):
+        if getattr(args, key) is not None:
+            changes[key] = getattr(args, key)
+    agents = tuple(
+        replace(
+            agent,
+            settings=layered(agent.settings, with_engine(agent.algo, changes, args.engine)),
+            conf_file=files.get(agent.algo, agent.conf_file),
+        )
+        for agent in study.agents
+    )
+    return replace(study, agents=agents)
+
+
+# --- policies on logged pulls ---------------------------------------------------------------------
+
+
+def _compare_on_log(args: argparse.Namespace) -> int:
+    """Judge the policies of ``--policy`` on the log of ``--logged``; the exit code."""
+    from pipeline.user_modules import import_typed
+
+    if not (args.logged and args.policy):
+        raise UserError("--logged LOG.csv and --policy RUN go together: one of them is missing")
+    if args.study or args.env or args.algos:
+        raise UserError("give a study, --env and --algos, or --logged and --policy, not both")
+    modules = import_typed(args.gym_packages)
+    console = table_console(highlight=False)
+    n = len(args.policy)
+    say(console, f"{n} {'policy' if n == 1 else 'policies'} on {args.logged}")
+    with doing(console, "reading the log") as activity:
+        from experiments.off_policy.policy_files import find_policy, read_logged
+
+        data = read_logged(args.logged)
+        found = [find_policy(Path(path)) for path in args.policy]
+        names = [policy.name for policy in found]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise UserError(f"--policy names {twice} twice")
+        activity.now("loading the libraries")
+        from experiments.off_policy.logged_policies import compare_policies, load_policy
+
+        activity.now("loading the policies")
+        policies = [load_policy(policy, modules) for policy in found]
+        activity.now("judging the policies")
+        compared = compare_policies(data, policies)
+    from report.off_policy_table import print_comparison
+
+    print_comparison(console, compared)
+    return 0
+
+
+# --- what a person watching sees: one table that moves, or a line now and then --------------------
+
+
+class StudyProgress(LiveProgress):
+    """How far the runs of a study are, by agent and environment."""
+
+    def __init__(
+        self,
+        console: Console,
+        runs: Sequence[PlannedRun],
+        done: Sequence[PlannedRun],
+        expected: Mapping[tuple[str, str], float] | None = None,
+    ) -> None:
+        from experiments.launching import TimeLeft
+
+        super().__init__(console)
+        there = {run.path for run in done}
+        self.left = TimeLeft([run for run in runs if run.path not in there], expected or {})
+        self.total = Counter((run.agent, run.environment) for run in runs)
+        self.done = Counter((run.agent, run.environment) for run in done)
+        self.failed: Counter[tuple[str, str]] = Counter()
+        self._refused: set[str] = set()
+        self.n_missing = len(runs) - len(done)
+        self.n_ended = 0
+
+    def note(self, run: PlannedRun, failure: RunFailure | None) -> None:
+        """Count a run that has ended now."""
+        self.n_ended += 1
+        now = time.monotonic()
+        self.left.start(self.started if self.n_ended == 1 else now, self.n_workers)
+        self.left.end(run, now)
+        self.left.start(now, self.n_workers)
+        key = (run.agent, run.environment)
+        if failure is None:
+            self.done[key] += 1
+            self.note_refusal(run)
+        else:
+            self.failed[key] += 1
+            self.say(f"failed: {run.agent} on {run.environment}, seed {run.seed}: {failure.reason}")
+        if self.live is None and self.is_over:
+            self.say(self.figures())
+        else:
+            self.look()
+
+    def look(self) -> None:
+        """Show how far it is; from the first look on, runs are under way."""
+        self.left.start(time.monotonic(), self.n_workers)
+        super().look()
+
+    @property
+    def n_workers(self) -> int:
+        """How many runs are done at once."""
+        return 1 if self._launcher is None else self._launcher.n_workers
+
+    def note_refusal(self, run: PlannedRun) -> None:
+        """Say once for each environment why its own model is not used, where that is so."""
+        refusal = run.run.read_info().get("model_refused")
+        if isinstance(refusal, str) and run.environment not in self._refused:
+            self._refused.add(run.environment)
+            self.say(f"{run.environment}: {refusal}; figures are sampled")
+
+    @property
+    def is_over(self) -> bool:
+        """Whether all runs have ended."""
+        return self.n_ended >= self.n_missing
+
+    def figures(self) -> str:
+        """How many runs have ended, and how long the others may take."""
+        seconds = time.monotonic() - self.started
+        text = f"{self.n_ended} of {self.n_missing} runs in {duration(seconds)}"
+        if 0 < self.n_ended < self.n_missing:
+            left = self.left.seconds(time.monotonic(), self.n_workers)
+            text += "" if left is None else f", about {duration(left)} left by the clock"
+        text += self.place_words
+        n_failed = self.failed.total()
+        return f"{text}, {n_failed} failed" if n_failed else text
+
+    def picture(self) -> Table:
+        """The same by agent and environment."""
+        from rich.progress_bar import ProgressBar
+        from rich.table import Table
+        from rich.text import Text
+
+        table = Table(box=None, pad_edge=False, caption=self.figures(), caption_justify="left")
+        for heading in ("agent", "environment", "runs", "", "failed"):
+            table.add_column(heading)
+        for key, total in self.total.items():
+            done, failed = self.done[key], self.failed[key]
+            table.add_row(
+                *key,
+                f"{done}/{total}",
+                ProgressBar(total=total, completed=done, width=24),
+                Text(str(failed), "red") if failed else "",
+            )
+        return table

@@ -1,0 +1,548 @@
+"""``tune.py``: its flags, a search from the first trial to the winner, and what it prints."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import shlex
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+
+from commands.cli import (
+    COUNT,
+    FIRST_SEED,
+    LONGEST_FOLDER_NAME,
+    RUN_TIMEOUT,
+    OneLineParser,
+    add_shared,
+    called_as,
+    command_line,
+    filled,
+    folder_name,
+    go_on_unread,
+    whole_number,
+)
+from commands.compare import RunContext, conclude, do_missing, give_way, read, run_context
+from commands.terminal import LiveProgress, say, search_line, table_console
+from pipeline.errors import UserError, unknown
+from pipeline.failures import exits_as_mistakes
+from pipeline.signs_of_life import doing, duration
+from pipeline.stopping import stops_noticed
+from tuning.pruning import PRUNERS
+from tuning.tuning_spec import AUTO, FIGURES, OBJECTIVES, SAMPLERS, SHIPPED, TuningSpec
+
+if TYPE_CHECKING:
+    from tuning.opening import OpenTuning
+    from tuning.retesting import Candidate, Outcome
+
+# --- flags ----------------------------------------------------------------------------------------
+
+TRIALS = whole_number(1, 100_000)
+SEEDS = whole_number(1, 1000)
+
+EPILOG = """\
+examples:
+  python tune.py --env Warehouse-v0 --algo ppo --trials 100
+  python tune.py --env FrozenLake8x8-v1 --algo ppo --engine auto -j 4
+  python tune.py --env CartPole-v1 --algo dqn --seeds-per-trial 10 --objective lower
+  python tune.py --env Taxi-v4 --algo qlearning --sampler grid --storage journal:shared/taxi.log
+
+The same command again continues the search; several at once share the work.
+"""
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The flags; those of runs mean what they mean to train and compare, the others to rl_zoo3."""
+    parser = OneLineParser(
+        description="Search for an agent's hyperparameters: judge each setting over several seeds, "
+        "run the best again on other seeds, and save a setting that is better there.",
+        epilog=EPILOG,
+    )
+    add = parser.add_argument
+    add("--algo", required=True, metavar="AGENT", help="agent (train --list has them)")
+    add("--env", required=True, metavar="ID", help="environment")
+
+    add = parser.add_argument_group("search").add_argument
+    add(
+        *("--trials", "--n-trials", "--max-total-trials"),
+        dest="n_trials",
+        type=TRIALS,
+        default=100,
+        metavar="N",
+        help="settings to try, over all drivers (100)",
+    )
+    seeds = "seeds of each trial (5)"
+    add("--seeds-per-trial", type=SEEDS, default=5, metavar="N", help=seeds)
+    first = "the first of these seeds (0)"
+    add("--first-seed", type=FIRST_SEED, default=0, metavar="N", help=first)
+    add(
+        "--objective",
+        choices=OBJECTIVES,
+        default="mean",
+        help="which figure of a trial's runs counts: mean (default), interquartile mean, or lower "
+        "quartile",
+    )
+    add(
+        "--metric",
+        choices=FIGURES,
+        help="which figure of a run counts (default: score, the final policy's return between the "
+        "best random or constant policy, 0, and the optimum, 1; the return if no optimum is known; "
+        "on bandits regret); steps and seconds count until the threshold",
+    )
+    add("--threshold", type=float, metavar="RETURN", help="the return that counts as solved")
+    add("--sampler", choices=SAMPLERS, default="tpe", help="what suggests settings (tpe)")
+    pruned = "rule that ends hopeless trials (auto)"
+    add("--pruner", choices=tuple(PRUNERS), default="auto", help=pruned)
+    add(
+        "--n-startup-trials",
+        type=whole_number(0, 100_000),
+        default=10,
+        metavar="N",
+        help="trials at random before the sampler learns from them (10)",
+    )
+    space = "the values to choose from (default: search_spaces/AGENT.yml)"
+    add("--search-space", type=filled, metavar="YAML", help=space)
+    add("--seed", type=whole_number(0, 2**32 - 1), default=0, help="seed of the search (0)")
+    timeout = "begin no more runs after this time, e.g. 50m; then comes the re-test"
+    add("--timeout", type=RUN_TIMEOUT, metavar="TIME", help=timeout)
+
+    add = parser.add_argument_group("re-test").add_argument
+    add(
+        "--retest",
+        type=whole_number(0, 100),
+        default=3,
+        metavar="K",
+        help="run the best K settings and the shipped ones again on other seeds (3; 0 for none)",
+    )
+    add("--retest-seeds", type=SEEDS, default=20, metavar="N", help="how many other seeds (20)")
+    first = "the first of these seeds (1000)"
+    add("--first-retest-seed", type=FIRST_SEED, default=1000, metavar="N", help=first)
+
+    group = parser.add_argument_group("runs")
+    add_shared(group, "--n-timesteps", "--n-episodes")
+    fixed = "hyperparameters of every trial, which are not searched, e.g. gamma:0.99"
+    add_shared(group, "--hyperparams", help=fixed)
+    add_shared(group, "--engine")
+    add_shared(group, "--conf-file", help="start from another file's entry")
+    add_shared(group, "--env-kwargs", "--gym-packages")
+    add = group.add_argument
+    add("--eval-freq", type=COUNT, metavar="N", help="steps between two evaluations")
+    add("--eval-episodes", type=COUNT, metavar="N", help="episodes of a sampled evaluation (20)")
+    add_shared(group, "--jobs", "--cluster", "--insecure-cluster", "--run-timeout", "--run-memory")
+
+    add = parser.add_argument_group("output").add_argument
+    add(
+        "--storage",
+        type=filled,
+        metavar="WHERE",
+        help="where trials are: journal:FILE, sqlite:///FILE, postgresql://..., grpc://HOST:PORT "
+        "(default: a SQLite file in the search's folder)",
+    )
+    add(
+        *("--name", "--study-name"),
+        dest="name",
+        type=folder_name,
+        help="name of the search and its folder (default: ENV_AGENT)",
+    )
+    add(
+        *("-f", "--log-folder", "--optimization-log-path"),
+        dest="log_folder",
+        type=filled,
+        default="logs/tuning",
+        help="folder of all searches (logs/tuning)",
+    )
+    add(
+        *("--no-report", "--no-optim-plots"),
+        dest="no_report",
+        action="store_true",
+        help="only tables: no figures and no page",
+    )
+    # Who comes from rl_zoo3 types it; what it asks for is what this command is.
+    optimize = ("-optimize", "--optimize-hyperparameters")
+    parser.add_argument(*optimize, action="store_true", help=argparse.SUPPRESS)
+    return parser
+
+
+# --- what is done ---------------------------------------------------------------------------------
+
+
+def main() -> int:
+    """Parse the arguments and do what they ask for; the exit code."""
+    args = build_parser().parse_args()
+    with stops_noticed(), exits_as_mistakes():
+        return _tune(args)
+
+
+def _tune(args: argparse.Namespace) -> int:
+    tuning = tuning_spec(args)
+    from experiments.child_processes import end_server
+    from experiments.run_limits import RunLimits
+    from tuning.trial_storage import failing_in_a_line, without_secret
+
+    go_on_unread()
+    console = table_console()
+    console.print(tuning.study.title, style="bold", highlight=False)
+    root = Path(args.log_folder) / tuning.study.name
+    try:
+        # Every run folder notes the command, which is no place for a password.
+        command = without_secret(command_line())
+        limits = RunLimits(tuning.study.run_timeout, tuning.study.run_memory)
+        context = run_context(args, root, command, limits, console)
+        deadline = math.inf if args.timeout is None else time.monotonic() + args.timeout
+        with doing(console, "loading the libraries"):
+            from tuning.trial_runs import shipped_run
+
+            context.get_ready([shipped_run(tuning, root)])
+            from pipeline.locks import FolderInUseError, told_if_gone
+            from tuning.opening import open_tuning
+
+            with failing_in_a_line(args.storage):
+                opened = open_tuning(tuning, root, args.storage)
+        with told_if_gone(root), failing_in_a_line(args.storage):
+            with opened.queue:
+                print_opened(context, opened)
+                _search(context, opened, deadline)
+            print_search(console, opened)
+            try:
+                return _retest(context, opened)
+            except FolderInUseError as error:
+                say(console, f"another driver does the re-test: {error}")
+                return 0
+    except KeyboardInterrupt:
+        end_server()
+        raise
+
+
+def _search(context: RunContext, opened: OpenTuning, deadline: float) -> None:
+    """Do trials until there are enough, beginning no run behind ``deadline``."""
+    from experiments.run_folders import remove_dead_drafts
+    from tuning.searching import Search
+
+    def ended() -> dict[int, float | None]:
+        trials = [trial for trial in queue.trials() if trial.state.is_finished()]
+        return {t.number: t.value if t.state.name == "COMPLETE" else None for t in trials}
+
+    tuning, queue = opened.tuning, opened.queue
+    if queue.is_done():
+        return
+    progress = TuningProgress(context.console, queue.n_trials, ended, is_cost=tuning.is_cost)
+    with progress, progress.watching(context.launchers)() as launcher:
+        Search(
+            tuning,
+            opened.root,
+            queue,
+            opened.suggestions,
+            launcher,
+            opened.hopeless,
+            progress,
+            deadline,
+        ).run()
+    if queue.is_done():
+        remove_dead_drafts(opened.root)  # of runs that nobody asks for any more
+
+
+def _retest(context: RunContext, opened: OpenTuning) -> int:
+    """Run the best again, and write down what won; the exit code."""
+    from pipeline.locks import folder_lock
+    from tuning.retesting import FOLDER, best_trials, chosen_for_retest
+    from tuning.winner_files import remove_winner, write_winner
+
+    tuning, tell = opened.tuning, partial(say, context.console)
+    ranked = best_trials(opened.queue.trials(), is_cost=tuning.is_cost)
+    candidates = chosen_for_retest(ranked, tuning.retest)
+    if not candidates:
+        if tuning.retest:
+            which = "no settings but the shipped ones" if ranked else "no settings"
+            tell(f"{which} were judged to the end: no re-test")
+        _write_down(context, opened, None)
+        return 0 if ranked or not opened.queue.is_done() else 1
+    again = replace(context, root=opened.root / FOLDER)
+    with folder_lock(again.root, give_way, tell):
+        code, outcome = _retested(again, opened, ranked, candidates)
+        won = None if outcome.winner is None else outcome.winner.number
+        winner = next((c for c in candidates if outcome.winner and c.number == won), None)
+        path = None
+        if winner is None:
+            remove_winner(opened.root)
+        else:
+            n_trials = opened.queue.n_trials
+            path = write_winner(tuning, opened.root, outcome, winner.entry, n_trials)
+        print_outcome(context.console, opened, outcome)
+        _write_down(context, opened, outcome)
+    if winner is not None and path is not None:
+        words = ["--algo", tuning.agent.algo, "--env", tuning.environment.env_id]
+        how = f"{called_as('train')} {shlex.join([*words, '--conf-file', str(path)])}"
+        tell(f"winner: {winner.label}, in {path}: {how}")
+        entry, shipped = winner.entry, opened.suggestions.shipped
+        for key in {**shipped, **entry}:
+            if entry.get(key) != shipped.get(key):
+                was = shipped.get(key, "left out")
+                tell(f"  {key}: {entry.get(key, 'left out')} (was {was})")
+    return code
+
+
+def _retested(
+    context: RunContext, opened: OpenTuning, ranked: list[Candidate], candidates: list[Candidate]
+) -> tuple[int, Outcome]:
+    """The exit code, and what the re-test shows."""
+    from experiments.analysis import analyse
+    from experiments.growing import take_looks
+    from experiments.launching import EarlyResults
+    from experiments.plan import plan
+    from tuning.retesting import concluded, retest_study
+
+    study = retest_study(opened.tuning, opened.root, candidates)
+    planned = plan(study, context.root)
+    context.get_ready(planned)
+    early = EarlyResults(study)
+    failures = do_missing(context, planned, early)
+    results = read(context, study, planned, early)
+    code = conclude(context, results, failures)
+    with doing(context.console, "judging the winner") as activity:
+        analysis = analyse(results, activity.at, take_looks(results))
+        return code, concluded(opened.tuning, ranked, candidates, analysis)
+
+
+def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None) -> None:
+    """Write the record, and the page of it."""
+    from tuning.record import FILE as RECORD
+    from tuning.record import write_record
+    from tuning.retesting import FOLDER
+    from tuning.winner_files import FILE as WINNER
+
+    is_won = outcome is not None and outcome.winner is not None
+    record = write_record(opened, outcome, context.command, WINNER if is_won else None)
+    files = [opened.root / RECORD]
+    if context.with_page:
+        with doing(context.console, "writing the page"):
+            from report.tuning_page import write_tuning_page
+
+            page, retest = opened.root / "report.html", f"{FOLDER}/report.html"
+            write_tuning_page(record, page, retest if (opened.root / retest).exists() else "")
+            files.append(page)
+    say(context.console, f"files: {', '.join(map(str, files))}")
+
+
+# --- from flags to a tuning -----------------------------------------------------------------------
+
+
+def tuning_spec(args: argparse.Namespace) -> TuningSpec:
+    """The tuning that the arguments mean."""
+    from agents import ALGORITHMS
+    from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
+    from pipeline.agent_checks import with_engine
+    from pipeline.environments import check_env_id
+    from pipeline.runs import environment_name
+    from pipeline.settings.values import parse_assignments
+    from pipeline.user_modules import import_typed
+    from tuning.trial_storage import kind_of
+
+    for library in ("optuna", "cmaes"):
+        if importlib.util.find_spec(library) is None:
+            raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
+    modules = import_typed(args.gym_packages, [args.env])
+    if args.algo not in ALGORITHMS:
+        raise unknown("unknown agent", args.algo, ALGORITHMS)
+    check_env_id(args.env)
+    for flag, name in (("--conf-file", args.conf_file), ("--search-space", args.search_space)):
+        if name is not None and not Path(name).is_file():
+            raise UserError(f"{flag}: there is no file {name}")
+    # The agent, with the settings that the command line fixes.
+    settings: dict[str, Any] = parse_assignments(args.hyperparams, "--hyperparams")
+    if args.env_kwargs:
+        named = {"env_kwargs": parse_assignments(args.env_kwargs, "--env-kwargs")}
+        settings = layered(settings, named)
+    if args.n_timesteps is not None and args.n_episodes is not None:
+        raise UserError("how long to train? give -n or --n-episodes, not both")
+    for key in ("n_timesteps", "n_episodes"):
+        if getattr(args, key) is not None:
+            settings[key] = getattr(args, key)
+    conf_file = None if args.conf_file is None else Path(args.conf_file)
+    settings = with_engine(args.algo, settings, args.engine)
+    study = StudySpec(
+        name=args.name
+        or file_name(f"{environment_name(args.env)}_{args.algo}", LONGEST_FOLDER_NAME),
+        title=f"{args.algo} on {args.env}: a search for settings",
+        agents=(AgentSpec(SHIPPED, args.algo, settings, conf_file=conf_file),),
+        environments=(EnvironmentSpec(args.env, args.env),),
+        n_seeds=args.seeds_per_trial,
+        first_seed=args.first_seed,
+        eval_freq=args.eval_freq,
+        eval_episodes=args.eval_episodes or StudySpec.eval_episodes,
+        threshold=args.threshold,
+        gym_packages=tuple(module.name for module in modules),
+        user_modules=modules,
+        run_timeout=args.run_timeout,
+        run_memory=args.run_memory,
+    )
+    tuning = TuningSpec(
+        study=study,
+        n_trials=args.n_trials,
+        figure=args.metric or AUTO,
+        objective=args.objective,
+        sampler=args.sampler,
+        pruner=args.pruner,
+        n_startup_trials=args.n_startup_trials,
+        seed=args.seed,
+        search_space=None if args.search_space is None else Path(args.search_space),
+        retest=args.retest,
+        retest_seeds=args.retest_seeds,
+        first_retest_seed=args.first_retest_seed,
+    )
+    tuning.check()
+    if args.storage is not None:
+        kind_of(args.storage)
+    return tuning
+
+
+# --- what is printed ------------------------------------------------------------------------------
+
+
+def print_opened(context: RunContext, opened: OpenTuning) -> None:
+    """Say what there is to do, and on which engines."""
+    from pipeline.train_spec import NETWORKS
+    from tuning.trial_runs import planned_run, shipped_run
+
+    tell = partial(say, context.console)
+    tuning, suggestions = opened.tuning, opened.suggestions
+    n_there = sum(trial.state.is_finished() for trial in opened.queue.trials())
+    tell(
+        f"{opened.queue.n_trials} trials of up to {len(tuning.seeds)} seeds, {n_there} of them "
+        f"there already; {suggestions.n_free} settings to choose; {context.words}, in {opened.root}"
+    )
+    for name in suggestions.space.widened:
+        tell(f"{name}: the search space is widened to hold the shipped value")
+    if tuning.agent.algo not in NETWORKS:
+        return
+    from pipeline.engine_outlook import planned_outlook
+
+    searched = planned_run(tuning, opened.root, suggestions.shipped, tuning.seeds[0])
+    runs = (searched, shipped_run(tuning, opened.root))
+    line = search_line(tuning.agent.algo, *(planned_outlook(run.spec) for run in runs))
+    if line:
+        tell(f"engine: {line}")
+
+
+_STATES = {"COMPLETE": "judged to the end", "PRUNED": "ended early", "FAIL": "failed"}
+
+
+def print_search(console: Console, opened: OpenTuning) -> None:
+    """Say what the search has cost, and what it has found."""
+    from tuning.trial_queue import FAILURE, figures_of, seconds_of
+
+    trials, tuning = opened.queue.trials(), opened.tuning
+    states = Counter(
+        "failed" if FAILURE in trial.user_attrs else _STATES.get(trial.state.name, "to do")
+        for trial in trials
+    )
+    n_runs = sum(len(figures_of(trial.user_attrs)) for trial in trials)
+    seconds = sum(seconds_of(trial.user_attrs) for trial in trials)
+    counts = ", ".join(f"{count} {state}" for state, count in states.items())
+    say(
+        console,
+        f"{len(trials)} trials: {counts}; {n_runs} of {len(trials) * len(tuning.seeds)} runs, "
+        f"{duration(seconds)} of processor time",
+    )
+
+
+def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> None:
+    """Print what the re-test shows: a table, and what follows from it."""
+    from rich.table import Table
+
+    held_out = opened.tuning.held_out
+    console.print()
+    title = f"re-test on the seeds {held_out.start} to {held_out.stop - 1}"
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
+    headings = "settings, in the search, on other seeds, 95 % interval, is, runs, failed"
+    for heading in headings.split(", "):
+        table.add_column(heading)
+    for each in outcome.retested:
+        interval = each.interval
+        table.add_row(
+            each.label,
+            "" if each.in_search is None else f"{each.in_search:.4g}",
+            "" if each.held_out is None else f"{each.held_out:.4g}",
+            "" if math.isnan(interval.low) else f"{interval.low:.4g} to {interval.high:.4g}",
+            each.verdict,
+            str(each.n_runs),
+            "" if each.n_failed is None else str(each.n_failed),
+        )
+    console.print(table, highlight=False)
+    if outcome.optimism is not None:
+        optimism = "optimism of the search, its best there less the same on other seeds"
+        say(console, f"{optimism}: {round(outcome.optimism, 9):+.4g}")
+    if outcome.winner is None:
+        say(console, f"no winner: {outcome.reason}; they stay as they are")
+
+
+# --- what a person watching sees: a line that moves, or one now and then --------------------------
+
+# To read all trials takes time, where there are many.
+SECONDS_BETWEEN_QUESTIONS = 5.0
+
+
+class TuningProgress(LiveProgress):
+    """How far a search is, and the best that was found."""
+
+    def __init__(
+        self,
+        console: Console,
+        n_trials: int,
+        ended: Callable[[], dict[int, float | None]],
+        *,
+        is_cost: bool,
+    ) -> None:
+        super().__init__(console)
+        self.n_trials, self.is_cost = n_trials, is_cost
+        # What trials were judged that have ended, by number; None for those ended early.
+        self._ended, self._asked_at = ended, time.monotonic()
+        self.values = ended()
+        self.n_before = len(self.values)
+        self.n_runs = 0
+
+    def run_ended(self) -> None:
+        """Count a run that has ended."""
+        self.n_runs += 1
+        if time.monotonic() > self._asked_at + SECONDS_BETWEEN_QUESTIONS:
+            self.values, self._asked_at = self._ended(), time.monotonic()
+        self.look()
+
+    def trial_ended(self, number: int, value: float | None, reason: str) -> None:
+        """Count a trial that has ended; one that is the best so far gets a line that stays."""
+        best = self.best()
+        self.values[number] = value
+        if reason:
+            self.say(f"trial {number} failed: {reason}")
+        elif value is not None and (best is None or self._is_better(value, best[1])):
+            self.say(f"trial {number}: {value:.4g}, the best so far")
+
+    def _is_better(self, value: float, other: float) -> bool:
+        return value < other if self.is_cost else value > other
+
+    def best(self) -> tuple[int, float] | None:
+        """The best trial and what it was judged; None before there is any."""
+        judged = [(number, value) for number, value in self.values.items() if value is not None]
+        sign = 1 if self.is_cost else -1
+        return min(judged, key=lambda each: (sign * each[1], each[0]), default=None)
+
+    def figures(self) -> str:
+        """How many trials have ended, the best of them, and how long the others may take."""
+        seconds = time.monotonic() - self.started
+        ended, new = len(self.values), len(self.values) - self.n_before
+        runs = "1 run" if self.n_runs == 1 else f"{self.n_runs} runs"
+        text = f"{ended} of {self.n_trials} trials, {runs} in {duration(seconds)}"
+        text += self.place_words
+        best = self.best()
+        if best is not None:
+            text += f"; best {best[1]:.4g} (trial {best[0]})"
+        if new > 0 and ended < self.n_trials:
+            text += f"; about {duration(seconds / new * (self.n_trials - ended))} left by the clock"
+        return text
