@@ -12,7 +12,7 @@ from typing import TypeVar
 from experiments import run_limits
 from pipeline.errors import shown
 from pipeline.files import portable_name
-from pipeline.resuming.state_keeping import SaveInterval
+from pipeline.unfinished_runs import SaveInterval
 
 LARGEST = 10**12
 Amount = TypeVar("Amount", int, float)

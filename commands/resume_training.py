@@ -13,8 +13,11 @@ from commands.parsing import command_line, exit_code
 from commands.streams import go_on_unread
 from commands.train_flags import build_parser
 from pipeline.errors import UserError
-from pipeline.resuming.state_folder import remove_states
-from pipeline.resuming.unfinished_runs import (
+from pipeline.run_files import remove_states
+from pipeline.run_folder import Run
+from pipeline.stopping import StopRequest, current
+from pipeline.train_spec import TrainSpec
+from pipeline.unfinished_runs import (
     go_on,
     is_finished,
     newest_unfinished,
@@ -22,9 +25,6 @@ from pipeline.resuming.unfinished_runs import (
     run_of_spec,
     tell_changes,
 )
-from pipeline.run_folder import Run
-from pipeline.stopping import StopRequest, current
-from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -137,8 +137,8 @@ def _prepared(args: argparse.Namespace, run: Run, spec: TrainSpec, console: Cons
     """The run, to be carried out from its newest state on."""
     from commands.run_output import print_line
     from pipeline.library_loading import loading_libraries
-    from pipeline.resuming.state_keeping import StateKeeping
     from pipeline.signs_of_life import doing
+    from pipeline.unfinished_runs import StateKeeping
 
     say = partial(print_line, console)
     with doing(console, "loading the libraries") as activity, loading_libraries():

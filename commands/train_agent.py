@@ -73,10 +73,10 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     with stop.held():
         with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
-                from pipeline.resuming.state_keeping import StateKeeping
                 from pipeline.run_folder import INTERRUPTED
                 from pipeline.run_lock import at_work_on
                 from pipeline.training import carry_out, prepare
+                from pipeline.unfinished_runs import StateKeeping
 
             activity.now("making the environments and the agent")
             keeping = StateKeeping(args.save_state_every, stays=args.keep_state)

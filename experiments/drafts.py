@@ -21,7 +21,7 @@ from pipeline import liveness
 from pipeline.file_digests import STATE_FOLDER
 from pipeline.files import portable_name
 from pipeline.folder_clock import seconds_silent
-from pipeline.resuming.state_folder import has_state
+from pipeline.run_files import has_state
 
 FOLDER = ".drafts"
 LONGEST_DRAFT_NAME = 150  # bytes, besides the numbers and names of process and machine

@@ -11,11 +11,10 @@ from experiments.drafts import claim_draft, holds_state
 from experiments.planned_runs import PlannedRun
 from pipeline.broken_runs import is_of_the_machine
 from pipeline.errors import UserError
-from pipeline.resuming.state_folder import remove_states
-from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.resuming.unfinished_runs import go_on
+from pipeline.run_files import remove_states
 from pipeline.run_folder import Run
 from pipeline.training import train
+from pipeline.unfinished_runs import StateKeeping, go_on
 
 
 def do_or_go_on(planned: PlannedRun, draft: Path, command: str) -> None:

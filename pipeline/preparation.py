@@ -43,9 +43,6 @@ from pipeline.models.normalization import take_over
 from pipeline.number_watch import NumberWatch
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
-from pipeline.resuming.resumed_logging import resumed_logger
-from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.resuming.state_saver import StateSaver
 from pipeline.run_files import environment_name
 from pipeline.run_folder import Run
 from pipeline.settings.action_noise import action_noise, check_action_noise
@@ -56,6 +53,7 @@ from pipeline.settings.algorithm_kwargs import (
 )
 from pipeline.settings.constructor_arguments import algorithm_parameters
 from pipeline.signs_of_life import can_move
+from pipeline.state_saver import StateSaver, resumed_logger
 from pipeline.train_spec import TrainSpec
 from pipeline.training_callbacks import (
     all_callbacks,
@@ -63,6 +61,7 @@ from pipeline.training_callbacks import (
     named_callbacks,
     pull_recorder,
 )
+from pipeline.unfinished_runs import StateKeeping
 from pipeline.watching.map_recorder import EvaluationMaps
 from pipeline.watching.watch_choice import Watch, watch_of
 from pipeline.worker_processes import close_environments, end_workers_after_stop

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,3 +95,27 @@ class RunFiles:
     def value_map_path(self) -> Path:
         """The picture of the policy at the end of training, on grid worlds."""
         return self.path / "value_map.png"
+
+
+# States in a folder: the newest two, so that one is whole.
+GENERATIONS = 2
+
+
+def state_file(folder: Path, number: int) -> Path:
+    """Where the state of that number lies, in place of the one before the last."""
+    return folder / f"{'odd' if number % GENERATIONS else 'even'}.state"
+
+
+def state_files(folder: Path) -> list[Path]:
+    """Where states may lie."""
+    return [state_file(folder, number) for number in range(GENERATIONS)]
+
+
+def has_state(folder: Path) -> bool:
+    """Whether there is a file that may be a state."""
+    return any(path.is_file() for path in state_files(folder))
+
+
+def remove_states(folder: Path) -> None:
+    """Remove all states."""
+    shutil.rmtree(folder, ignore_errors=True)

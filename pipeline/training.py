@@ -26,9 +26,7 @@ from pipeline.library_errors import blame_settings, blame_weights
 from pipeline.library_loading import load_for_optimizer
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
 from pipeline.pull_recording import PullSummary
-from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
-from pipeline.resuming.state_folder import remove_states
-from pipeline.resuming.state_keeping import StateKeeping
+from pipeline.run_files import remove_states
 from pipeline.run_folder import FINISHED, INTERRUPTED, RUNNING, Run
 from pipeline.run_record import (
     TRAINED_AGENT,
@@ -38,8 +36,10 @@ from pipeline.run_record import (
     write_settings,
 )
 from pipeline.signs_of_life import Activity, doing
+from pipeline.state_saver import IterationInterval, iterations_before
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
+from pipeline.unfinished_runs import StateKeeping
 from pipeline.worker_processes import deaths_told
 
 # A budget in episodes has no number of steps; this one is never reached.

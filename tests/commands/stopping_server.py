@@ -43,8 +43,8 @@ def moments():
     from agents.compiled import engine
     from commands import run_output
     from pipeline import broken_runs, evaluation_callback, files, finishing, preparation
-    from pipeline.resuming.state_saver import StateSaver
     from pipeline.run_folder import Run
+    from pipeline.state_saver import StateSaver
 
     calls = iter(range(10**9))
     return {
