@@ -44,6 +44,11 @@ SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
 EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
 LAGGING = {"n_steps": 3, "train_freq": 4, "target_update_interval": 30, "tau": 0.7}
 
+SPARING = {
+    "optimize_memory_usage": True,
+    "replay_buffer_kwargs": {"handle_timeout_termination": False},
+}
+
 # Every agent, and the settings whose state is kept in a place of its own.
 TRAININGS = [
     (GRID, "qlearning", 600, {"engine": "compiled"}),
@@ -76,6 +81,7 @@ TRAININGS = [
     (GRID, "random", 300, {}),
     (LEFT_RIGHT, "angle", 300, {}),
     (LEFT_RIGHT, "dqn", 300, {**EAGER, "n_steps": 3, "exploration_fraction": 0.5}),
+    (LEFT_RIGHT, "dqn", 300, {**EAGER, **SPARING}),
     ("Warehouse-v0", "double_dqn", 300, {**EAGER, "mask_actions": True}),
     ("Warehouse-v0", "deep_qlearning", 200, {}),
     # Long enough for `auto` to compile it, as a whole and for what is left.

@@ -29,6 +29,9 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from stable_baselines3 import DQN, HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.utils import set_random_seed
 
 from pipeline.state_files import read_state, write_state
 from pipeline.states import NotFittingError, NotKeepableError, pickled, unpickled
@@ -558,3 +561,50 @@ def test_chains_that_are_too_long_are_refused():
         chain = [chain]
     with pytest.raises(NotKeepableError, match="too deep"):
         pickled({"it": chain})
+
+
+# --- replay buffers ---
+
+
+def goal_learner():
+    env = BitFlippingEnv(n_bits=4, max_steps=4)
+    return DQN(
+        "MultiInputPolicy",
+        env,
+        learning_starts=20,
+        buffer_size=100,
+        seed=1,
+        device="cpu",
+        replay_buffer_class=HerReplayBuffer,
+        policy_kwargs={"net_arch": [8]},
+    )
+
+
+def sparing_learner():
+    sparing = {"handle_timeout_termination": False}
+    return DQN(
+        "MlpPolicy",
+        "CartPole-v1",
+        learning_starts=20,
+        buffer_size=100,
+        optimize_memory_usage=True,
+        seed=1,
+        device="cpu",
+        replay_buffer_kwargs=sparing,
+        policy_kwargs={"net_arch": [8]},
+    )
+
+
+@pytest.mark.parametrize("make", [goal_learner, sparing_learner])
+@pytest.mark.parametrize("n_steps", [30, 150], ids=["partly full", "round once"])
+def test_replay_buffers_of_goals_and_those_that_spare_memory(tmp_path, make, n_steps):
+    original, built = make().learn(n_steps), make()
+    found = gone_through(original, built, tmp_path)
+    assert found is built
+    assert found.env is found.replay_buffer.env if make is goal_learner else True
+    weights = []
+    for model in (original, found):
+        set_random_seed(2)
+        model.learn(100, reset_num_timesteps=False)
+        weights.append([p.tolist() for p in model.policy.parameters()])
+    assert weights[0] == weights[1]
