@@ -45,6 +45,7 @@ EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 
 LAGGING = {"n_steps": 3, "train_freq": 4, "target_update_interval": 30, "tau": 0.7}
 
 SPARING = {
+    "n_steps": 1,
     "optimize_memory_usage": True,
     "replay_buffer_kwargs": {"handle_timeout_termination": False},
 }
