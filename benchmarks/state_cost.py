@@ -18,10 +18,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from pipeline import state_saver
 from pipeline.auto_settings import resolved_spec
-from pipeline.resuming import state_saver
-from pipeline.resuming.state_saver import StateSaver
 from pipeline.settings.hyperparams import override, read_hyperparams
+from pipeline.state_saver import StateSaver
 from pipeline.training import train
 
 CASES: tuple[tuple[str, str, int, dict[str, Any]], ...] = (

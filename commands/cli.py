@@ -28,8 +28,8 @@ from experiments import run_limits
 from pipeline.errors import OTHER_NAMES, UserError, did_you_mean, one_line, shown, visible
 from pipeline.failures import OwnExit, exhaustion
 from pipeline.files import portable_name
-from pipeline.resuming.state_keeping import SaveInterval
 from pipeline.stopping import default_for_signals, n_stops
+from pipeline.unfinished_runs import SaveInterval
 from safe_files.refusals import UnsafeFileError
 
 MISTAKE = 2  # exit code

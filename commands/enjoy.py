@@ -203,9 +203,9 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest) -> None:
     with doing(console, "loading the libraries"), loading_libraries():
         # All that plays, so that nothing is loaded in the middle of it.
         import pipeline.action_figures
+        import pipeline.evaluation.exact
         import pipeline.evaluation.policies
         import pipeline.evaluation.sampled
-        import pipeline.evaluation.exact
         import pipeline.models.load  # noqa: F401
 
         chosen = with_statistics(found, wanted.statistics)

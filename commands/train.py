@@ -177,7 +177,7 @@ def main() -> int:
             return _go_on(args, run, spec, stop)
         spec = train_spec(args)
         if args.resume_or_start:
-            from pipeline.resuming.unfinished_runs import recorded_training, run_of_spec
+            from pipeline.unfinished_runs import recorded_training, run_of_spec
 
             there = run_of_spec(spec, any_seed=args.seed < 0)
             if there is not None:
@@ -197,9 +197,9 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     with stop.held():
         with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
-                from pipeline.resuming.state_keeping import StateKeeping
                 from pipeline.runs import at_work_on
                 from pipeline.training import prepare
+                from pipeline.unfinished_runs import StateKeeping
 
             activity.now("making the environments and the agent")
             keeping = StateKeeping(args.save_state_every, stays=args.keep_state)
@@ -236,7 +236,7 @@ def _resumed(args: argparse.Namespace) -> tuple[Run, TrainSpec]:
             flag = action.option_strings[-1]
             raise UserError(f"{flag} cannot be given with --resume: the run has its own")
     from pipeline.models.find import run_in
-    from pipeline.resuming.unfinished_runs import newest_unfinished, recorded_training
+    from pipeline.unfinished_runs import newest_unfinished, recorded_training
     from pipeline.user_modules import import_typed
 
     path = Path(args.resume)
@@ -252,10 +252,9 @@ def _resumed(args: argparse.Namespace) -> tuple[Run, TrainSpec]:
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
     """Carry out the rest of a run, from its newest state on; the exit code."""
     from commands.terminal import TextConsole, say
-    from pipeline.resuming.state_folder import remove_states
-    from pipeline.resuming.unfinished_runs import go_on, is_finished, tell_changes
-    from pipeline.runs import at_work_on, check_left
+    from pipeline.runs import at_work_on, check_left, remove_states
     from pipeline.signs_of_life import doing
+    from pipeline.unfinished_runs import go_on, is_finished, tell_changes
 
     spec = replace(spec, verbose=args.verbose, progress=args.progress)
     go_on_unread()
@@ -274,8 +273,8 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
             return 0
         with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
-                from pipeline.resuming.state_keeping import StateKeeping
                 from pipeline.training import prepare
+                from pipeline.unfinished_runs import StateKeeping
 
                 activity.now("making the environments and the agent")
                 tell_changes(run, spec, tell)

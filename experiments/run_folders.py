@@ -25,7 +25,7 @@ from pipeline.digests import STATE_FOLDER, DamagedFileError
 from pipeline.errors import UserError, shown
 from pipeline.files import portable_name, put_in_place, settle, sync_together
 from pipeline.locks import seconds_silent
-from pipeline.resuming.state_folder import has_state
+from pipeline.runs import has_state
 from pipeline.signs_of_life import Tell, tell_nobody
 
 if TYPE_CHECKING:

@@ -17,12 +17,10 @@ from experiments.run_folders import (
 from pipeline.errors import UserError
 from pipeline.failures import is_of_the_machine
 from pipeline.locks import SECONDS_BETWEEN_SIGNS, give_sign
-from pipeline.resuming.state_folder import remove_states
-from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.resuming.unfinished_runs import go_on
-from pipeline.runs import Run
+from pipeline.runs import Run, remove_states
 from pipeline.signs_of_life import Heartbeat
 from pipeline.training import train
+from pipeline.unfinished_runs import StateKeeping, go_on
 from pipeline.user_modules import import_again
 
 

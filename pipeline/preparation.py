@@ -39,9 +39,6 @@ from pipeline.models.load import ModelFile, agent_class, take_over, telling_mask
 from pipeline.number_watch import NumberWatch
 from pipeline.progress import ProgressDisplay
 from pipeline.pull_recording import PullRecorder, are_bandits
-from pipeline.resuming.resumed_logging import resumed_logger
-from pipeline.resuming.state_keeping import StateKeeping
-from pipeline.resuming.state_saver import StateSaver
 from pipeline.runs import Run, environment_name
 from pipeline.settings.components import (
     action_noise,
@@ -52,6 +49,7 @@ from pipeline.settings.components import (
 )
 from pipeline.settings.values import algorithm_parameters
 from pipeline.signs_of_life import can_move
+from pipeline.state_saver import StateSaver, resumed_logger
 from pipeline.train_spec import TrainSpec
 from pipeline.training_callbacks import (
     all_callbacks,
@@ -59,6 +57,7 @@ from pipeline.training_callbacks import (
     named_callbacks,
     pull_recorder,
 )
+from pipeline.unfinished_runs import StateKeeping
 from pipeline.watching.map_recorder import EvaluationMaps
 from pipeline.watching.watch_choice import Watch, watch_of
 from pipeline.worker_processes import close_environments, end_workers_after_stop

@@ -8,20 +8,24 @@ gone have left among the runs is cleared away before the next is begun.
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import os
 import platform
 import re
 import secrets
 import shutil
-from collections.abc import Mapping, Sequence
+import signal
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.digests import (
     FIELD,
+    LOCK,
     RECORD,
     STATE_FOLDER,
     VERSION,
@@ -42,24 +46,37 @@ from pipeline.files import (
     write_json,
     write_text,
 )
-from pipeline.locks import is_alive, mark
-from pipeline.module_records import keep_copies
-from safe_files.regular_files import hold
+from pipeline.locks import folder_lock, is_alive, mark
+from pipeline.module_records import COPIES, keep_copies
+from safe_files.regular_files import hold, take_up
 
 if TYPE_CHECKING:
     from pipeline.train_spec import TrainSpec
-import _thread
-import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
-
-from pipeline.digests import LOCK
-from pipeline.locks import folder_lock
-from pipeline.module_records import COPIES
-from safe_files.regular_files import take_up
 
 PULLS_FILE = "pulls.npz"
+
+# States in a folder: the newest two, so that one is whole.
+GENERATIONS = 2
+
+
+def state_file(folder: Path, number: int) -> Path:
+    """Where the state of that number lies, in place of the one before the last."""
+    return folder / f"{'odd' if number % GENERATIONS else 'even'}.state"
+
+
+def state_files(folder: Path) -> list[Path]:
+    """Where states may lie."""
+    return [state_file(folder, number) for number in range(GENERATIONS)]
+
+
+def has_state(folder: Path) -> bool:
+    """Whether there is a file that may be a state."""
+    return any(path.is_file() for path in state_files(folder))
+
+
+def remove_states(folder: Path) -> None:
+    """Remove all states."""
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def environment_name(env_id: str) -> str:

@@ -7,7 +7,7 @@ from functools import cache
 from mdp.source_files import content_lines, digest_of, source_paths
 
 # What the objects of a training, and what is recorded of them, are made by.
-OF_TRAINING = ("safe_files", "snapshots", "mdp", "envs", "agents", "pipeline")
+OF_TRAINING = ("safe_files", "mdp", "envs", "agents", "pipeline")
 
 
 @cache

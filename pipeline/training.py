@@ -30,9 +30,6 @@ from pipeline.finishing import draw, judge, save
 from pipeline.library_loading import load_for_optimizer
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
 from pipeline.pull_recording import PullSummary
-from pipeline.resuming.resumed_logging import IterationInterval, iterations_before
-from pipeline.resuming.state_folder import remove_states
-from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.runs import (
     FINISHED,
     INTERRUPTED,
@@ -42,12 +39,15 @@ from pipeline.runs import (
     recorded_machine,
     recorded_versions,
     remove_leftovers,
+    remove_states,
     write_arguments,
     write_settings,
 )
 from pipeline.signs_of_life import Activity, doing
+from pipeline.state_saver import IterationInterval, iterations_before
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
+from pipeline.unfinished_runs import StateKeeping
 from pipeline.worker_processes import deaths_told
 
 # A budget in episodes has no number of steps; this one is never reached.

@@ -27,7 +27,7 @@ from pipeline.errors import UserError, one_line, shown
 # Where this project is installed, libraries lie beside it.
 _PROJECT = Path(__file__).resolve().parents[1]
 _OWN = (
-    "safe_files snapshots mdp verdicts envs agents pipeline experiments tuning report commands "
+    "safe_files mdp verdicts envs agents pipeline experiments tuning report commands "
     "textbook train enjoy compare tune"
 )
 

@@ -18,7 +18,6 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = (
     "safe_files",
-    "snapshots",
     "mdp",
     "verdicts",
     "envs",

@@ -13,7 +13,6 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = [
     "safe_files",
-    "snapshots",
     "mdp",
     "verdicts",
     "envs",

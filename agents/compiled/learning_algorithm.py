@@ -66,7 +66,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
     _read_settings: ClassVar[Any]
 
     _rebuilt = (*OnlineAlgorithm._rebuilt, "exploration_schedule", "_workspaces")
-    not_in_snapshots: ClassVar[tuple[str, ...]] = ("_workspaces",)
+    excluded_from_states: ClassVar[tuple[str, ...]] = ("_workspaces",)
 
     def __init__(
         self,

@@ -106,7 +106,7 @@ class CompiledNetworks(BaseAlgorithm):
     rng: np.random.Generator
 
     # Of the training under way.
-    not_in_snapshots = ("_training", "_sharing")
+    excluded_from_states = ("_training", "_sharing")
     _own: ClassVar[tuple[str, ...]] = ("engine", "engine_in_use", "rng", "_training", "_sharing")
 
     def __init__(self, *args: Any, engine: NetworkEngineChoice = "library", **kwargs: Any) -> None:

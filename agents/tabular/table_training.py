@@ -41,7 +41,7 @@ class TableTraining(EpisodeKeeper):
     commit = no_commitment
 
     _rebuilt = (*EpisodeKeeper._rebuilt, "_in_use", "last_steps")
-    not_in_snapshots = ("_in_use", "last_steps")
+    excluded_from_states = ("_in_use", "last_steps")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.engine_in_use = ""

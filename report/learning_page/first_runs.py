@@ -18,10 +18,10 @@ from experiments.plan import PlannedRun
 from experiments.run_files import difference
 from experiments.run_limits import RunLimits
 from pipeline.errors import UserError
-from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.signs_of_life import Tell, tell_nobody
 from pipeline.train_spec import is_plain
 from pipeline.training import carry_out, prepare
+from pipeline.unfinished_runs import SaveInterval, StateKeeping
 from pipeline.user_modules import import_again
 from report.learning_page.kept_pages import kept_page, note_page, page_path, without_page
 from report.learning_page.learning_assembly import write_learning_page

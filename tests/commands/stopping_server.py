@@ -49,8 +49,8 @@ def moments():
         preparation,
         worker_processes,
     )
-    from pipeline.resuming.state_saver import StateSaver
     from pipeline.runs import Run
+    from pipeline.state_saver import StateSaver
 
     calls = iter(range(10**9))
     return {

@@ -18,9 +18,9 @@ from commands import share
 from commands.cli import run_command
 from pipeline.digests import FIELD, RECORD, digests_of, sealed
 from pipeline.files import replacing
-from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
+from pipeline.unfinished_runs import SaveInterval, StateKeeping
 from safe_files.refusals import UnsafeFileError
 from safe_files.regular_files import hold, read_file
 

@@ -32,9 +32,9 @@ from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
-from pipeline.resuming.saved_states import SavedState
-from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.source_digest import source_digest
+from pipeline.state_files import SavedState
+from pipeline.unfinished_runs import StateKeeping
 
 LAKE = EnvironmentSpec("dry lake", "FrozenLake-v1", {"n_timesteps": 20})
 

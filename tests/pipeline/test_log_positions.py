@@ -3,7 +3,7 @@
 import pytest
 
 from pipeline.errors import UserError
-from pipeline.resuming.log_positions import cut_back, log_positions
+from pipeline.unfinished_runs import cut_back, log_positions
 
 ROWS = b"r,l,t\n1.0,5,0.1\n2.0,6,0.2\n"
 

@@ -1,21 +1,18 @@
-"""What Monitor remembers of all episodes is in no state, and is there again after a resume."""
+"""What Monitor remembers of all episodes is there again after a resume."""
 
-import json
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from rich.console import Console
 
 from pipeline.auto_settings import resolved_spec
-from pipeline.resuming.monitor_rows import LENGTHS, RETURNS, TIMES
-from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
-from pipeline.resuming.state_saver import StateSaver
-from pipeline.resuming.unfinished_runs import go_on, recorded_training
-from pipeline.settings.hyperparams import override, read_hyperparams, split
+from pipeline.settings.hyperparams import override, read_hyperparams
+from pipeline.state_saver import StateSaver
 from pipeline.training import carry_out, prepare
+from pipeline.unfinished_runs import SaveInterval, StateKeeping, go_on, recorded_training
 
 LAKE = "FrozenLake-v1"
+RETURNS, LENGTHS, TIMES = "episode_returns", "episode_lengths", "episode_times"
 OFF = StateKeeping(SaveInterval(is_off=True))
 # Ten rewards of 0.1 are not 1.
 FINE = {"env_kwargs": {"reward_schedule": (1.7, -0.3, 0.1)}}
@@ -45,7 +42,7 @@ def remembered(training):
 
 
 def cut_off(spec, monkeypatch):
-    """A run that was killed after its second state; and what that state left to the files."""
+    """A run that was killed after its second state."""
     training = training_of(spec, StateKeeping(SaveInterval(steps=1000)))
 
     def on_step(saver):
@@ -66,7 +63,7 @@ def gone_on(run):
     keeping = go_on(run, OFF, pytest.fail)
     training = training_of(spec, keeping, run)
     carry_out(training)
-    return training, keeping.state.note["episodes"]
+    return training
 
 
 @pytest.mark.parametrize("settings", [{}, FINE], ids=["whole returns", "others"])
@@ -77,14 +74,12 @@ def test_monitor_remembers_what_it_would_have(tmp_path, monkeypatch, settings, e
     whole = training_of(spec_of(tmp_path / "whole", settings), OFF)
     carry_out(whole)
     run = cut_off(spec_of(tmp_path / "parts", settings), monkeypatch)
-    again, left_to_files = gone_on(run)
+    again = gone_on(run)
     assert remembered(again) == remembered(whole)
     assert type(again.model.get_env().get_attr(LENGTHS)[0][0]) is int
-    names = [LENGTHS, TIMES] if "env_kwargs" in settings else [RETURNS, LENGTHS, TIMES]
-    assert left_to_files == {f"{i}.monitor.csv": names for i in range(n_envs)}
 
 
-def test_what_a_file_does_not_say_all_of_is_in_the_state(tmp_path, monkeypatch):
+def test_so_is_what_its_file_does_not_say(tmp_path, monkeypatch):
     spec = spec_of(tmp_path, {"engine": "interpreted"})
     start = StateSaver._on_training_start
 
@@ -93,26 +88,5 @@ def test_what_a_file_does_not_say_all_of_is_in_the_state(tmp_path, monkeypatch):
         saver.training_env.get_attr(RETURNS)[0].append(-7.5)
 
     monkeypatch.setattr(StateSaver, "_on_training_start", forgetful)
-    again, left_to_files = gone_on(cut_off(spec, monkeypatch))
-    assert left_to_files == {}
+    again = gone_on(cut_off(spec, monkeypatch))
     assert remembered(again)[0][0][0] == -7.5
-
-
-def test_states_do_not_grow_with_the_number_of_episodes(tmp_path, monkeypatch):
-    sizes = []
-    save = StateSaver.save
-
-    def weighed(saver):
-        save(saver)
-        files = saver.run.state_path.glob("*.state")
-        sizes.append(max(files, key=lambda path: path.stat().st_mtime_ns).stat().st_size)
-
-    monkeypatch.setattr(StateSaver, "save", weighed)
-    spec = spec_of(tmp_path, {"engine": "compiled"})
-    raw = {**spec.saved_hyperparams, "n_timesteps": 200_000}
-    spec = replace(spec, hyperparams=split(raw), saved_hyperparams=raw)
-    training = training_of(spec, StateKeeping(SaveInterval(steps=20_000)))
-    carry_out(training)
-    n_episodes = len(training.model.get_env().get_attr(RETURNS)[0])
-    assert n_episodes > 5000
-    assert np.ptp(sizes) < 1000, json.dumps(sizes)

@@ -3,7 +3,6 @@
 import gc
 import io
 import json
-import os
 import sys
 import zipfile
 from dataclasses import replace
@@ -14,32 +13,40 @@ import torch as th
 from rich.console import Console
 
 from agents import ALGORITHMS
+from pipeline import state_files
 from pipeline.auto_settings import resolved_spec
 from pipeline.digests import LOCK
 from pipeline.errors import UserError
 from pipeline.evaluation import sampled
-from pipeline.resuming import saved_states
-from pipeline.resuming.log_positions import cut_back, log_positions
-from pipeline.resuming.saved_states import SavedState
-from pipeline.resuming.state_keeping import SaveInterval, StateKeeping
-from pipeline.resuming.state_saver import StateSaver
-from pipeline.resuming.unfinished_runs import (
+from pipeline.runs import Run, at_work_on
+from pipeline.settings.hyperparams import override, read_hyperparams, split
+from pipeline.state_files import SavedState
+from pipeline.state_saver import StateSaver
+from pipeline.states import Pickled
+from pipeline.training import carry_out, prepare, train
+from pipeline.unfinished_runs import (
+    SaveInterval,
+    StateKeeping,
+    cut_back,
     go_on,
+    log_positions,
     newest_unfinished,
     recorded_training,
     tell_changes,
 )
-from pipeline.runs import Run, at_work_on
-from pipeline.settings.hyperparams import override, read_hyperparams, split
-from pipeline.training import carry_out, prepare, train
 from pipeline.user_modules import import_typed
-from snapshots.recording import Snapshot
 
 GRID, LEFT_RIGHT, SWING = "FrozenLake-v1", "CartPole-v1", "Pendulum-v1"
 ARMS, LINEAR = "BernoulliBandit-v0", "LinearBandit-v0"
 SMALL = {"n_steps": 64, "batch_size": 32, "n_envs": 2, "n_epochs": 2}
 EAGER = {"learning_starts": 50, "buffer_size": 500, "batch_size": 16, "n_envs": 1}
 LAGGING = {"n_steps": 3, "train_freq": 4, "target_update_interval": 30, "tau": 0.7}
+
+SPARING = {
+    "n_steps": 1,
+    "optimize_memory_usage": True,
+    "replay_buffer_kwargs": {"handle_timeout_termination": False},
+}
 
 # Every agent, and the settings whose state is kept in a place of its own.
 TRAININGS = [
@@ -73,6 +80,7 @@ TRAININGS = [
     (GRID, "random", 300, {}),
     (LEFT_RIGHT, "angle", 300, {}),
     (LEFT_RIGHT, "dqn", 300, {**EAGER, "n_steps": 3, "exploration_fraction": 0.5}),
+    (LEFT_RIGHT, "dqn", 300, {**EAGER, **SPARING}),
     ("Warehouse-v0", "double_dqn", 300, {**EAGER, "mask_actions": True}),
     ("Warehouse-v0", "deep_qlearning", 200, {}),
     # Long enough for `auto` to compile it, as a whole and for what is left.
@@ -270,7 +278,7 @@ def test_a_state_makes_the_difference(tmp_path, monkeypatch):
     spec = spec_of(tmp_path / "whole", LEFT_RIGHT, "dqn", 300, EAGER)
     whole = undisturbed(spec)
     run = cut_off(replace(spec, log_folder=tmp_path / "parts"), monkeypatch)
-    monkeypatch.setattr("pipeline.resuming.state_saver.set_generators", lambda _: None)
+    monkeypatch.setattr("pipeline.state_saver.set_generators", lambda _: None)
     gone_on(run)
     assert content(whole.run.model_path) != content(run.model_path)
 
@@ -359,7 +367,7 @@ def test_a_state_of_other_sources_is_told_of_and_no_bug_of_theirs_is_a_traceback
     tmp_path, monkeypatch
 ):
     with monkeypatch.context() as context:
-        context.setattr("pipeline.resuming.saved_states.source_digest", lambda: "older")
+        context.setattr("pipeline.state_files.source_digest", lambda: "older")
         run = cut_off(spec_of(tmp_path, GRID, "qlearning", 600, {}), monkeypatch)
     told = []
     keeping = go_on(run, StateKeeping(), told.append)
@@ -369,7 +377,7 @@ def test_a_state_of_other_sources_is_told_of_and_no_bug_of_theirs_is_a_traceback
     def restore(*_):
         raise AttributeError("'Evaluation' object has no attribute 'new'")
 
-    monkeypatch.setattr("pipeline.resuming.state_saver.restore", restore)
+    monkeypatch.setattr("pipeline.state_saver.unpickled", restore)
     again = replace(recorded_training(run, ()), verbose=0, pictures=False)
     with pytest.raises(UserError, match=r"no attribute 'new'; remove it to begin the run again$"):
         carry_out(training_of(again, keeping, run))
@@ -449,7 +457,7 @@ def test_what_cannot_be_kept_is_said_once(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("part", "said"),
     [
-        ("write_snapshot", "no state was saved: {folder}: No space left on device"),
+        ("write_state", "no state was saved: {folder}: No space left on device"),
         ("user_key", "no state can be kept: the key to saved states: No space left on device"),
     ],
 )
@@ -461,7 +469,7 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
 
     told = []
     monkeypatch.setattr("pipeline.preparation._say", lambda _, line: told.append(line))
-    monkeypatch.setattr(saved_states, part, full)
+    monkeypatch.setattr(state_files, part, full)
     spec = spec_of(tmp_path, GRID, "qlearning", 600, {})
     keeping = StateKeeping(SaveInterval(steps=50), stays=True)
     outcome = train(spec, Console(quiet=True), {}, "", keeping=keeping)
@@ -473,7 +481,7 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
 def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeypatch):
     """After a power cut a state would be there whose rows of Monitor are not."""
     order = []
-    saver, save = "pipeline.resuming.state_saver", saved_states.save_state
+    saver, save = "pipeline.state_saver", state_files.save_state
     monkeypatch.setattr(f"{saver}.sync_file", lambda path: order.append(path.name))
     monkeypatch.setattr(f"{saver}.save_state", lambda *args: (order.append("state"), save(*args)))
     log = {"tensorboard_log": tmp_path / "log", "log_interval": 1}
@@ -490,14 +498,14 @@ def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeyp
 
 def test_models_are_on_the_disk_before_a_state_that_comes_after_them(tmp_path, monkeypatch):
     """They are not written again by a run that goes on from it."""
-    held, save = [], saved_states.save_state
+    held, save = [], state_files.save_state
     monkeypatch.setattr(
         "pipeline.runs.sync_together",
         lambda files, _: held.extend(path.name for path in files),
     )
     seen = []
     monkeypatch.setattr(
-        "pipeline.resuming.state_saver.save_state",
+        "pipeline.state_saver.save_state",
         lambda *args: (seen.append(set(held)), held.clear(), save(*args)),
     )
     spec = spec_of(tmp_path, GRID, "qlearning", 600, {}, eval_freq=100)
@@ -509,7 +517,7 @@ def test_models_are_on_the_disk_before_a_state_that_comes_after_them(tmp_path, m
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     """However long a state takes, the next is saved fifty times as long after it."""
     clock = [0.0]
-    monkeypatch.setattr("pipeline.resuming.state_saver.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("pipeline.state_saver.time.monotonic", lambda: clock[0])
     saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
     clock[0] = 2.4
     assert not saver.wants_position()
@@ -562,10 +570,10 @@ def test_no_search_for_garbage_follows_a_state(tmp_path, monkeypatch):
 def test_what_was_cut_off_is_saved_sooner(tmp_path, monkeypatch):
     """Where it is cut off every few seconds, it gets ahead all the same."""
     clock = [0.0]
-    monkeypatch.setattr("pipeline.resuming.state_saver.time.monotonic", lambda: clock[0])
+    monkeypatch.setattr("pipeline.state_saver.time.monotonic", lambda: clock[0])
 
     def saver_of(note, seconds=0.0, was_cut_off=True):
-        state = None if note is None else SavedState(Snapshot(), note)
+        state = None if note is None else SavedState(Pickled(b"", (), ()), note)
         interval = SaveInterval(seconds=seconds)
         return StateSaver(Run(tmp_path, ""), interval, pytest.fail, state, was_cut_off)
 
@@ -620,8 +628,3 @@ def test_of_versions_that_are_none_nothing_is_said(tmp_path):
     run = Run.claim(tmp_path, "qlearning", GRID)
     run.update_info(versions=["torch"])
     assert go_on(run, StateKeeping(), pytest.fail).goes_on
-
-
-def test_a_pipe_in_the_place_of_a_state_is_not_waited_for(tmp_path):
-    os.mkfifo(tmp_path / "odd.state")
-    assert saved_states.newest_state(tmp_path, pytest.fail) is None

@@ -1,17 +1,16 @@
 """What the user's modules keep outside of objects, and what is said where nothing can be kept."""
 
 import sys
+from dataclasses import replace
 
 import pytest
 
-from pipeline.resuming import saved_states
-from pipeline.resuming.state_keeping import SaveInterval
-from pipeline.resuming.state_saver import StateSaver
-from pipeline.resuming.user_state import put_back, user_state
+from pipeline import state_files
 from pipeline.runs import Run
+from pipeline.state_saver import StateSaver, put_back, user_state
+from pipeline.states import Pickled, pickled, unpickled
+from pipeline.unfinished_runs import SaveInterval
 from pipeline.user_modules import import_typed
-from snapshots.recording import Snapshot, record
-from snapshots.restoring import restore
 
 SOURCE = """
 import random
@@ -45,17 +44,22 @@ def things(tmp_path, monkeypatch):
     del sys.modules["things_with_globals"]
 
 
+def frozen(modules):
+    """What modules hold now, whatever becomes of it."""
+    held = pickled({"it": modules})
+    memories = [memory.copy() for memory in held.memories]
+    return replace(held, pickled=bytes(held.pickled), memories=memories)
+
+
 def test_globals_and_attributes_of_classes_go_back(things):
     modules, module = things
     thing = module.Thing()
     thing.step()
-    snapshot = record({"modules": user_state(modules)})
+    saved = frozen(user_state(modules))
     seen = list(module.seen)
     thing.step()
     after = list(module.seen)
-    state = user_state(modules)
-    restore(snapshot, {"modules": state})
-    put_back(modules, state)
+    put_back(modules, unpickled(saved, {"it": user_state(modules)})["it"])
     assert (module.steps, module.Thing.made, module.Thing.names) == (1, 1, ["a", "b"])
     assert module.seen == seen
     thing.step()
@@ -86,15 +90,16 @@ class Thing:
     monkeypatch.setattr(sys, "path", [*sys.path])
     modules = import_typed([str(path)])
     module = sys.modules["things_that_remember"]
-    assert record({"it": user_state(modules)}).lost == []
+    assert pickled({"it": user_state(modules)}).lost == []
     module.double(1)
     module.Thing.triple(None, 1)
     module.draw()
-    snapshot = record({"it": user_state(modules)})
-    assert [line.partition("]")[2] for line in snapshot.lost] == ["['double']", "['triple']"]
+    saved = frozen(user_state(modules))
+    assert [line.partition("]")[2] for line in saved.lost] == ["['double']", "['triple']"]
     after = module.draw()
-    restore(snapshot, {"it": user_state(modules)})
+    put_back(modules, unpickled(saved, {"it": user_state(modules)})["it"])
     assert module.draw() == after
+    assert module.double(1) == 2
     del sys.modules["things_that_remember"]
 
 
@@ -141,10 +146,10 @@ def test_a_user_without_a_home_keeps_no_states(tmp_path, monkeypatch):
     def no_home(_):
         raise FileNotFoundError("the user has no home folder")
 
-    monkeypatch.setattr(saved_states, "user_key", no_home)
+    monkeypatch.setattr(state_files, "user_key", no_home)
 
     def write(self):
-        saved_states.save_state(tmp_path / "state", 1, Snapshot(), {})
+        state_files.save_state(tmp_path / "state", 1, Pickled(b"", (), ()), {})
 
     monkeypatch.setattr(StateSaver, "_write", write)
     saver.save()

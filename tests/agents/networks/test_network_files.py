@@ -28,7 +28,7 @@ import sys
 
 class Nothing:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"agents", "envs", "mdp", "pipeline", "snapshots", "safe_files"}:
+        if name.split(".")[0] in {"agents", "envs", "mdp", "pipeline", "safe_files"}:
             raise ModuleNotFoundError(name)
 
 sys.meta_path.insert(0, Nothing())

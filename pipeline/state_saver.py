@@ -2,39 +2,39 @@
 
 from __future__ import annotations
 
+import enum
+import functools
 import gc
+import random
+import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FunctionType, ModuleType
 from typing import Any
 
+import numpy as np
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.logger import KVWriter, Logger
+from stable_baselines3.common.logger import KVWriter, Logger, make_output_format
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from agents.common.callback_horizons import Horizon
+from agents.common.callback_horizons import BlockCallback, Horizon
 from mdp.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.files import files_below, sync_file
 from pipeline.progress import ProgressDisplay
-from pipeline.resuming.global_generators import generator_states, set_generators
-from pipeline.resuming.log_positions import Position, log_positions
-from pipeline.resuming.monitor_rows import held_in, lists_in_files, read_back
-from pipeline.resuming.saved_states import SavedState, save_state
-from pipeline.resuming.state_folder import settings_digest
-from pipeline.resuming.state_keeping import SaveInterval
-from pipeline.resuming.user_state import put_back, user_state
 from pipeline.runs import Run
-from pipeline.safe_moments import StopAtSafeMoment
+from pipeline.state_files import SavedState, save_state
+from pipeline.states import NotFittingError, NotKeepableError, pickled, unpickled
 from pipeline.stopping import current
+from pipeline.unfinished_runs import Position, SaveInterval, log_positions, settings_digest
 from pipeline.user_modules import UserModule
-from snapshots.filling import NotRestorableError
-from snapshots.kinds import NotRecordableError
-from snapshots.recording import record
-from snapshots.restoring import restore
 
 # Saving may take this share of the time, where the user has not said how often.
 SHARE_OF_TIME = 0.02
@@ -47,6 +47,37 @@ SHORTEST_PAUSE = 0.1
 # Bytes of a file since the last state. A fast table writes many times that in a second, and waiting
 # until the disk has it would take more than all else.
 MOST_SYNCED = 1 << 20
+
+
+class StopAtSafeMoment(BlockCallback):
+    """Ends the training, if a signal asks for it, before the next steps are taken.
+
+    That is after the last update and before the environments move: what the agent has seen it has
+    learnt from, and what it is about to see has not happened yet.
+    """
+
+    takes_blocks = True
+
+    def _on_rollout_start(self) -> None:
+        self.stop_if_asked()
+
+    def stop_if_asked(self) -> None:
+        """End the training here, if a signal asks for it.
+
+        Raises:
+            Stopped: if so.
+        """
+        stop = current()
+        if stop.number is not None:
+            with stop.held():
+                self.before_stopping()
+            stop.raise_if_asked()
+
+    def before_stopping(self) -> None:
+        """What there is to do at the last safe moment."""
+
+    def _on_step(self) -> bool:
+        return True
 
 
 class StateSaver(StopAtSafeMoment):
@@ -148,7 +179,7 @@ class StateSaver(StopAtSafeMoment):
         try:
             with _garbage_left():
                 self._write()
-        except NotRecordableError as error:
+        except NotKeepableError as error:
             self._give_up(f"no state can be kept: {one_line(error)}")
         except UserError as error:
             self._give_up(f"no state can be kept: {error}")
@@ -187,18 +218,15 @@ class StateSaver(StopAtSafeMoment):
     def _write(self) -> None:
         environment = self.training_env.unwrapped
         if isinstance(environment, SubprocVecEnv):
-            raise NotRecordableError("--vec-env subproc", "environments are in other processes")
+            raise NotKeepableError("--vec-env subproc: environments are in other processes")
         positions = log_positions(self.run.path, _log_folder(self.model))
-        in_files = lists_in_files(self.training_env, self.run.path, positions)
-        episodes = held_in(self.training_env, self.run.path, in_files)
-        snapshot = record(self._roots(), _CONSTANTS, episodes)
-        for lost in snapshot.lost:
+        content = pickled(self._roots(), _OF_THIS_PROCESS)
+        for lost in content.lost:
             self._tell_once(f"{lost} is not kept: a run that goes by it may differ after --resume")
         note = {
             "folder": self._folder_names(),
             "log_folder": _log_folder(self.model),
             "files": positions,
-            "episodes": in_files,
             "steps": self.model.num_timesteps,
             "rollouts": self.n_rollouts,
             **self.taken.as_data(),
@@ -206,7 +234,7 @@ class StateSaver(StopAtSafeMoment):
             "spec": settings_digest(self.run.recorded_spec()),
         }
         self._sync(positions)
-        save_state(self.run.state_path, self.n_saved + 1, snapshot, note)
+        save_state(self.run.state_path, self.n_saved + 1, content, note)
         self.n_saved += 1
 
     def _sync(self, positions: Mapping[str, Position]) -> None:
@@ -248,17 +276,18 @@ class StateSaver(StopAtSafeMoment):
         roots = self._roots()
         moved = dict(zip(state.note["folder"], self._folder_names(), strict=True))
         try:
-            restore(state.snapshot, roots, moved)
-            read_back(self.training_env, self.run.path, state.note.get("episodes", {}))
+            restored = unpickled(state.content, roots, moved)
         except Exception as error:
-            if state.is_of_these_sources and not isinstance(error, NotRestorableError):
+            if state.is_of_these_sources and not isinstance(error, NotFittingError):
                 raise
             raise UserError(
                 f"{self.run.state_path} does not fit what the run's settings make today: "
                 f"{one_line(error)}; remove it to begin the run again"
             ) from error
-        put_back(self.modules, roots["modules"])
-        set_generators(roots["generators"])
+        logger = self.model.logger
+        logger.name_to_value, logger.name_to_count, logger.name_to_excluded = restored["pending"]
+        put_back(self.modules, restored["modules"])
+        set_generators(restored["generators"])
         self.steps_at_save = self.model.num_timesteps
         self.saved_at = time.monotonic()
 
@@ -289,4 +318,151 @@ def _log_folder(model: BaseAlgorithm) -> str | None:
 
 
 # What is made anew from the settings, and holds nothing that training changes.
-_CONSTANTS = (KVWriter, Logger, ExactEvaluator, ProgressDisplay, Run, StateSaver)
+_OF_THIS_PROCESS = (
+    ExactEvaluator,
+    KVWriter,
+    Logger,
+    ProgressDisplay,
+    ResultsWriter,
+    Run,
+    StateSaver,
+)
+
+
+# --- the generators that libraries draw from without being told ---
+
+
+def generator_states() -> dict[str, Any]:
+    """Where they are."""
+    cuda = (
+        [state.numpy() for state in th.cuda.get_rng_state_all()] if th.cuda.is_available() else []
+    )
+    return {
+        "python": random.getstate(),
+        "numpy": np.random.get_state(legacy=False),  # noqa: NPY002  # libraries draw from it
+        "torch": th.get_rng_state().numpy(),
+        "cuda": cuda,
+    }
+
+
+def set_generators(states: dict[str, Any]) -> None:
+    """Put them where they were."""
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])  # noqa: NPY002
+    th.set_rng_state(th.from_numpy(states["torch"].copy()))
+    if states["cuda"]:
+        th.cuda.set_rng_state_all([th.from_numpy(state.copy()) for state in states["cuda"]])
+
+
+# --- what the user's own modules keep outside of objects ---
+
+_CODE = (ModuleType, type, FunctionType)
+
+
+def user_state(modules: Iterable[UserModule]) -> dict[str, dict[str, Any]]:
+    """The values of global names and of classes' attributes, by the names of their holders.
+
+    Args:
+        modules: those that were typed; what lies beside them counts too, what is installed does
+            not.
+    """
+    return {name: _values(holder) for name, holder in _holders(modules)}
+
+
+def put_back(modules: Iterable[UserModule], state: Mapping[str, Mapping[str, Any]]) -> None:
+    """Let the names have those values."""
+    for name, holder in _holders(modules):
+        before = _values(holder)
+        for attribute, value in state.get(name, {}).items():
+            if attribute not in before or before[attribute] is not value:
+                setattr(holder, attribute, value)
+
+
+def _holders(modules: Iterable[UserModule]) -> Iterator[tuple[str, ModuleType | type]]:
+    typed = [module for module in modules if module.path is not None]
+    if not typed:
+        return
+    for name, module in list(sys.modules.items()):
+        if not any(_is_of(module, name, user) for user in typed):
+            continue
+        yield name, module
+        for held in list(vars(module).values()):
+            is_own = isinstance(held, type) and held.__module__ == name
+            if is_own and not issubclass(held, enum.Enum):
+                yield f"{name}:{held.__qualname__}", held
+
+
+def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
+    """Whether a module is the user's: the one that was typed, part of it, or a file beside it."""
+    top = user.name.partition(".")[0]
+    if name == top or name.startswith(f"{top}."):
+        return True
+    file, folder = getattr(module, "__file__", None), Path(user.path or "").parent
+    ours = Path(__file__).resolve().parents[1]
+    return bool(file) and Path(str(file)).parent == folder and folder != ours
+
+
+def _is_method(value: Any) -> bool:
+    """Whether a class's attribute is a method or the like, but for those that remember."""
+    return hasattr(type(value), "__get__") and not isinstance(value, functools._lru_cache_wrapper)
+
+
+def _values(holder: ModuleType | type) -> dict[str, Any]:
+    """What is data of it: no code, and nothing that Python keeps there itself."""
+    return {
+        name: value
+        for name, value in vars(holder).items()
+        if not name.startswith(("__", "_abc_"))
+        and not isinstance(value, _CODE)
+        and not (isinstance(holder, type) and _is_method(value))
+    }
+
+
+# --- the log of a training that goes on: the same folder, and iterations counted on ---
+
+# On-policy algorithms of the library count them from 1 at each `learn`.
+ITERATIONS = "time/iterations"
+
+
+class IterationInterval(int):
+    """A number of iterations between two log records, counted on from an earlier `learn`.
+
+    The library takes an iteration's number modulo the interval; this adds those that went before.
+    """
+
+    before: int
+
+    @classmethod
+    def after(cls, before: int, interval: int) -> IterationInterval:
+        """An interval, where so many iterations went before."""
+        result = cls(interval)
+        result.before = before
+        return result
+
+    def __rmod__(self, iteration: int) -> int:
+        return (iteration + self.before) % int(self)
+
+
+class IterationLogger(Logger):
+    """A logger that adds the iterations of an earlier `learn` to those that it is told."""
+
+    before = 0
+
+    def record(self, key: str, value: Any, *args: Any, **kwargs: Any) -> None:
+        """As in the library, but for the number of iterations."""
+        super().record(key, value + self.before if key == ITERATIONS else value, *args, **kwargs)
+
+
+def iterations_before(model: BaseAlgorithm, note: dict[str, Any]) -> int:
+    """How many an algorithm that counts from 1 has behind it in a saved state."""
+    return int(note["rollouts"]) if isinstance(model, OnPolicyAlgorithm) else 0
+
+
+def resumed_logger(model: BaseAlgorithm, note: dict[str, Any]) -> Logger:
+    """A logger that goes on where that of a saved state was, with the same outputs."""
+    folder = note["log_folder"]
+    names = ["stdout"] if model.verbose > 0 or folder is None else []
+    names += [] if folder is None else ["tensorboard"]
+    logger = IterationLogger(folder, [make_output_format(name, folder or "") for name in names])
+    logger.before = iterations_before(model, note)
+    return logger

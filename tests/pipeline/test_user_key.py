@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from snapshots.user_key import user_key
+from pipeline.state_files import user_key
 
 
 @pytest.fixture(autouse=True)

@@ -1,32 +1,86 @@
-"""Runs that were cut off: which there are, and what is needed to go on with one."""
+"""Runs that were cut off: which there are, and what is needed to go on with one.
+
+A command asks for this before PyTorch is imported.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import zlib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from io import BufferedReader
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pipeline.digests import DamagedFileError, digest_of
+from pipeline.digests import STATE_FOLDER, DamagedFileError, digest_of
 from pipeline.errors import UserError
+from pipeline.files import replacing
 from pipeline.module_records import changed_since
-from pipeline.resuming.log_positions import cut_back, monitor_files
-from pipeline.resuming.state_folder import has_state, remove_states, settings_digest
-from pipeline.resuming.state_keeping import StateKeeping
 from pipeline.runs import (
     FINISHED,
     TRAINED_AGENT,
     Run,
     environment_name,
+    has_state,
     numbered_runs,
     recorded_versions,
+    remove_states,
 )
 from pipeline.train_spec import TrainSpec, completed
 from pipeline.user_modules import UserModule
+from safe_files.refusals import UnsafeFileError
+from safe_files.regular_files import NO_LIMIT, opened
+
+if TYPE_CHECKING:
+    from pipeline.state_files import SavedState
 
 # What may be given anew, and what stands in no settings of a run.
 _SHOWN_ONLY = ("verbose", "progress", "log_folder", "gym_packages", "user_modules", "unique_id")
+
+EVENT_FILES = "events.out.tfevents.*"
+# By the numbers of the environments: a wrapper that the settings name begins its file anew.
+MONITOR_FILES = "[0-9]*.monitor.csv"
+_PIECE = 1 << 20  # bytes
+
+# A file's length in bytes and the checksum of them.
+Position = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class SaveInterval:
+    """How often to save the state.
+
+    Attributes:
+        seconds: between two states; 0 for as often as takes `SHARE_OF_TIME`.
+        steps: environment steps between them instead, counted over all environments; or 0.
+        is_off: to save none.
+    """
+
+    seconds: float = 0.0
+    steps: int = 0
+    is_off: bool = False
+
+
+@dataclass(frozen=True)
+class StateKeeping:
+    """What becomes of a training's state.
+
+    Attributes:
+        interval: how often it is saved.
+        state: what the training goes on from; None where it begins.
+        goes_on: whether the run folder is an earlier process's, also where that left no state.
+        was_cut_off: whether another process began the run and did not finish it, so that states
+            come sooner.
+        stays: whether states are still there when the run is finished.
+    """
+
+    interval: SaveInterval = SaveInterval()
+    state: SavedState | None = None
+    goes_on: bool = False
+    was_cut_off: bool = False
+    stays: bool = False
 
 
 def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
@@ -116,7 +170,7 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
     Raises:
         UserError: if its states are all damaged or another user's, or its files are gone.
     """
-    from pipeline.resuming.saved_states import newest_state  # it takes PyTorch
+    from pipeline.state_files import newest_state  # it takes PyTorch
 
     _tell_versions(run, tell)
     state = newest_state(run.state_path, tell) if has_state(run.state_path) else None
@@ -174,3 +228,85 @@ def _forget(run: Run) -> None:
     remove_states(run.state_path)
     for path in monitor_files(run.path):  # another name of one keeps what it holds
         path.unlink()
+
+
+def settings_digest(spec: Mapping[str, Any]) -> str:
+    """What tells a run's settings from others'."""
+    text = json.dumps(spec, sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+# --- what the files hold that a training only appends to ----------------------------------------
+
+
+def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Position]:
+    """How far Monitor's and TensorBoard's files have come.
+
+    Args:
+        run_folder: where Monitor writes.
+        log_folder: where the logger does, or None.
+
+    Returns:
+        By path: of Monitor's files relative to the run folder, of the others from the root.
+    """
+    paths = {path.name: path for path in monitor_files(run_folder)}
+    paths |= {str(path): path for path in _event_files(log_folder)}
+    return {name: _position(path, path.stat().st_size) for name, path in paths.items()}
+
+
+def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, Position]) -> None:
+    """Remove what was appended since, and the files that were begun since.
+
+    What is left is a new file, so that no other name of the old one is written to.
+
+    Raises:
+        UserError: if a file is missing, or does not begin with what it held.
+    """
+    for name, position in positions.items():
+        path = run_folder / name  # or the name itself, where that begins at the root
+        try:
+            found = _position(path, position[0])
+        except (FileNotFoundError, UnsafeFileError):
+            found = None
+        if found != tuple(position):
+            raise UserError(
+                f"{path} is not as the run left it: it cannot go on from its state; remove "
+                f"{run_folder / STATE_FOLDER} to begin the run again"
+            )
+    for path in [*monitor_files(run_folder), *_event_files(log_folder)]:
+        name = path.name if path.parent == run_folder else str(path)
+        if name in positions:
+            with replacing(path) as draft, opened(path, NO_LIMIT) as file:
+                _copy(file, positions[name][0], draft.write)
+        else:
+            path.unlink()
+
+
+def _position(path: Path, length: int) -> Position:
+    """Where a file is after so many bytes, or at its end if that comes before."""
+    checksum = 0
+
+    def add(piece: bytes) -> None:
+        nonlocal checksum
+        checksum = zlib.crc32(piece, checksum)
+
+    with opened(path, NO_LIMIT) as file:
+        return _copy(file, length, add), checksum
+
+
+def _copy(file: BufferedReader, length: int, write: Callable[[bytes], object]) -> int:
+    """Hand on so many bytes of a file, or all if it has fewer; how many there were."""
+    n_read = 0
+    while piece := file.read(min(_PIECE, length - n_read)):
+        write(piece)
+        n_read += len(piece)
+    return n_read
+
+
+def monitor_files(run_folder: Path) -> list[Path]:
+    """The files that Monitor appends to."""
+    return sorted(run_folder.glob(MONITOR_FILES))
+
+
+def _event_files(log_folder: str | None) -> list[Path]:
+    return [] if log_folder is None else sorted(Path(log_folder).resolve().glob(EVENT_FILES))
