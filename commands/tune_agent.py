@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -45,12 +46,12 @@ def _tune(args: argparse.Namespace) -> int:
     try:
         how = _how(args, tuning, root, console)
         with doing(console, "loading the libraries"):
-            from tuning.trial_runs import shipped_run
+            from experiments.study_plan import plan
 
-            how.place(root).get_ready([shipped_run(tuning, root)])
+            how.place(root).get_ready(plan(replace(tuning.study, n_seeds=1), root))
             from commands.tune_driving import drive
             from pipeline.folder_lock import told_if_gone
-            from tuning.opening import open_tuning
+            from tuning.searching import open_tuning
             from tuning.trial_storage import failing_in_a_line
 
             with failing_in_a_line(args.storage):

@@ -26,21 +26,20 @@ from experiments.early_results import EarlyResults
 from experiments.study_plan import plan
 from pipeline.folder_lock import FolderInUseError, folder_lock
 from pipeline.signs_of_life import doing
-from tuning.opening import OpenTuning
-from tuning.record import FILE as RECORD
-from tuning.record import write_record
 from tuning.retesting import (
     FOLDER,
+    RECORD,
+    WINNER,
     Candidate,
     Outcome,
     best_trials,
     chosen_for_retest,
     concluded,
     retest_study,
+    write_record,
+    write_winner,
 )
-from tuning.searching import Search
-from tuning.winner_files import FILE as WINNER
-from tuning.winner_files import remove_winner, write_winner
+from tuning.searching import OpenTuning, Search
 
 
 def drive(console: Console, place: OpenTuning, how: How) -> int:
@@ -67,16 +66,7 @@ def _search(console: Console, place: OpenTuning, how: How) -> None:
         return
     progress = TuningProgress(console, queue.n_trials, ended, is_cost=tuning.is_cost)
     with progress, progress.watching(how.place(place.root).launchers)() as launcher:
-        Search(
-            tuning,
-            place.root,
-            queue,
-            place.suggestions,
-            launcher,
-            place.hopeless,
-            progress,
-            how.deadline,
-        ).run()
+        Search(place, launcher, progress, how.deadline).run()
     if queue.is_done():
         remove_dead_drafts(place.root)  # of runs that nobody asks for any more
 
@@ -99,7 +89,7 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
         winner = next((c for c in candidates if _is(c, outcome)), None)
         path = None
         if winner is None:
-            remove_winner(place.root)
+            (place.root / WINNER).unlink(missing_ok=True)  # of a search that has gone on since
         else:
             n_trials = place.queue.n_trials
             path = write_winner(tuning, place.root, outcome, winner.entry, n_trials)
@@ -113,8 +103,7 @@ def _judge(console: Console, place: OpenTuning, how: How) -> int:
 
 def _write_down(console: Console, place: OpenTuning, how: How, outcome: Outcome | None) -> None:
     """Write the record, and the page of it."""
-    is_won = outcome is not None and outcome.winner is not None
-    record = write_record(place, outcome, how.command, WINNER if is_won else None)
+    record = write_record(place, outcome, how.command)
     files = [place.root / RECORD]
     if how.with_page:
         with doing(console, "writing the page"):

@@ -106,7 +106,7 @@ def _add_search_flags(parser: argparse.ArgumentParser) -> None:
         "--search-space",
         type=filled,
         metavar="YAML",
-        help="the values to choose from (default: search_spaces/AGENT.yml)",
+        help="the values to choose from (default: hyperparams/search_spaces/AGENT.yml)",
     )
     add("--seed", type=whole_number(0, 2**32 - 1), default=0, help="seed of the search (0)")
     add(

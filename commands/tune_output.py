@@ -14,10 +14,10 @@ from rich.table import Table
 from commands.study_output import say
 from pipeline.plain_runs import NETWORKS
 from pipeline.signs_of_life import duration
-from tuning.opening import OpenTuning
 from tuning.retesting import Outcome, Retested
-from tuning.trial_queue import FAILURE, figures_of, seconds_of
-from tuning.trial_runs import planned_run, shipped_run
+from tuning.searching import OpenTuning
+from tuning.suggesting import planned_run, shipped_run
+from tuning.trial_storage import FAILURE, figures_of, seconds_of
 
 
 def print_opened(console: Console, place: OpenTuning, where: str) -> None:

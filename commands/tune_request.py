@@ -19,7 +19,7 @@ from pipeline.user_modules import import_typed
 from tuning.trial_storage import kind_of
 from tuning.tuning_spec import AUTO, SHIPPED, TuningSpec
 
-NEEDED = {"optuna": "tune", "cmaes": "tune"}
+NEEDED = {"optuna": "tune"}
 
 
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:

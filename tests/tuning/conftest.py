@@ -12,14 +12,10 @@ from optuna.storages import InMemoryStorage
 
 from experiments.study_spec import AgentSpec, EnvironmentSpec, StudySpec
 from tuning import searching
-from tuning.judging import RunOutcome
-from tuning.opening import OpenTuning
-from tuning.samplers import make_sampler
 from tuning.search_spaces import read_search_space
-from tuning.study_opening import open_study
-from tuning.suggesting import Suggestions
-from tuning.trial_queue import TrialQueue
-from tuning.trial_storage import open_storage
+from tuning.searching import OpenTuning, RunOutcome, Search
+from tuning.suggesting import Suggestions, make_sampler
+from tuning.trial_storage import TrialQueue, open_storage, open_study
 from tuning.tuning_spec import SHIPPED, TuningSpec
 
 SHIPPED_ENTRY = {"learning_rate": 0.5, "gamma": 0.9, "n_episodes": 10}
@@ -108,16 +104,7 @@ def search(monkeypatch, place, launcher, figure=score, judged_by="score", **opti
 
     monkeypatch.setattr(searching, "outcome_of", outcome_of)
     with place.queue, suppress(KeyboardInterrupt):
-        searching.Search(
-            place.tuning,
-            place.root,
-            place.queue,
-            place.suggestions,
-            launcher,
-            place.hopeless,
-            Quiet(),
-            **options,
-        ).run()
+        Search(place, launcher, Quiet(), **options).run()
     return launcher
 
 
