@@ -232,9 +232,13 @@ class NumberRange:
         if form is not None and (self.scale != "log" or start > 0):
             low, high = self.final_share
             share = end / start if form == "exponential" else low
-            reaching = {"low": min(self.low, start), "high": max(self.high, start)}
-            shares = (min(low, share), max(high, share))
-            wider.append(replace(wider[-1], **reaching, final_share=shares))
+            reaching = replace(
+                wider[-1],
+                low=min(self.low, start),
+                high=max(self.high, start),
+                final_share=(min(low, share), max(high, share)),
+            )
+            wider.append(reaching)
         for each in wider:
             with contextlib.suppress(LookupError, ValueError):
                 each.params_of(settings)

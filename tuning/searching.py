@@ -164,6 +164,7 @@ def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
     if results is None:
         raise UnjudgedError("it has not finished")
     row, name = results.rows[0], tuning.figure
+    figure: float | None
     if name in ("steps", "seconds"):
         figure = _cost(tuning, row, results.curves[0])
     else:
