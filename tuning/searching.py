@@ -118,8 +118,7 @@ def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuni
     with _made(root):
         with turn(root):  # of several that make a file's tables at once, all but one would fail
             opened = open_storage(root, storage)
-        sampler = make_sampler(tuning)
-        study = open_study(tuning.study.name, root, opened, sampler, asked, is_cost=tuning.is_cost)
+        study = open_study(tuning, root, opened, make_sampler(tuning), asked)
     return OpenTuning(tuning, root, study, TrialQueue(study, root, n_trials), suggestions)
 
 

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from optuna.storages import BaseStorage
     from optuna.trial import FrozenTrial
 
+    from tuning.tuning_spec import TuningSpec
+
 OWN_FILE = "trials.db"
 SECONDS_TO_WAIT = 120  # for others who write into the same SQLite file
 SECONDS_TO_CONNECT = 15  # to a proxy
@@ -207,20 +209,19 @@ def _reason(error: Exception) -> str:
 
 
 def open_study(
-    name: str,
+    tuning: TuningSpec,
     root: Path,
     storage: BaseStorage,
     sampler: BaseSampler,
     asked: Mapping[str, Any],
-    *,
-    is_cost: bool,
 ) -> Study:
-    """The study of that name, a new one where there is none; refused where it was another's.
+    """The study of a tuning, a new one where there is none; refused where another has its name.
 
     ``asked`` is what makes it this tuning and no other, as JSON.
     """
     import optuna
 
+    name = tuning.study.name
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     with turn(root):
         study = optuna.create_study(
@@ -228,7 +229,7 @@ def open_study(
             storage=storage,
             sampler=sampler,
             pruner=optuna.pruners.NopPruner(),  # what is hopeless is said by `tuning.pruning`
-            direction="minimize" if is_cost else "maximize",
+            direction="minimize" if tuning.is_cost else "maximize",
             load_if_exists=True,
         )
         before = study.user_attrs.get(ASKED)
@@ -293,6 +294,7 @@ class TrialQueue:
 
     def __enter__(self) -> TrialQueue:
         self.add_places()
+        self.free_dead()  # of a driver that was killed, its trial comes first, as it would have
         self.give_sign()
         self._heart.start()
         return self

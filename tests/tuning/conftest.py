@@ -50,14 +50,8 @@ def opened(storages, tuning, root, storage=None):
     path.write_text(SPACE)
     space = read_search_space("qlearning", "FrozenLake-v1", path)
     suggestions = Suggestions(tuning, space, SHIPPED_ENTRY)
-    study = open_study(
-        "toy",
-        root,
-        keeping,
-        make_sampler(tuning),
-        tuning.identity(SHIPPED_ENTRY, {}),
-        is_cost=tuning.is_cost,
-    )
+    asked = tuning.identity(SHIPPED_ENTRY, {})
+    study = open_study(tuning, root, keeping, make_sampler(tuning), asked)
     queue = TrialQueue(study, root, suggestions.n_trials)
     return OpenTuning(tuning, root, study, queue, suggestions)
 

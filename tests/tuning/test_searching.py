@@ -17,6 +17,7 @@ from optuna.trial import TrialState
 
 from experiments.run_curves import Curve
 from experiments.study_results import RunResults
+from pipeline import liveness
 from pipeline.errors import UserError
 from tuning import searching
 from tuning.searching import UnjudgedError, outcome_of
@@ -108,6 +109,24 @@ def test_a_kill_at_any_write_to_the_storage_changes_no_trial(toy, tmp_path, samp
             searched(storage)
         storage.revive()
         assert searched(storage) == undisturbed, k
+
+
+@pytest.mark.parametrize("stops_after", [5, 11, 23])
+def test_the_trial_of_a_driver_that_was_killed_comes_before_those_that_nobody_began(
+    toy, tmp_path, monkeypatch, stops_after
+):
+    whole = toy.opened(toy.tuning(), tmp_path / "whole")
+    toy.search(whole, toy.Launcher())
+    killed = toy.opened(toy.tuning(), tmp_path / "killed")
+    mark = liveness.mark()
+    with monkeypatch.context() as patch:
+        patch.setattr(liveness, "mark", lambda: {**mark, "began": 1})  # not this process
+        patch.setattr(killed.queue, "give_back", lambda _: None)
+        toy.search(killed, toy.Launcher(stops_after=stops_after))
+    assert toy.states(killed).count("RUNNING") == 1
+    again = toy.opened(toy.tuning(), tmp_path / "killed")
+    toy.search(again, toy.Launcher())
+    assert toy.params(again) == toy.params(whole)
 
 
 def test_a_hopeless_trial_is_ended_and_its_other_seeds_are_not_run(toy, tmp_path):
