@@ -40,8 +40,8 @@ from tuning.pruning import PRUNERS
 from tuning.tuning_spec import AUTO, FIGURES, OBJECTIVES, SAMPLERS, SHIPPED, TuningSpec
 
 if TYPE_CHECKING:
-    from tuning.opening import OpenTuning
     from tuning.retesting import Candidate, Outcome
+    from tuning.searching import OpenTuning
 
 # --- flags ----------------------------------------------------------------------------------------
 
@@ -108,7 +108,7 @@ def build_parser() -> argparse.ArgumentParser:
         metavar="N",
         help="trials at random before the sampler learns from them (10)",
     )
-    space = "the values to choose from (default: search_spaces/AGENT.yml)"
+    space = "the values to choose from (default: hyperparams/search_spaces/AGENT.yml)"
     add("--search-space", type=filled, metavar="YAML", help=space)
     add("--seed", type=whole_number(0, 2**32 - 1), default=0, help="seed of the search (0)")
     timeout = "begin no more runs after this time, e.g. 50m; then comes the re-test"
@@ -198,11 +198,11 @@ def _tune(args: argparse.Namespace) -> int:
         context = run_context(args, root, command, limits, console)
         deadline = math.inf if args.timeout is None else time.monotonic() + args.timeout
         with doing(console, "loading the libraries"):
-            from tuning.trial_runs import shipped_run
+            from experiments.plan import plan
 
-            context.get_ready([shipped_run(tuning, root)])
+            context.get_ready(plan(replace(tuning.study, n_seeds=1), root))
             from pipeline.locks import FolderInUseError, told_if_gone
-            from tuning.opening import open_tuning
+            from tuning.searching import open_tuning
 
             with failing_in_a_line(args.storage):
                 opened = open_tuning(tuning, root, args.storage)
@@ -235,16 +235,7 @@ def _search(context: RunContext, opened: OpenTuning, deadline: float) -> None:
         return
     progress = TuningProgress(context.console, queue.n_trials, ended, is_cost=tuning.is_cost)
     with progress, progress.watching(context.launchers)() as launcher:
-        Search(
-            tuning,
-            opened.root,
-            queue,
-            opened.suggestions,
-            launcher,
-            opened.hopeless,
-            progress,
-            deadline,
-        ).run()
+        Search(opened, launcher, progress, deadline).run()
     if queue.is_done():
         remove_dead_drafts(opened.root)  # of runs that nobody asks for any more
 
@@ -252,8 +243,7 @@ def _search(context: RunContext, opened: OpenTuning, deadline: float) -> None:
 def _retest(context: RunContext, opened: OpenTuning) -> int:
     """Run the best again, and write down what won; the exit code."""
     from pipeline.locks import folder_lock
-    from tuning.retesting import FOLDER, best_trials, chosen_for_retest
-    from tuning.winner_files import remove_winner, write_winner
+    from tuning.retesting import FOLDER, WINNER, best_trials, chosen_for_retest, write_winner
 
     tuning, tell = opened.tuning, partial(say, context.console)
     ranked = best_trials(opened.queue.trials(), is_cost=tuning.is_cost)
@@ -271,7 +261,7 @@ def _retest(context: RunContext, opened: OpenTuning) -> int:
         winner = next((c for c in candidates if outcome.winner and c.number == won), None)
         path = None
         if winner is None:
-            remove_winner(opened.root)
+            (opened.root / WINNER).unlink(missing_ok=True)  # of a search that has gone on since
         else:
             n_trials = opened.queue.n_trials
             path = write_winner(tuning, opened.root, outcome, winner.entry, n_trials)
@@ -313,13 +303,9 @@ def _retested(
 
 def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None) -> None:
     """Write the record, and the page of it."""
-    from tuning.record import FILE as RECORD
-    from tuning.record import write_record
-    from tuning.retesting import FOLDER
-    from tuning.winner_files import FILE as WINNER
+    from tuning.retesting import FOLDER, RECORD, write_record
 
-    is_won = outcome is not None and outcome.winner is not None
-    record = write_record(opened, outcome, context.command, WINNER if is_won else None)
+    record = write_record(opened, outcome, context.command)
     files = [opened.root / RECORD]
     if context.with_page:
         with doing(context.console, "writing the page"):
@@ -345,9 +331,8 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     from pipeline.user_modules import import_typed
     from tuning.trial_storage import kind_of
 
-    for library in ("optuna", "cmaes"):
-        if importlib.util.find_spec(library) is None:
-            raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
+    if importlib.util.find_spec("optuna") is None:
+        raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
     modules = import_typed(args.gym_packages, [args.env])
     if args.algo not in ALGORITHMS:
         raise unknown("unknown agent", args.algo, ALGORITHMS)
@@ -409,7 +394,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
 def print_opened(context: RunContext, opened: OpenTuning) -> None:
     """Say what there is to do, and on which engines."""
     from pipeline.train_spec import NETWORKS
-    from tuning.trial_runs import planned_run, shipped_run
+    from tuning.suggesting import planned_run, shipped_run
 
     tell = partial(say, context.console)
     tuning, suggestions = opened.tuning, opened.suggestions
@@ -436,7 +421,7 @@ _STATES = {"COMPLETE": "judged to the end", "PRUNED": "ended early", "FAIL": "fa
 
 def print_search(console: Console, opened: OpenTuning) -> None:
     """Say what the search has cost, and what it has found."""
-    from tuning.trial_queue import FAILURE, figures_of, seconds_of
+    from tuning.trial_storage import FAILURE, figures_of, seconds_of
 
     trials, tuning = opened.queue.trials(), opened.tuning
     states = Counter(

@@ -188,7 +188,7 @@ def test_no_file_names_a_path_of_somebodys_machine() -> None:
 def published_files() -> Iterator[Path]:
     """Every text file of the project, with or without git at hand."""
     text = {".py", ".md", ".yml", ".yaml", ".toml", ".txt", ".json", ".html", ".css", ".js", ".csv"}
-    data = ("hyperparams", "search_spaces", "studies")
+    data = ("hyperparams", "studies")
     folders = (*PACKAGES, *data, "tests", "benchmarks", "docs", ".ci")
     inside = [path for folder in folders for path in (ROOT / folder).rglob("*") if path.is_file()]
     beside = [path for path in ROOT.iterdir() if path.is_file()]

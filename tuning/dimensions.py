@@ -1,24 +1,44 @@
-"""What a search may choose between, as settings and as the parameters that Optuna knows."""
+"""One thing that a search chooses: one of several values, or a number between two ends.
+
+Each dimension knows its settings and the parameters that Optuna stores for them, and leads from one
+to the other. Settings are flat here: the name of one inside another is dotted, as in
+``policy_kwargs.net_arch``. A setting that is `LEFT_OUT` is not said.
+"""
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Literal
 
-from pipeline.settings.values import DottedName
+import numpy as np
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
 
-if TYPE_CHECKING:
-    from optuna.distributions import BaseDistribution
+from pipeline.errors import UserError
+from pipeline.settings.values import DottedName, parse_schedule
+from tuning.tuning_spec import SHIPPED
 
 # What Optuna stores of a choice.
 Word = str | int | float | bool | None
-# Chooses a value for a parameter of this name.
-Pick = Callable[[str, "BaseDistribution"], Any]
+# Chooses a value for the parameter of this name.
+Pick = Callable[[str, BaseDistribution], Any]
+# For other choices by name, the words of which one must be chosen; empty for always.
+Conditions = Mapping[str, tuple[Word, ...]]
 
-SHIPPED = "shipped"
+Scale = Literal["linear", "log", "log_below_one", "powers_of_two"]
+# What a number may be: itself at all times, or where a schedule begins.
+FORMS = ("constant", "linear", "exponential")
+FINAL_SHARE = (0.001, 1.0)
+_DIGITS = 6
+_PREFIXES: Mapping[str, str] = {"log_below_one": "one_minus_", "powers_of_two": "log2_"}
 
 
 class Absent(Enum):
@@ -30,26 +50,27 @@ class Absent(Enum):
 LEFT_OUT = Absent.LEFT_OUT
 
 
-class Dimension(Protocol):
-    """One thing to be chosen, which may take several of Optuna's parameters.
+@dataclass(frozen=True)
+class Choice:
+    """One of several values, or one of several sets of settings."""
 
-    Settings are flat here: of those inside another the name is dotted, as in
-    ``policy_kwargs.net_arch``. A setting that is `LEFT_OUT` is not said.
-    """
+    name: str  # of the parameter
+    options: Mapping[Word, Mapping[str, Any]]  # the flat settings that each word stands for
+    when: Conditions = field(default_factory=dict)
 
-    @property
-    def name(self) -> str:
-        """How the file calls it, and other dimensions that depend on it."""
-
-    @property
+    @cached_property
     def keys(self) -> tuple[str, ...]:
         """The settings that it decides."""
+        return tuple(dict.fromkeys(key for option in self.options.values() for key in option))
 
+    @cached_property
     def distributions(self) -> dict[str, BaseDistribution]:
         """What each of its parameters is drawn from."""
+        return {self.name: CategoricalDistribution(tuple(self.options))}
 
     def settings(self, pick: Pick) -> dict[str, Any]:
         """What is chosen, asking for those parameters alone that it takes."""
+        return self._decided(self.options[pick(self.name, self.distributions[self.name])])
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         """The parameters that lead to these settings.
@@ -57,66 +78,207 @@ class Dimension(Protocol):
         Raises:
             LookupError: if none do.
         """
-
-    def including(self, settings: Mapping[str, Any]) -> Dimension:
-        """As much wider as it takes to have these settings among its choices."""
-
-    def grid(self, n: int) -> dict[str, list[Any]]:
-        """Values for each parameter: all words, and at most ``n`` numbers from end to end."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """One of several values, or one of several sets of settings.
-
-    Attributes:
-        name: of the parameter.
-        options: the flat settings that each word stands for.
-    """
-
-    name: str
-    options: Mapping[Word, Mapping[str, Any]]
-
-    @property
-    def keys(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(key for option in self.options.values() for key in option))
-
-    @cached_property
-    def _words(self) -> BaseDistribution:
-        from optuna.distributions import CategoricalDistribution
-
-        return CategoricalDistribution(tuple(self.options))
-
-    def distributions(self) -> dict[str, BaseDistribution]:
-        return {self.name: self._words}
-
-    def settings(self, pick: Pick) -> dict[str, Any]:
-        chosen = self.options[pick(self.name, self._words)]
-        return {key: chosen.get(key, LEFT_OUT) for key in self.keys}
-
-    def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        wanted = {key: settings.get(key, LEFT_OUT) for key in self.keys}
         for word, option in self.options.items():
-            if same({key: option.get(key, LEFT_OUT) for key in self.keys}, wanted):
+            if same(self._decided(option), self._decided(settings)):
                 return {self.name: word}
         raise LookupError(self.name)
 
     def including(self, settings: Mapping[str, Any]) -> Choice:
+        """As much wider as it takes to have these settings among its choices."""
         try:
             self.params_of(settings)
         except LookupError:
-            added = {key: settings.get(key, LEFT_OUT) for key in self.keys}
+            added = self._decided(settings)
             return replace(self, options={**self.options, self._word_for(added): added})
         return self
+
+    def _decided(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        return {key: settings.get(key, LEFT_OUT) for key in self.keys}
 
     def _word_for(self, added: Mapping[str, Any]) -> Word:
         """The value itself where that tells the reader more."""
         value = added.get(self.name, LEFT_OUT)
-        speaks = all(is_word(o.get(self.name)) for o in self.options.values())
+        speaks = all(is_word(option.get(self.name)) for option in self.options.values())
         return value if speaks and is_word(value) and value not in self.options else SHIPPED
 
-    def grid(self, n: int) -> dict[str, list[Any]]:
-        return {self.name: list(self.options)}
+
+@dataclass(frozen=True)
+class NumberRange:
+    """A number between two ends, whole where both are, or a schedule or word in its place.
+
+    Chosen numbers have six digits, so that files stay readable.
+    """
+
+    name: str  # of the setting
+    low: float  # included
+    high: float  # included
+    scale: Scale = "linear"  # on which steps are alike; powers of two are all that it then takes
+    forms: tuple[str, ...] = ("constant",)  # the words of `FORMS` that it may take
+    # The ends of the share of its start at which an exponential schedule ends.
+    final_share: tuple[float, float] = FINAL_SHARE
+    # What may stand in place of a number, by the word that Optuna knows it by.
+    instead: Mapping[Word, Any] = field(default_factory=dict)
+    when: Conditions = field(default_factory=dict)
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """The settings that it decides."""
+        return (self.name,)
+
+    @property
+    def _number(self) -> str:
+        return _PREFIXES.get(self.scale, "") + self.name
+
+    @property
+    def _form(self) -> str:
+        return f"{self.name}_form"
+
+    @property
+    def _share(self) -> str:
+        return f"{self.name}_final_share"
+
+    @property
+    def _words(self) -> tuple[Word, ...]:
+        return (*self.forms, *self.instead)
+
+    @cached_property
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """What each of its parameters is drawn from."""
+        found: dict[str, BaseDistribution] = {}
+        if len(self._words) > 1:
+            found[self._form] = CategoricalDistribution(self._words)
+        found[self._number] = self._number_distribution()
+        if "exponential" in self.forms:
+            found[self._share] = FloatDistribution(*self.final_share, log=True)
+        return found
+
+    def _number_distribution(self) -> BaseDistribution:
+        low, high = sorted((self._parameter(self.low), self._parameter(self.high)))
+        is_log = self.scale in ("log", "log_below_one")
+        if isinstance(low, int) and isinstance(high, int):
+            return IntDistribution(low, high, log=is_log)
+        return FloatDistribution(low, high, log=is_log)
+
+    def _parameter(self, number: float) -> float:
+        """What Optuna is told of a number."""
+        match self.scale:
+            case "log_below_one":
+                return tidy(1.0 - number)
+            case "powers_of_two":
+                return int(number).bit_length() - 1
+        return number
+
+    def _number_of(self, parameter: float) -> float:
+        """The number that a parameter stands for."""
+        match self.scale:
+            case "log_below_one":
+                return round(1.0 - tidy(parameter), 12)
+            case "powers_of_two":
+                return 1 << int(parameter)
+        number = parameter if isinstance(parameter, int) else tidy(parameter)
+        return min(max(number, self.low), self.high)
+
+    def settings(self, pick: Pick) -> dict[str, Any]:
+        """What is chosen, asking for those parameters alone that it takes."""
+        ranges = self.distributions
+        form = pick(self._form, ranges[self._form]) if self._form in ranges else self._words[0]
+        if form not in self.forms:
+            return {self.name: self.instead[form]}
+        number = self._number_of(pick(self._number, ranges[self._number]))
+        if form == "constant":
+            return {self.name: number}
+        if form == "linear":
+            return {self.name: f"lin_{number}"}
+        end = tidy(number * pick(self._share, ranges[self._share]))
+        return {self.name: f"exp_{number}_{end}"}
+
+    def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """The parameters that lead to these settings.
+
+        Raises:
+            LookupError: if none do.
+        """
+        value = settings.get(self.name, LEFT_OUT)
+        for word, other in self.instead.items():
+            if same(value, other):
+                return {self._form: word}
+        form, start, end = _read(value)
+        if form is None:
+            raise LookupError(self.name)
+        params: dict[str, Any] = {self._form: form} if len(self._words) > 1 else {}
+        params[self._number] = self._parameter(start)
+        if form == "exponential":
+            params[self._share] = end / start
+        if all(self._holds(name, value) for name, value in params.items()):
+            again = self.settings(lambda name, _: params[name])[self.name]
+            if _read(again) == (form, start, end):
+                return params
+        raise LookupError(self.name)
+
+    def _holds(self, param: str, value: Any) -> bool:
+        kind = self.distributions.get(param)
+        if isinstance(kind, FloatDistribution | IntDistribution):
+            return bool(kind.low <= value <= kind.high)
+        return isinstance(kind, CategoricalDistribution) and value in kind.choices
+
+    def including(self, settings: Mapping[str, Any]) -> NumberRange:
+        """As much wider as it takes to have these settings among its choices."""
+        value = settings.get(self.name, LEFT_OUT)
+        form, start, end = _read(value)
+        wider = [self]
+        if form is not None:
+            wider.append(replace(self, forms=tuple(dict.fromkeys((*self.forms, form)))))
+        if form is not None and (self.scale != "log" or start > 0):
+            low, high = self.final_share
+            share = end / start if form == "exponential" else low
+            reaching = replace(
+                wider[-1],
+                low=min(self.low, start),
+                high=max(self.high, start),
+                final_share=(min(low, share), max(high, share)),
+            )
+            wider.append(reaching)
+        for each in wider:
+            with contextlib.suppress(LookupError, ValueError):
+                each.params_of(settings)
+                return each
+        word = value if is_word(value) and value not in self._words else SHIPPED
+        return replace(self, instead={**self.instead, word: value})
+
+
+Dimension = Choice | NumberRange
+
+
+def spread(distribution: BaseDistribution, n: int) -> list[Any]:
+    """At most ``n`` values from one end of a distribution to the other; of words all."""
+    if isinstance(distribution, CategoricalDistribution):
+        return list(distribution.choices)
+    if not isinstance(distribution, FloatDistribution | IntDistribution):
+        raise TypeError(distribution)
+    between = np.geomspace if distribution.log else np.linspace
+    values = between(distribution.low, distribution.high, n).tolist()
+    if isinstance(distribution, IntDistribution):
+        return sorted({round(value) for value in values})
+    inside = [min(max(tidy(v), distribution.low), distribution.high) for v in values]
+    return list(dict.fromkeys(inside))
+
+
+def tidy(number: float) -> float:
+    """The number with six digits."""
+    return float(f"{number:.{_DIGITS}g}")
+
+
+def _read(value: Any) -> tuple[str | None, float, float]:
+    """Form, start and end of a number or schedule; no form for what is neither."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return "constant", value, value
+    if isinstance(value, str):
+        try:
+            schedule = parse_schedule(value, "")
+        except UserError:
+            return None, 0.0, 0.0
+        return schedule.kind, schedule.start, schedule.end
+    return None, 0.0, 0.0
 
 
 def is_word(value: object) -> bool:

@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from pipeline.errors import unknown
 
 Scores = Mapping[int, float]  # by seed
@@ -29,25 +31,23 @@ SEEDS_FOR_RANKS = 10
 
 @dataclass(frozen=True)
 class Rivals:
-    """The other trials.
+    """The other trials."""
 
-    Attributes:
-        others: their scores, of ended ones and those under way.
-        n_seeds: how many a whole trial has.
-        value: what scores are worth together.
-        ceiling: no score is above that; minus infinity where nobody knows.
-    """
-
-    others: Sequence[Scores]
-    n_seeds: int
-    value: Value
-    ceiling: float
+    others: Sequence[Scores]  # of ended trials and those under way
+    n_seeds: int  # how many a whole trial has
+    value: Value  # what scores are worth together
+    ceiling: float  # no score is above that; minus infinity where nobody knows
 
     @property
     def best(self) -> Scores:
         """The best of those with all seeds; one under way may be lucky yet. Empty without any."""
         whole = [each for each in self.others if len(each) == self.n_seeds]
         return max(whole, key=lambda each: self.value([*each.values()]), default={})
+
+    def lead(self, scores: Scores) -> list[float]:
+        """By how much a trial is better than the best one on each of the seeds in common."""
+        best = self.best
+        return [score - best[seed] for seed, score in scores.items() if seed in best]
 
     def values(self, seeds: Scores) -> list[float]:
         """On these seeds, of those that have them all."""
@@ -98,8 +98,6 @@ def below_median(scores: Scores, rivals: Rivals) -> bool:
 
     Source: the median stopping rule of Golovin et al. (2017), "Google Vizier", KDD.
     """
-    import numpy as np
-
     theirs = rivals.values(scores)
     enough = len(scores) >= MIN_SEEDS and len(theirs) >= MIN_OTHERS
     return enough and rivals.value([*scores.values()]) < float(np.median(theirs))
@@ -131,7 +129,7 @@ def worse_by_ranks(scores: Scores, rivals: Rivals) -> bool:
     """
     from scipy.stats import wilcoxon
 
-    differences = _differences(scores, rivals.best)
+    differences = rivals.lead(scores)
     if len(differences) < MIN_SEEDS or sum(differences) >= 0:
         return False
     test = wilcoxon(differences, alternative="less", zero_method="zsplit")
@@ -144,10 +142,9 @@ def worse_by_means(scores: Scores, rivals: Rivals) -> bool:
     Source: racing as in Birattari et al. (2002), "A racing algorithm for configuring
     metaheuristics", GECCO, with the t test that irace offers.
     """
-    import numpy as np
     from scipy.stats import t
 
-    differences = np.asarray(_differences(scores, rivals.best))
+    differences = np.asarray(rivals.lead(scores))
     if len(differences) < MIN_SEEDS or differences.sum() >= 0:
         return False
     error = differences.std(ddof=1) / np.sqrt(len(differences))
@@ -174,9 +171,8 @@ def cannot_win(scores: Scores, rivals: Rivals) -> bool:
 
 def no_chance(scores: Scores, rivals: Rivals) -> bool:
     """Whether the trial cannot win, or has many seeds to come and loses by ranks."""
-    if cannot_win(scores, rivals):
-        return True
-    return rivals.n_seeds >= SEEDS_FOR_RANKS and worse_by_ranks(scores, rivals)
+    has_many = rivals.n_seeds >= SEEDS_FOR_RANKS
+    return cannot_win(scores, rivals) or (has_many and worse_by_ranks(scores, rivals))
 
 
 PRUNERS: Mapping[str, Callable[[Scores, Rivals], bool]] = {
@@ -188,8 +184,3 @@ PRUNERS: Mapping[str, Callable[[Scores, Rivals], bool]] = {
     "racing": worse_by_means,
     "wilcoxon": worse_by_ranks,
 }
-
-
-def _differences(scores: Scores, best: Scores) -> list[float]:
-    """By how much the trial is better than the best one on each of the seeds in common."""
-    return [score - best[seed] for seed, score in scores.items() if seed in best]

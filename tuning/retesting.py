@@ -1,45 +1,48 @@
-"""The best settings on seeds that the search has not seen, beside those that it began with."""
+"""The best settings on seeds that the search has not seen, and the files that say what came of it.
+
+They run beside the settings that the search began with, in a study like any other. A setting that
+is better there is written as an entry of hyperparameters; ``tuning.json`` holds all figures.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import math
+import textwrap
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
+
+import yaml
+from optuna.trial import FrozenTrial, TrialState
 
 from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
-from experiments.plan import PlannedRun
 from experiments.study import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.digests import DamagedFileError
-from pipeline.files import write_text
-from tuning.entry_files import entry_text
-from tuning.judging import UnjudgedError, judged, outcome_of
-from tuning.trial_queue import SETTINGS
-from tuning.trial_runs import name_of
-from tuning.tuning_spec import SHIPPED, TuningSpec
+from pipeline.files import plain, write_json, write_text
+from pipeline.settings.hyperparams import TUNED_ON as TUNED_ON
+from pipeline.settings.hyperparams import seeds_tuned_on
+from tuning.searching import OpenTuning, UnjudgedError, outcome_of
+from tuning.suggesting import name_of
+from tuning.trial_storage import ASKED, FAILURE, SETTINGS, figures_of, seconds_of
+from tuning.tuning_spec import SHIPPED, TuningSpec, judged
 from verdicts import Estimate
 
-if TYPE_CHECKING:
-    from optuna.trial import FrozenTrial
-
-FOLDER = "retest"
+FOLDER, WINNER, RECORD = "retest", "winner.yml", "tuning.json"
 ROUNDING = 1e-9  # two that are the same but for this are the same
+LONGEST_LINE = 100
+LIBRARY_LOOP = "Stable-Baselines3's own loop, in which the agent trains unless told otherwise"
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting that is run again.
+    """A setting that is run again."""
 
-    Attributes:
-        number: of its trial.
-        entry: its hyperparameters.
-        value: what the search found it to be worth.
-    """
-
-    number: int
-    entry: Mapping[str, Any]
-    value: float
+    number: int  # of its trial
+    entry: Mapping[str, Any]  # its hyperparameters
+    value: float  # what the search found it to be worth
 
     @property
     def label(self) -> str:
@@ -52,8 +55,6 @@ def best_trials(trials: Sequence[FrozenTrial], *, is_cost: bool) -> list[Candida
 
     Each is there once, however many trials tried it.
     """
-    from optuna.trial import TrialState
-
     found: dict[str, Candidate] = {}
     for trial in trials:
         entry = trial.user_attrs.get(SETTINGS)
@@ -77,13 +78,14 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
         path.parent.mkdir(parents=True, exist_ok=True)
         write_text(path, entry_text(tuning, each.entry, ()))
         agents.append(AgentSpec(each.label, tuning.agent.algo, conf_file=path))
+    seeds = ", ".join(map(str, sorted(tuning.seeds)))
     metric = tuning.figure if tuning.figure in METRICS else "final"  # of scores and costs too
     return replace(
         tuning.study,
         name=FOLDER,
         title=f"{tuning.agent.algo} on {tuning.environment.env_id}: "
         f"the best settings of a search, on other seeds",
-        description=f"Settings that a search found on the seeds {_named(tuning.seeds)}, "
+        description=f"Settings that a search found on the seeds {seeds}, "
         "beside those that it began with, on seeds that it has not seen.",
         agents=tuple(agents),
         first_seed=tuning.first_retest_seed,
@@ -92,54 +94,35 @@ def retest_study(tuning: TuningSpec, root: Path, candidates: Sequence[Candidate]
     )
 
 
-def _named(seeds: Sequence[int]) -> str:
-    return ", ".join(map(str, sorted(seeds)))
-
-
 @dataclass(frozen=True)
 class Retested:
-    """What one of the settings came to on other seeds.
+    """What one of the settings came to on other seeds."""
 
-    Attributes:
-        label: what it is called.
-        number: of its trial; 0 for the settings that the search began with.
-        in_search: what the search found it to be worth; None where it was not judged to the end.
-        held_out: the same on the other seeds; None where no run is there.
-        interval: the mean of the scores there, or of what was asked for instead, with its interval.
-        verdict: on it beside the settings that the search began with; empty for these.
-        n_runs: how many runs there are.
-        n_failed: how many of them got less than half as far as the best typical run; None where
-            nothing says what that is.
-    """
-
-    label: str
-    number: int
-    in_search: float | None
-    held_out: float | None
-    interval: Estimate
-    verdict: str
-    n_runs: int
+    label: str  # what it is called
+    number: int  # of its trial; 0 for the settings that the search began with
+    in_search: float | None  # what the search found it to be worth, where judged to the end
+    held_out: float | None  # the same on the other seeds; None where no run is there
+    interval: Estimate  # of the mean of the scores there, or of what was asked for instead
+    verdict: str  # on it beside the settings that the search began with; empty for these
+    n_runs: int  # how many runs there are
+    # How many of them got less than half as far as the best typical run; None where nothing says
+    # what that is.
     n_failed: int | None
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a tuning comes to.
+    """What a tuning comes to."""
 
-    Attributes:
-        retested: the settings that the search began with, then the others, the best in the search
-            first.
-        winner: of the others that ran on all other seeds, the best there, where it is better than
-            those that the search began with, and no verdict says otherwise; None where none is.
-        optimism: by how much the best of the search was better there than on the other seeds; None
-            where it was not run again.
-        reason: why there is no winner; empty where there is one.
-    """
-
+    # The settings that the search began with, then the others, the best in the search first.
     retested: tuple[Retested, ...]
+    # Of the others that ran on all other seeds, the best there, where it is better than those that
+    # the search began with, and no verdict says otherwise.
     winner: Retested | None
+    # By how much the best of the search was better there than on the other seeds; None where it was
+    # not run again.
     optimism: float | None
-    reason: str
+    reason: str  # why there is no winner; empty where there is one
 
 
 def concluded(
@@ -148,27 +131,18 @@ def concluded(
     candidates: Sequence[Candidate],
     analysis: StudyAnalysis,
 ) -> Outcome:
-    """What the re-test shows.
-
-    Args:
-        tuning: what was asked for.
-        ranked: all settings that the search judged to the end, the best first.
-        candidates: those that were run again.
-        analysis: the study of these.
-    """
-    judged_there = {each.number: each.value for each in ranked}
+    """What the re-test shows: of all settings that were judged to the end, those run again."""
+    in_search = {each.number: each.value for each in ranked}
     numbers = {SHIPPED: 0} | {each.label: each.number for each in candidates}
-    environment = analysis.environments[0] if analysis.environments else None
     retested = [
-        _retested(tuning, label, number, judged_there.get(number), analysis, environment)
+        _retested(tuning, label, number, in_search.get(number), analysis)
         for label, number in numbers.items()
     ]
     winner, reason = _winner(tuning, retested)
     best = ranked[0].number if ranked else None
     found = next((each for each in retested if each.number == best), None)
-    return Outcome(
-        tuple(retested), winner, None if found is None else optimism(tuning, found), reason
-    )
+    apart = None if found is None else optimism(tuning, found)
+    return Outcome(tuple(retested), winner, apart, reason)
 
 
 def optimism(tuning: TuningSpec, best: Retested) -> float | None:
@@ -185,42 +159,27 @@ def _retested(
     number: int,
     in_search: float | None,
     analysis: StudyAnalysis,
-    environment: EnvironmentAnalysis | None,
 ) -> Retested:
-    runs = [run for run in analysis.results.planned if run.agent == label]
-    figures = _figures(tuning, runs)
-    held_out = judged(figures, tuning.objective, is_cost=tuning.is_cost) if figures else None
-    agent = _of_label(environment, label)
+    figures = []
+    for run in analysis.results.planned:
+        # The study says which runs are not there, and why.
+        with contextlib.suppress(UnjudgedError, DamagedFileError):
+            if run.agent == label:
+                figures.append(outcome_of(tuning, run).figure)
+    environment = next(iter(analysis.environments), None)
+    agents = () if environment is None else environment.agents
+    agent = next((agent for agent in agents if agent.agent == label), None)
+    failures = None if environment is None else environment.failures.get(label)
     return Retested(
         label=label,
         number=number,
         in_search=in_search,
-        held_out=held_out,
+        held_out=judged(figures, tuning.objective, is_cost=tuning.is_cost) if figures else None,
         interval=_interval(tuning, agent),
         verdict="" if number == 0 else _verdict(environment, label),
         n_runs=0 if agent is None else agent.n_runs,
-        n_failed=_n_failed(environment, label),
+        n_failed=None if failures is None else failures.n_failed,
     )
-
-
-def _n_failed(environment: EnvironmentAnalysis | None, label: str) -> int | None:
-    count = None if environment is None else environment.failures.get(label)
-    return None if count is None else count.n_failed
-
-
-def _figures(tuning: TuningSpec, runs: Sequence[PlannedRun]) -> list[float]:
-    figures = []
-    for run in runs:
-        try:
-            figures.append(outcome_of(tuning, run).figure)
-        except (UnjudgedError, DamagedFileError):
-            continue  # the study says which runs are not there, and why
-    return figures
-
-
-def _of_label(environment: EnvironmentAnalysis | None, label: str) -> AgentAnalysis | None:
-    agents = () if environment is None else environment.agents
-    return next((agent for agent in agents if agent.agent == label), None)
 
 
 def interval_of(tuning: TuningSpec) -> str:
@@ -263,3 +222,159 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     if best.verdict == "worse" or apart <= ROUNDING * abs(shipped.held_out):
         return None, "none is better than the shipped settings on other seeds"
     return best, ""
+
+
+# --- entries of hyperparameters, which say what they were tuned on --------------------------------
+
+
+def entry_text(tuning: TuningSpec, entry: Mapping[str, Any], lines: Sequence[str]) -> str:
+    """A file with one entry, as `hyperparams/` has them, and lines of what is said of it."""
+    env_id = tuning.environment.env_id.partition(":")[2] or tuning.environment.env_id
+    seeds = [{"first": each.start, "count": len(each)} for each in tuned_seeds(tuning)]
+    said = {TUNED_ON: {env_id: seeds[0] if len(seeds) == 1 else seeds}}
+    comment = "".join(f"# {line}\n" for line in lines)
+    return f"{_yaml(said)}\n{comment}{_yaml({env_id: plain(entry)})}"
+
+
+def tuned_seeds(tuning: TuningSpec) -> list[range]:
+    """The seeds that settings of a search have seen, in as few ranges as can be.
+
+    They are the search's own, and those of where it began.
+    """
+    agent = tuning.agent
+    before = seeds_tuned_on(agent.algo, tuning.environment.env_id, agent.conf_file) or ()
+    joined: list[range] = []
+    for each in sorted([*before, tuning.study.seeds], key=lambda seeds: seeds.start):
+        if joined and each.start <= joined[-1].stop:
+            joined[-1] = range(joined[-1].start, max(joined[-1].stop, each.stop))
+        elif each:
+            joined.append(each)
+    return joined
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes a setting a line; lists of plain values, and seeds, in one."""
+
+
+def _list(dumper: yaml.SafeDumper, items: list[Any]) -> yaml.Node:
+    are_plain = not any(isinstance(item, list | dict) for item in items)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=are_plain)
+
+
+def _mapping(dumper: yaml.SafeDumper, items: dict[str, Any]) -> yaml.Node:
+    return dumper.represent_mapping(
+        "tag:yaml.org,2002:map", items, flow_style=items.keys() == {"first", "count"}
+    )
+
+
+_Dumper.add_representer(list, _list)
+_Dumper.add_representer(dict, _mapping)
+
+
+def _yaml(data: Mapping[str, Any]) -> str:
+    return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True))
+
+
+# --- the winner -----------------------------------------------------------------------------------
+
+
+def write_winner(
+    tuning: TuningSpec, root: Path, outcome: Outcome, entry: Mapping[str, Any], n_trials: int
+) -> Path:
+    """Write the winner's entry, as `hyperparams/` and ``--conf-file`` take it; the file."""
+    path = root / WINNER
+    write_text(path, entry_text(tuning, entry, _provenance(tuning, outcome, entry, n_trials)))
+    return path
+
+
+def _provenance(
+    tuning: TuningSpec, outcome: Outcome, entry: Mapping[str, Any], n_trials: int
+) -> list[str]:
+    """Where the winner's settings come from, in lines."""
+    winner, shipped = outcome.winner, outcome.retested[0]
+    assert winner is not None
+    seeds, held_out = tuning.study.seeds, tuning.held_out
+    others = len(outcome.retested) - 1
+    chosen = f", the best of {others} that were run again" if others > 1 else ""
+    lower = "upper quartile" if tuning.is_cost else "lower quartile"
+    statistic = {"mean": "mean", "iqm": "interquartile mean", "lower": lower}[tuning.objective]
+    is_one_engine = tuning.searched(entry) == dict(entry)
+    engines = f" The search ran with engine: auto, the re-test in {LIBRARY_LOOP}."
+    text = (
+        f"Tuned by tune.py on {time.strftime('%Y-%m-%d')}: trial {winner.number} of {n_trials} "
+        f"({tuning.sampler}), {statistic} of {tuning.figure} over the seeds {seeds.start} to "
+        f"{seeds.stop - 1}: {_figure(winner.in_search)}. On the seeds {held_out.start} to "
+        f"{held_out.stop - 1}, which the search has not seen{chosen}: {_held_out(tuning, winner)}; "
+        f"the settings before, there: {_held_out(tuning, shipped)}. Verdict: {winner.verdict}."
+        f"{'' if is_one_engine else engines}"
+    )
+    return textwrap.wrap(text, LONGEST_LINE - len("# "))
+
+
+def _figure(value: float | None) -> str:
+    return "nothing" if value is None else f"{value:.4g}"
+
+
+def _held_out(tuning: TuningSpec, each: Retested) -> str:
+    """The figure, and an interval."""
+    found, text = each.interval, _figure(each.held_out)
+    if math.isnan(found.low):
+        return text
+    ends = f"{found.low:.4g} to {found.high:.4g}"
+    failed = f", {each.n_failed} of them failed" if each.n_failed else ""
+    of_what = interval_of(tuning)
+    return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs{failed})"
+
+
+# --- the record -----------------------------------------------------------------------------------
+
+
+def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> dict[str, Any]:
+    """Write what there is, and return it: for the page, and for whoever wants to know."""
+    tuning = place.tuning
+    data: dict[str, Any] = {
+        "name": tuning.study.name,
+        "command": command,
+        "asked": place.study.user_attrs.get(ASKED),
+        "figure": tuning.figure,
+        "objective": tuning.objective,
+        "lower_is_better": tuning.is_cost,
+        "n_trials": place.queue.n_trials,
+        "seeds": list(tuning.seeds),
+        "held_out_seeds": list(tuning.held_out),
+        "search_engine": tuning.searched(place.suggestions.shipped).get("engine"),
+        "engine": place.suggestions.shipped.get("engine"),
+        "widened": list(place.suggestions.space.widened),
+        "trials": [_trial(trial) for trial in place.queue.trials()],
+        "retest": None if outcome is None else _outcome(outcome),
+    }
+    data = plain(data)
+    write_json(place.root / RECORD, data)
+    return data
+
+
+def _trial(trial: FrozenTrial) -> dict[str, Any]:
+    said = trial.user_attrs
+    began, ended = trial.datetime_start, trial.datetime_complete
+    return {
+        "number": trial.number,
+        "state": trial.state.name.lower(),
+        "value": trial.value,
+        "params": dict(trial.params),
+        "settings": said.get(SETTINGS),
+        "figures": {str(seed): figure for seed, figure in figures_of(said).items()},
+        "seconds": seconds_of(said),
+        "failure": said.get(FAILURE),
+        "began": None if began is None else began.isoformat(),
+        "ended": None if ended is None else ended.isoformat(),
+    }
+
+
+def _outcome(outcome: Outcome) -> dict[str, Any]:
+    return {
+        "settings": [asdict(each) for each in outcome.retested],
+        "winner": None if outcome.winner is None else outcome.winner.label,
+        "winner_file": None if outcome.winner is None else WINNER,
+        "reason": outcome.reason,
+        "optimism": outcome.optimism,
+    }

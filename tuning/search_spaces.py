@@ -1,34 +1,71 @@
 """Spaces of settings to search: read from files, asked by Optuna, and back from settings.
 
-``search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see
+``hyperparams/search_spaces/ALGO.yml`` maps environment ids to ranges and choices, see
 `docs/search-spaces.md`. What an environment's entry says replaces what ``default`` says of the same
 name; null takes it out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+import inspect
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pipeline.errors import UserError, shown
-from pipeline.settings.hyperparams import override
+from optuna.distributions import (
+    BaseDistribution,
+    CategoricalDistribution,
+    FloatDistribution,
+    IntDistribution,
+)
+from optuna.trial import BaseTrial
+
+from pipeline.errors import UserError, shown, unknown
+from pipeline.models.load import agent_class
+from pipeline.settings.components import default_policy
+from pipeline.settings.hyperparams import Hyperparams, check_algorithm_kwargs, override, split
+from pipeline.settings.values import (
+    DottedName,
+    algorithm_parameters,
+    check_arguments,
+    constructor_parameters,
+    parse_literal,
+)
 from pipeline.settings.yaml import read_yaml
-from tuning.dimensions import LEFT_OUT, Pick, same
-from tuning.flat_settings import flat_items, nested, with_mappings
-from tuning.number_ranges import spread
-from tuning.space_checks import check_against_agent, defaults_of
-from tuning.space_entries import Conditional, check_names, check_order, read_conditional
-
-if TYPE_CHECKING:
-    from optuna.distributions import BaseDistribution
-    from optuna.trial import BaseTrial
+from tuning.dimensions import (
+    FINAL_SHARE,
+    FORMS,
+    LEFT_OUT,
+    Choice,
+    Dimension,
+    NumberRange,
+    Pick,
+    Scale,
+    Word,
+    is_word,
+    same,
+    spread,
+)
 
 # Of a range; so many that hardly any whole numbers are as far apart.
 _PARTS = 98
 
-_FOLDER = Path(__file__).resolve().parents[1] / "search_spaces"
+_FOLDER = Path(__file__).resolve().parents[1] / "hyperparams" / "search_spaces"
+# What would make the task another one, so that the easiest would win.
+_TASK = ("env_kwargs", "eval_env_kwargs")
+# The keys of each kind of entry, and their types.
+_RANGE: Mapping[str, Any] = {
+    "low": float,
+    "high": float,
+    "scale": Scale,
+    "forms": list[Any],
+    "final_share": list[float],
+    "when": dict[str, Any],
+}
+_CHOICE: Mapping[str, Any] = {"choices": dict[str, Any] | list[Any], "when": dict[str, Any]}
+_SETS: Mapping[str, Any] = {"sets": dict[str, dict[str, Any]], "when": dict[str, Any]}
 
 
 @dataclass(frozen=True)
@@ -36,20 +73,19 @@ class SearchSpace:
     """What a search chooses for one agent on one environment.
 
     Attributes:
-        entries: dimensions and their conditions by name, in the order in which they are asked.
+        entries: dimensions by name, in the order in which they are asked.
         defaults: what a setting is where none is said; those not named are just left out.
         widened: names of the dimensions that `including` made wider.
     """
 
-    entries: Mapping[str, Conditional]
+    entries: Mapping[str, Dimension]
     defaults: Mapping[str, Any]
     widened: tuple[str, ...] = ()
 
     @property
     def keys(self) -> tuple[str, ...]:
         """The settings that the space decides, inner ones dotted: ``policy_kwargs.net_arch``."""
-        dimensions = (entry.dimension for entry in self.entries.values())
-        return tuple(dict.fromkeys(key for dimension in dimensions for key in dimension.keys))
+        return tuple(dict.fromkeys(key for each in self.entries.values() for key in each.keys))
 
     def suggest(self, trial: BaseTrial) -> dict[str, Any]:
         """Settings in the form of hyperparameter files, to be put into an entry by `merged`.
@@ -58,14 +94,13 @@ class SearchSpace:
             trial: of Optuna; a FixedTrial does too. Only what exists under what was chosen before
                 is asked for.
         """
-        return nested(self._chosen(lambda name, ends: _ask(trial, name, ends)))
+        return self._chosen(lambda name, ends: _ask(trial, name, ends))
 
     def at(self, params: Mapping[str, Any]) -> dict[str, Any]:
         """The settings under parameters, of which there may be more than those that exist."""
-        return nested(self._chosen(lambda name, _: params[name]))
+        return self._chosen(lambda name, _: params[name])
 
     def _chosen(self, pick: Pick) -> dict[str, Any]:
-        """Flat settings."""
         words: dict[str, Any] = {}
 
         def noting(name: str, ends: BaseDistribution) -> Any:
@@ -73,27 +108,30 @@ class SearchSpace:
             return words[name]
 
         chosen: dict[str, Any] = {}
-        for entry in self.entries.values():
-            if _is_there(entry, words):
-                chosen.update(entry.dimension.settings(noting))
-        return chosen
+        for each in self.entries.values():
+            if _is_there(each, words):
+                chosen.update(each.settings(noting))
+        nested: dict[str, Any] = {}
+        for key, value in chosen.items():
+            outer, _, inner = key.partition(".")
+            if value is not LEFT_OUT:
+                (nested.setdefault(outer, {}) if inner else nested)[inner or outer] = value
+        return nested
 
     def distributions(self) -> dict[str, BaseDistribution]:
         """All of Optuna's parameters, those that exist under a condition too."""
-        found: dict[str, BaseDistribution] = {}
-        for entry in self.entries.values():
-            found.update(entry.dimension.distributions())
-        return found
+        return {
+            name: ends
+            for each in self.entries.values()
+            for name, ends in each.distributions.items()
+        }
 
     def grid(self, n: int) -> dict[str, list[Any]]:
-        """Values for Optuna's GridSampler: all words, and at most ``n`` of each number."""
-        found: dict[str, list[Any]] = {}
-        for entry in self.entries.values():
-            found.update(entry.dimension.grid(n))
-        return found
+        """Values for each parameter: all words, and at most ``n`` numbers from end to end."""
+        return {name: spread(ends, n) for name, ends in self.distributions().items()}
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that make `suggest` say these settings, for ``study.enqueue_trial``.
+        """The parameters that make `suggest` say these settings.
 
         Args:
             settings: an entry of hyperparameters. What it leaves out is at its default.
@@ -101,34 +139,32 @@ class SearchSpace:
         Raises:
             UserError: if they lie outside of the space, see `including`.
         """
-        flat = self._flat(settings)
+        flat = self.flat(settings)
         params: dict[str, Any] = {}
-        for entry in self.entries.values():
-            if not _is_there(entry, params):
+        for each in self.entries.values():
+            if not _is_there(each, params):
                 continue
             try:
-                params.update(entry.dimension.params_of(flat))
+                params.update(each.params_of(flat))
             except LookupError as error:
-                name = entry.dimension.name
                 raise UserError(
-                    f"{name}: the search space does not hold {shown(flat.get(name))}"
+                    f"{each.name}: the search space does not hold {shown(flat.get(each.name))}"
                 ) from error
         return params
 
     def including(self, settings: Mapping[str, Any]) -> SearchSpace:
         """The space, as much wider as it takes to hold these settings; see ``widened``."""
-        flat = self._flat(settings)
+        flat = self.flat(settings)
         params: dict[str, Any] = {}
-        entries, widened = {}, []
-        for name, entry in self.entries.items():
-            wider = entry
-            if _is_there(entry, params):
-                wider = replace(entry, dimension=entry.dimension.including(flat))
-                params.update(wider.dimension.params_of(flat))
-            if wider != entry:
+        entries, widened = dict(self.entries), list(self.widened)
+        for name, each in self.entries.items():
+            if not _is_there(each, params):
+                continue
+            entries[name] = each.including(flat)
+            params.update(entries[name].params_of(flat))
+            if entries[name] != each:
                 widened.append(name)
-            entries[name] = wider
-        return replace(self, entries=entries, widened=(*self.widened, *widened))
+        return replace(self, entries=entries, widened=tuple(widened))
 
     def merged(self, shipped: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
         """An entry of hyperparameters with chosen settings in it.
@@ -140,7 +176,7 @@ class SearchSpace:
             shipped: the entry before.
             settings: what `suggest` returned.
         """
-        kept = with_mappings(shipped, self.keys)
+        kept = _with_mappings(shipped, self.keys)
         for key in self.keys:
             outer, _, inner = key.partition(".")
             if inner and isinstance(kept.get(outer), dict):
@@ -155,74 +191,55 @@ class SearchSpace:
         }
         return {key: value for key, value in override(kept, changes).items() if value != {}}
 
-    def _flat(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        given = dict(flat_items(with_mappings(settings, self.keys), self.keys))
-        return {
-            key: self.defaults.get(key, LEFT_OUT) if value is LEFT_OUT else value
-            for key, value in given.items()
-        }
+    def flat(self, settings: Mapping[str, Any]) -> dict[str, Any]:
+        """The values of an entry under the space's keys; of what it leaves out, the defaults."""
+        given, found = _with_mappings(settings, self.keys), {}
+        for key in self.keys:
+            outer, _, inner = key.partition(".")
+            value = given.get(outer, LEFT_OUT)
+            if inner:
+                value = value.get(inner, LEFT_OUT) if isinstance(value, Mapping) else LEFT_OUT
+            found[key] = self.defaults.get(key, LEFT_OUT) if value is LEFT_OUT else value
+        return found
 
 
-def read_search_space(algo: str, env_id: str, path: Path | str | None = None) -> SearchSpace:
-    """Read what a search chooses for an agent on an environment.
-
-    Args:
-        algo: the agent, whose file is ``search_spaces/<algo>.yml``.
-        env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts.
-        path: another file to read.
-
-    Raises:
-        UserError: if the file cannot be read, is not of this format, says nothing to search, or
-            chooses what the agent does not take.
-    """
-    path = _FOLDER / f"{algo}.yml" if path is None else Path(path)
-    if not path.is_file():
-        raise UserError(f"{path}: there is no such file: name one with --search-space FILE")
-    where, said = _entry(path, env_id.partition(":")[2] or env_id)
-    entries = {name: read_conditional(name, value, where) for name, value in said.items()}
-    if not entries:
-        raise UserError(f"{where}: there is nothing to search for {algo}")
-    check_names(entries, where)
-    check_order(entries, where)
-    space = SearchSpace(entries, {})
-    space = replace(space, defaults=defaults_of(algo, space.keys))
-    check_against_agent(algo, corners(space), where)
-    _check_between(algo, space, where)
-    return space
+def _with_mappings(settings: Mapping[str, Any], keys: Iterable[str]) -> dict[str, Any]:
+    """The settings, with mappings that are written as texts read where keys lead into them."""
+    outer = {key.partition(".")[0] for key in keys if "." in key}
+    return {
+        key: _plain(parse_literal(value, key)) if key in outer and isinstance(value, str) else value
+        for key, value in settings.items()
+    }
 
 
-def _check_between(algo: str, space: SearchSpace, where: str) -> None:
-    """Make sure that an agent takes what lies between the ends of ranges, too.
-
-    Raises:
-        UserError: where it needs whole numbers, and the ends are not written as such.
-    """
-    from optuna.distributions import FloatDistribution
-
-    for name, kind in space.distributions().items():
-        if isinstance(kind, FloatDistribution):
-            between = _with_one(space, _ends(space)[0], name, spread(kind, _PARTS)[1])
-            try:
-                check_against_agent(algo, [between], where)
-            except UserError as error:
-                raise UserError(f"{error}: write low and high without a point") from error
+def _plain(value: Any) -> Any:
+    """Names of classes as the texts that a file holds."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value.name if isinstance(value, DottedName) else value
 
 
-def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
-    """Where an environment's entry stands, and what it says together with the default."""
-    file = read_yaml(path)
-    for name, entry in file.items() if isinstance(file, dict) else [("", None)]:
-        is_entry = isinstance(entry, dict) and all(isinstance(key, str) for key in entry)
-        if not (isinstance(name, str) and (is_entry or entry is None)) or not name:
-            raise UserError(
-                f"{path}: must map environment ids to names of settings and their ranges"
-            )
-    own = (file.get(env_id) or {}) if env_id in file else {}
-    if env_id not in file and "default" not in file:
-        raise UserError(f"{path}: no entry for {shown(env_id)}, and no default")
-    both = {**(file.get("default") or {}), **own}
-    where = f"{path}: {env_id if env_id in file else 'default'}"
-    return where, {name: value for name, value in both.items() if value is not None}
+def _is_there(dimension: Dimension, chosen: Mapping[str, Any]) -> bool:
+    return all(
+        other in chosen and any(same(chosen[other], word) for word in words)
+        for other, words in dimension.when.items()
+    )
+
+
+def _ask(trial: BaseTrial, name: str, kind: BaseDistribution) -> Any:
+    match kind:
+        case FloatDistribution():
+            return trial.suggest_float(name, kind.low, kind.high, log=kind.log)
+        case IntDistribution():
+            return trial.suggest_int(name, kind.low, kind.high, log=kind.log)
+        case CategoricalDistribution():
+            return trial.suggest_categorical(name, kind.choices)
+    raise TypeError(kind)
+
+
+# --- points of a space ----------------------------------------------------------------------------
 
 
 def corners(space: SearchSpace) -> Iterator[dict[str, Any]]:
@@ -251,37 +268,201 @@ def _with_one(
     space: SearchSpace, params: Mapping[str, Any], changed: str, value: Any
 ) -> dict[str, Any]:
     """Settings under the parameters but for one, with the words under which that one is there."""
-    return space.at({**params, **_needed(space, changed), changed: value})
-
-
-def _needed(space: SearchSpace, param: str) -> dict[str, Any]:
-    """The words of other choices under which a parameter is there."""
     needed: dict[str, Any] = {}
-    open_names = [name for name, e in space.entries.items() if param in e.dimension.distributions()]
-    while open_names:
-        for other, words in space.entries[open_names.pop()].when.items():
+    names = [name for name, each in space.entries.items() if changed in each.distributions]
+    while names:
+        for other, words in space.entries[names.pop()].when.items():
             needed[other] = words[0]
-            open_names.append(other)
-    return needed
+            names.append(other)
+    return space.at({**params, **needed, changed: value})
 
 
-def _is_there(entry: Conditional, chosen: Mapping[str, Any]) -> bool:
-    return all(
-        other in chosen and any(same(chosen[other], word) for word in words)
-        for other, words in entry.when.items()
-    )
+# --- read from a file -----------------------------------------------------------------------------
 
 
-def _ask(trial: BaseTrial, name: str, distribution: BaseDistribution) -> Any:
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+def read_search_space(algo: str, env_id: str, path: Path | str | None = None) -> SearchSpace:
+    """Read what a search chooses for an agent on an environment.
 
-    match distribution:
-        case FloatDistribution():
-            low, high = distribution.low, distribution.high
-            return trial.suggest_float(name, low, high, log=distribution.log)
-        case IntDistribution():
-            low, high = distribution.low, distribution.high
-            return trial.suggest_int(name, low, high, log=distribution.log)
-        case CategoricalDistribution():
-            return trial.suggest_categorical(name, distribution.choices)
-    raise TypeError(distribution)
+    Args:
+        algo: the agent, whose file is ``hyperparams/search_spaces/<algo>.yml``.
+        env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts.
+        path: another file to read.
+
+    Raises:
+        UserError: if the file cannot be read, is not of this format, says nothing to search, or
+            chooses what the agent does not take.
+    """
+    path = _FOLDER / f"{algo}.yml" if path is None else Path(path)
+    if not path.is_file():
+        raise UserError(f"{path}: there is no such file: name one with --search-space FILE")
+    where, said = _entry(path, env_id.partition(":")[2] or env_id)
+    entries = {name: _dimension(name, value, f"{where}: {name}") for name, value in said.items()}
+    if not entries:
+        raise UserError(f"{where}: there is nothing to search for {algo}")
+    _check_names(entries, where)
+    _check_conditions(entries, where)
+    space = SearchSpace(entries, {})
+    known = _defaults(algo)
+    space = replace(space, defaults={key: known[key] for key in space.keys if key in known})
+    for settings in corners(space):
+        _check_settings(algo, settings, where)
+    for name, kind in space.distributions().items():  # between the ends, too
+        if isinstance(kind, FloatDistribution):
+            between = _with_one(space, _ends(space)[0], name, spread(kind, _PARTS)[1])
+            try:
+                _check_settings(algo, between, where)
+            except UserError as error:
+                raise UserError(f"{error}: write low and high without a point") from error
+    return space
+
+
+def _entry(path: Path, env_id: str) -> tuple[str, dict[str, Any]]:
+    """Where an environment's entry stands, and what it says together with the default."""
+    file = read_yaml(path)
+    for name, entry in file.items() if isinstance(file, dict) else [("", None)]:
+        is_entry = isinstance(entry, dict) and all(isinstance(key, str) for key in entry)
+        if not (isinstance(name, str) and (is_entry or entry is None)) or not name:
+            raise UserError(
+                f"{path}: must map environment ids to names of settings and their ranges"
+            )
+    if env_id not in file and "default" not in file:
+        raise UserError(f"{path}: no entry for {shown(env_id)}, and no default")
+    both = {**(file.get("default") or {}), **(file.get(env_id) or {})}
+    where = f"{path}: {env_id if env_id in file else 'default'}"
+    return where, {name: value for name, value in both.items() if value is not None}
+
+
+def _dimension(name: str, said: Any, place: str) -> Dimension:
+    """Read what stands beside a name: a list, or a mapping as `docs/search-spaces.md` has it."""
+    if isinstance(said, list):
+        said = {"choices": said}
+    if not isinstance(said, dict):
+        raise UserError(
+            f"{place} must be a list of values, or map low and high, choices or sets to theirs; "
+            f"not {shown(said)}"
+        )
+    known = _CHOICE if "choices" in said else _SETS if "sets" in said else _RANGE
+    parameters = {
+        key: inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, annotation=annotation)
+        for key, annotation in known.items()
+    }
+    checked = check_arguments(said, parameters, place, "key")
+    when = {other: _words(said, place) for other, said in checked.get("when", {}).items()}
+    if known is _RANGE:
+        ends = {end: said[end] for end in ("low", "high") if isinstance(said.get(end), int)}
+        # A range is of whole numbers where both ends are written so.
+        whole = ends if len(ends) == 2 else {}
+        return replace(_number_range(name, {**checked, **whole}, place), when=when)
+    options = checked["sets"] if known is _SETS else _options(name, checked["choices"], place)
+    if len(options) < 2:
+        raise UserError(f"{place}: there must be two values at least to choose from")
+    return Choice(name, options, when)
+
+
+def _words(said: Any, place: str) -> tuple[Word, ...]:
+    words = said if isinstance(said, list) else [said]
+    for word in words:
+        if not is_word(word):
+            raise UserError(f"{place}: when names values of another choice, not {shown(word)}")
+    return tuple(words)
+
+
+def _options(name: str, choices: Any, place: str) -> dict[Word, dict[str, Any]]:
+    if isinstance(choices, dict):
+        return {word: {name: value} for word, value in choices.items()}
+    for value in choices:
+        if not is_word(value):
+            raise UserError(
+                f"{place}: {shown(value)} needs a name, as in choices: {{small: [64, 64]}}"
+            )
+    return {value: {name: value} for value in choices}
+
+
+def _number_range(name: str, checked: Mapping[str, Any], place: str) -> NumberRange:
+    for end in ("low", "high"):
+        if end not in checked:
+            raise UserError(f"{place}: {end} is missing")
+    low, high, scale = checked["low"], checked["high"], checked.get("scale", "linear")
+    if not -math.inf < low < high < math.inf:
+        raise UserError(
+            f"{place}: low must be below high, and both finite: not {shown(low)} and {shown(high)}"
+        )
+    if scale in {"log", "powers_of_two"} and low <= 0:
+        raise UserError(f"{place}: scale {scale} needs low above 0, not {shown(low)}")
+    if scale == "log_below_one" and high >= 1:
+        raise UserError(f"{place}: scale {scale} needs high below 1, not {shown(high)}")
+    are_powers = (isinstance(end, int) and end.bit_count() == 1 for end in (low, high))
+    if scale == "powers_of_two" and not all(are_powers):
+        raise UserError(f"{place}: scale {scale} needs whole powers of two as low and high")
+    forms = checked.get("forms", ["constant"])
+    if not any(isinstance(form, str) and form in FORMS for form in forms):
+        raise UserError(f"{place}: forms must name one of {', '.join(FORMS)}, and what else may be")
+    for form in forms:
+        if not is_word(form):
+            raise UserError(f"{place}: forms are words and single values, not {shown(form)}")
+    share = tuple(checked.get("final_share", FINAL_SHARE))
+    if len(share) != 2 or not 0 < share[0] < share[1] < math.inf:
+        raise UserError(f"{place}: final_share must be two numbers above 0, the smaller one first")
+    own = tuple(form for form in forms if form in FORMS)
+    instead = {form: form for form in forms if form not in FORMS}
+    return NumberRange(name, low, high, scale, own, (share[0], share[1]), instead)
+
+
+def _check_names(entries: Mapping[str, Dimension], where: str) -> None:
+    """Make sure that nothing is chosen twice, and that the task is not chosen at all."""
+    deciders: dict[str, str] = {}
+    for name, each in entries.items():
+        task = next((key for key in each.keys if key.partition(".")[0] in _TASK), None)
+        if task is not None:
+            raise UserError(
+                f"{where}: {task} is what settings are judged on, and not searched: give it by "
+                "--env-kwargs, or search train_env_kwargs"
+            )
+        decided = () if each.when else each.keys  # under conditions it may be one or the other
+        for key in (*decided, *each.distributions):
+            other = deciders.setdefault(key, name)
+            if other != name:
+                raise UserError(f"{where}: {other} and {name} both decide {key}: leave one out")
+
+
+def _check_conditions(entries: Mapping[str, Dimension], where: str) -> None:
+    """Make sure that conditions speak of choices further up, and of words that these have."""
+    before: dict[str, Choice] = {}
+    for name, each in entries.items():
+        for other, words in each.when.items():
+            place = f"{where}: {name}: when"
+            if other not in before:
+                raise unknown(f"{place}: no choice above it is called", other, before)
+            options = before[other].options
+            strange = next((word for word in words if word not in options), None)
+            if strange is not None:
+                raise unknown(f"{place}: {other} has no value", str(strange), map(str, options))
+        if isinstance(each, Choice):
+            before[name] = each
+
+
+def _check_settings(algo: str, settings: Mapping[str, Any], where: str) -> None:
+    """Make sure that an agent takes settings, by their names, types and bounds."""
+    parameters = algorithm_parameters(agent_class(algo))
+    check_algorithm_kwargs(split(settings, where).algorithm, parameters, where)
+
+
+def _defaults(algo: str) -> dict[str, Any]:
+    """What settings of an agent are where none is said, as far as there is a default for each."""
+    algorithm = agent_class(algo)
+    policy = algorithm.policy_aliases.get(default_policy(algorithm, is_dict=False), object)
+    return {
+        **{key.name: key.default for key in fields(Hyperparams) if "wrapper" not in key.name},
+        **dict.fromkeys(("env_wrapper", "train_env_wrapper", "vec_env_wrapper", "callback")),
+        "normalize": False,
+        **_argument_defaults(algorithm_parameters(algorithm), ""),
+        **_argument_defaults(constructor_parameters(policy), "policy_kwargs."),
+    }
+
+
+def _argument_defaults(parameters: Mapping[str, inspect.Parameter], prefix: str) -> dict[str, Any]:
+    return {
+        prefix + name: f"nn.{p.default.__name__}" if isinstance(p.default, type) else p.default
+        for name, p in parameters.items()
+        if p.default is not p.empty
+    }

@@ -6,41 +6,193 @@ import contextlib
 import math
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
+from optuna import Study, Trial
+from optuna.distributions import distribution_to_json
+from optuna.exceptions import UpdateFinishedTrialError
+from optuna.trial import TrialState
+
+from agents import ALGORITHMS
 from experiments.launching import Launcher, RunFailure
-from experiments.plan import PlannedRun
+from experiments.plan import PlannedRun, check_settings
+from experiments.results import read_run
+from experiments.run_files import Curve
 from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from pipeline.files import DISK_ERRORS, plain
 from pipeline.locks import FolderGoneError, is_gone
-from tuning.judging import RunOutcome, UnjudgedError, judged, outcome_of
-from tuning.suggesting import Suggestions
-from tuning.trial_queue import (
+from safe_files.regular_files import take_up
+from tuning.pruning import is_hopeless
+from tuning.search_spaces import read_search_space, steps_aside
+from tuning.suggesting import Suggestions, check_entry, make_sampler, planned_run, shipped_run
+from tuning.trial_storage import (
     FAILURE,
     FIGURES,
+    JUDGED_BY,
     SECONDS,
     SETTINGS,
     TrialQueue,
     figures_of,
+    open_storage,
+    open_study,
     seconds_of,
+    turn,
 )
-from tuning.trial_runs import planned_run
-from tuning.tuning_spec import TuningSpec
-
-if TYPE_CHECKING:
-    from optuna import Trial
+from tuning.tuning_spec import AUTO, TuningSpec, judged
+from verdicts import steps_to_threshold
 
 SECONDS_BETWEEN_LOOKS = 1.0
 # So many that fail in a row, and none before that did not: then it is not their settings.
 MOST_FAILURES = 5
 _ROOM_FOR_A_RUN = 1 << 18  # bytes, of a small one
+# What a run costs that never comes to the threshold, in whole runs: with the cost of what was done
+# alone, giving up early would look cheap.
+WHOLE_RUNS = 2
 
-Hopeless = Callable[[int, Mapping[int, float]], bool]
+
+@dataclass(frozen=True)
+class OpenTuning:
+    """A tuning that is ready: everything checked, and what keeps its trials open."""
+
+    tuning: TuningSpec  # what is asked for
+    root: Path  # its folder
+    study: Study  # of Optuna
+    queue: TrialQueue  # its trials
+    suggestions: Suggestions  # what they try
+
+    def hopeless(self, number: int, figures: Mapping[int, float]) -> bool:
+        """Whether a trial has no more hope to be the best, by its seeds so far."""
+        sign = -1.0 if self.tuning.is_cost else 1.0
+        others = [
+            {seed: sign * figure for seed, figure in figures_of(trial.user_attrs).items()}
+            for trial in self.queue.trials()
+            if trial.number != number
+        ]
+        scores = {seed: sign * figure for seed, figure in figures.items()}
+        # Costs have their sign turned: of what is left, higher is better.
+        value = partial(judged, objective=self.tuning.objective, is_cost=False)
+        # A score of 1 is the optimum. Where nobody knows that, returns stand in its place, of which
+        # no 1 says anything.
+        is_score = self.queue.known_figure == "score"
+        return is_hopeless(
+            scores,
+            others,
+            self.tuning.pruner,
+            value,
+            n_seeds=len(self.tuning.seeds),
+            ceiling=1.0 if is_score else -math.inf,
+        )
+
+
+def open_tuning(tuning: TuningSpec, root: Path, storage: str | None) -> OpenTuning:
+    """Check what is asked for, and open what keeps its trials.
+
+    The folder is made, where there is nothing to complain of; ``storage`` is what ``--storage``
+    says.
+    """
+    take_up(root)
+    run = shipped_run(tuning, root)
+    check_settings(tuning.study, [run])
+    if tuning.figure == AUTO:
+        is_bandit = ALGORITHMS[tuning.agent.algo].for_bandits
+        tuning = replace(tuning, figure="regret" if is_bandit else "score")
+    agent = tuning.agent
+    space = read_search_space(agent.algo, tuning.environment.env_id, tuning.search_space)
+    suggestions = Suggestions(tuning, space, run.spec.saved_hyperparams)
+    if not suggestions.n_free:
+        raise UserError(f"{agent.algo}: its search space leaves nothing to choose")
+    for settings in steps_aside(suggestions.space, suggestions.first):
+        check_entry(tuning, root, suggestions.merged(settings))
+    n_trials = suggestions.n_trials
+    ranges = suggestions.space.distributions()
+    as_json = {name: distribution_to_json(kind) for name, kind in ranges.items()}
+    asked = tuning.identity(suggestions.shipped, as_json)
+    with _made(root):
+        with turn(root):  # of several that make a file's tables at once, all but one would fail
+            opened = open_storage(root, storage)
+        study = open_study(tuning, root, opened, make_sampler(tuning), asked)
+    return OpenTuning(tuning, root, study, TrialQueue(study, root, n_trials), suggestions)
+
+
+@contextlib.contextmanager
+def _made(root: Path) -> Iterator[None]:
+    """A folder that is there, and gone again where something fails and nothing came into it."""
+    root.mkdir(parents=True, exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        for folder in (root, *list(root.parents)[:2]):
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+        raise
+
+
+# --- what a run is worth --------------------------------------------------------------------------
+
+
+class UnjudgedError(Exception):
+    """A run is there, and says nothing that a search could go by."""
+
+
+@dataclass(frozen=True)
+class RunOutcome:
+    """What came of a run."""
+
+    figure: float  # what it is judged by
+    seconds: float  # processor time that it took
+    name: str  # of the figure: as asked for, but the final return where no score is known
+
+
+def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
+    """What a finished run is judged by, and what it took.
+
+    Raises:
+        UnjudgedError: if it has no such figure.
+        DamagedFileError: if a file of it is missing or changed.
+        UserError: if no run has such a figure here, since nobody says what the threshold is.
+    """
+    results = read_run(tuning.study, planned)
+    if results is None:
+        raise UnjudgedError("it has not finished")
+    row, name = results.rows[0], tuning.figure
+    figure: float | None
+    if name in ("steps", "seconds"):
+        figure = _cost(tuning, row, results.curves[0])
+    else:
+        if name == "score" and row.get(name) is None:  # where no optimum is known
+            name = "final"
+        figure = row.get(name)
+        if figure is None or not math.isfinite(figure):
+            raise UnjudgedError(f"it has no figure for {name}")
+    return RunOutcome(float(figure), float(row.get("cpu_seconds") or row["seconds"]), name)
+
+
+def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> float:
+    """Steps or seconds until the learning curve comes to the threshold.
+
+    Source: a run that never does counts twice, as in the PAR-k of Hutter et al. (2009), "ParamILS",
+    JAIR 36.
+    """
+    threshold, name = row.get("threshold"), tuning.figure
+    if threshold is None:
+        raise UserError(
+            f"--metric {name}: no threshold is known on "
+            f"{tuning.environment.env_id}; give --threshold"
+        )
+    figures = evaluations.figures
+    points = figures["step" if name == "steps" else "seconds"]
+    reached = steps_to_threshold(points, figures["value"], float(threshold))
+    whole = float(row["n_timesteps"] if name == "steps" else row["seconds"])
+    return float(reached) if math.isfinite(reached) else WHOLE_RUNS * whole
+
+
+# --- the loop -------------------------------------------------------------------------------------
 
 
 class Listener(Protocol):
@@ -55,69 +207,39 @@ class Listener(Protocol):
 
 @dataclass
 class TrialUnderWay:
-    """A setting that is being judged.
+    """A setting that is being judged."""
 
-    Attributes:
-        trial: of Optuna.
-        entry: its hyperparameters.
-        seeds: those that have not begun, in their order.
-        figures: what came of those that are done.
-        seconds: what they took.
-        n_running: how many are under way.
-        is_over: whether what still comes is of no interest.
-    """
-
-    trial: Trial
-    entry: dict[str, Any]
-    seeds: list[int]
-    figures: dict[int, float] = field(default_factory=dict)
-    seconds: float = 0.0
-    n_running: int = 0
-    is_over: bool = False
+    trial: Trial  # of Optuna
+    entry: dict[str, Any]  # its hyperparameters
+    seeds: list[int]  # those that have not begun, in their order
+    figures: dict[int, float]  # what came of those that are done
+    seconds: float  # what they took
+    n_running: int = 0  # how many are under way
+    is_over: bool = False  # whether what still comes is of no interest
 
 
 class Search:
-    """A driver's part in a search.
-
-    Args:
-        tuning: what is asked for.
-        root: its folder.
-        queue: where trials come from.
-        suggestions: what they try.
-        launcher: where runs are done.
-        hopeless: whether to end a trial of this number, by its figures so far.
-        listener: told how far it is.
-        deadline: when no further run is begun, by `time.monotonic`.
-    """
+    """A driver's part in a search; after the deadline, by `time.monotonic`, no run is begun."""
 
     def __init__(
         self,
-        tuning: TuningSpec,
-        root: Path,
-        queue: TrialQueue,
-        suggestions: Suggestions,
+        place: OpenTuning,
         launcher: Launcher,
-        hopeless: Hopeless,
         listener: Listener,
         deadline: float = math.inf,
     ) -> None:
-        self.tuning, self.root, self.queue, self.suggestions = tuning, root, queue, suggestions
-        self.launcher, self.hopeless, self.listener = launcher, hopeless, listener
-        self.deadline = deadline
+        self.place, self.tuning, self.queue = place, place.tuning, place.queue
+        self.launcher, self.listener, self.deadline = launcher, listener, deadline
         self._trials: list[TrialUnderWay] = []
         self._runs: dict[Future[RunFailure | None], tuple[TrialUnderWay, PlannedRun]] = {}
         self._failures: list[str] | None = []  # in a row from the first on; None after a success
 
     def run(self) -> None:
-        """Do trials until there are none left, or the time is over.
-
-        Raises:
-            UserError: if nothing but failures comes of it.
-        """
+        """Do trials until there are none left, or the time is over."""
         try:
             while not self._is_at_end():
-                if is_gone(self.root):
-                    raise FolderGoneError(self.root)
+                if is_gone(self.place.root):
+                    raise FolderGoneError(self.place.root)
                 self._hand_out()
                 self._look()
         finally:
@@ -148,12 +270,11 @@ class Search:
         return min(open_ones, key=lambda each: each.n_running, default=None)
 
     def _new_trial(self) -> TrialUnderWay | None:
-        while (trial := self.queue.claim(self.suggestions.params)) is not None:
-            entry = self.suggestions.entry(trial)
+        while (trial := self.queue.claim(self.place.suggestions.params)) is not None:
+            entry = self.place.suggestions.entry(trial)
             trial.set_user_attr(SETTINGS, plain(entry))
-            known = figures_of(trial.user_attrs)
+            known, seconds = figures_of(trial.user_attrs), seconds_of(trial.user_attrs)
             seeds = [seed for seed in self.tuning.seeds if seed not in known]
-            seconds = seconds_of(trial.user_attrs)
             new = TrialUnderWay(trial, entry, seeds, known, seconds)
             self._trials.append(new)
             if known:  # its driver may have ended between the last of them and the judgement
@@ -164,20 +285,17 @@ class Search:
 
     def _begin(self, each: TrialUnderWay, seed: int) -> None:
         try:
-            planned = planned_run(self.tuning, self.root, each.entry, seed)
+            planned = planned_run(self.tuning, self.place.root, each.entry, seed)
         except UserError as error:
             self._fail(each, str(error))
             return
         each.n_running += 1
-        self._runs[self._submitted(planned)] = (each, planned)
-
-    def _submitted(self, planned: PlannedRun) -> Future[RunFailure | None]:
-        """A run that is there, of equal settings or a driver before, is not done again."""
-        if not planned.is_finished:
-            return self.launcher.submit(planned)
-        done: Future[RunFailure | None] = Future()
-        done.set_result(None)
-        return done
+        if planned.is_finished:  # by a trial of equal settings, or a driver before
+            future: Future[RunFailure | None] = Future()
+            future.set_result(None)
+        else:
+            future = self.launcher.submit(planned)
+        self._runs[future] = (each, planned)
 
     def _look(self) -> None:
         """Wait until a run has ended, or it is time to look for trials that others left."""
@@ -196,7 +314,7 @@ class Search:
     def _note(self, each: TrialUnderWay, planned: PlannedRun, failure: RunFailure | None) -> None:
         """Take in what came of a run."""
         if failure is not None:
-            _check_room(self.root)
+            _check_room(self.place.root)
             where = "" if failure.log is None else f"; see {failure.log}"
             self._fail(each, f"seed {planned.seed}: {failure.reason}{where}")
             return
@@ -206,30 +324,26 @@ class Search:
             self._fail(each, f"seed {planned.seed}: {error}")
             return
         self._failures = None
-        self._check_alike(outcome)
-        each.figures[planned.seed] = outcome.figure
-        each.seconds += outcome.seconds
-        with _lost_to_others():
-            figures = {str(seed): figure for seed, figure in each.figures.items()}
-            self._report(each)
-            each.trial.set_user_attr(SECONDS, each.seconds)
-            each.trial.set_user_attr(FIGURES, figures)  # the last: from now on the seed is done
-        self._judge(each)
-
-    def _report(self, each: TrialUnderWay) -> None:
-        step, trial_id = len(each.figures), each.trial._trial_id
-        # A driver that was killed may have told it already.
-        if step not in self.queue.storage.get_trial(trial_id).intermediate_values:
-            each.trial.report(self._value(each), step)
-
-    def _check_alike(self, outcome: RunOutcome) -> None:
-        """Scores and returns are not to be compared: an optimum may be known since an update."""
-        before = self.queue.judged_by(outcome.name)
-        if before != outcome.name:
+        before = self.queue.known_figure
+        if before is None:
+            self.place.study.set_user_attr(JUDGED_BY, outcome.name)
+        elif before != outcome.name:  # an optimum may be known since an update
             raise UserError(
                 f"{self.tuning.study.name}: runs there were judged by {before}, and now by "
                 f"{outcome.name}: --name NAME makes a search of its own"
             )
+        each.figures[planned.seed] = outcome.figure
+        each.seconds += outcome.seconds
+        with _lost_to_others():
+            step = len(each.figures)
+            there = self.queue.storage.get_trial(each.trial._trial_id).intermediate_values
+            if step not in there:  # a driver that was killed may have told it
+                each.trial.report(self._value(each), step)
+            each.trial.set_user_attr(SECONDS, each.seconds)
+            # The last: from now on the seed is done.
+            figures = {str(seed): figure for seed, figure in each.figures.items()}
+            each.trial.set_user_attr(FIGURES, figures)
+        self._judge(each)
 
     def _value(self, each: TrialUnderWay) -> float:
         figures = list(each.figures.values())
@@ -237,25 +351,15 @@ class Search:
 
     def _judge(self, each: TrialUnderWay) -> None:
         """End a trial that has all its seeds, or is hopeless."""
-        from optuna.trial import TrialState
-
         if len(each.figures) == len(self.tuning.seeds):
-            value = self._value(each)
-            with _lost_to_others():
-                each.trial.study.tell(each.trial, value, skip_if_finished=True)
-            self._end(each, value, "")
-        elif each.trial.number and self.hopeless(each.trial.number, each.figures):
-            with _lost_to_others():
-                each.trial.study.tell(each.trial, state=TrialState.PRUNED, skip_if_finished=True)
+            self._end(each, self._value(each), "")
+        elif each.trial.number and self.place.hopeless(each.trial.number, each.figures):
             self._end(each, None, "")
 
     def _fail(self, each: TrialUnderWay, reason: str) -> None:
         """End a trial of which a run failed: to samplers it is one of the worst there are."""
-        from optuna.trial import TrialState
-
         with _lost_to_others():
             each.trial.set_user_attr(FAILURE, reason)
-            each.trial.study.tell(each.trial, state=TrialState.PRUNED, skip_if_finished=True)
         self._end(each, None, reason)
         if self._failures is not None:
             self._failures.append(reason)
@@ -263,6 +367,10 @@ class Search:
                 raise UserError(f"all of the first {MOST_FAILURES} trials failed; {reason}")
 
     def _end(self, each: TrialUnderWay, value: float | None, reason: str) -> None:
+        """End a trial, without a value where it was ended early or failed."""
+        state = TrialState.PRUNED if value is None else TrialState.COMPLETE
+        with _lost_to_others():
+            self.place.study.tell(each.trial, value, state, skip_if_finished=True)
         each.is_over = True
         self._trials.remove(each)
         for future, (other, _) in self._runs.items():
@@ -272,11 +380,7 @@ class Search:
 
 
 def _check_room(root: Path) -> None:
-    """Make sure that it is no full disk that runs fail of, which says nothing of their settings.
-
-    Raises:
-        UserError: if it is full.
-    """
+    """Make sure that it is no full disk that runs fail of, which says nothing of their settings."""
     try:
         with tempfile.TemporaryFile(dir=root) as file:
             file.write(bytes(_ROOM_FOR_A_RUN))
@@ -291,7 +395,5 @@ def _check_room(root: Path) -> None:
 @contextlib.contextmanager
 def _lost_to_others() -> Iterator[None]:
     """Let go of a trial that another driver has taken, since this one was silent for long."""
-    from optuna.exceptions import UpdateFinishedTrialError
-
     with contextlib.suppress(UpdateFinishedTrialError, ValueError):
         yield

@@ -1,22 +1,39 @@
-"""What a trial tries: the shipped settings first, then points of a grid or what a sampler says."""
+"""What trials try, and the runs that this takes.
+
+The first trial has the shipped settings; the others are points of a grid, or what one of Optuna's
+samplers says. A sampler that several drivers seed alike would draw the same settings in all of
+them, and one that goes on after a kill would draw its first again. So each trial has a generator of
+its own, seeded by the search's seed and the trial's number: which driver asks, and when it was
+started, is no matter.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import json
 import random
-from collections.abc import Mapping
+import warnings
+import zlib
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
-from experiments.study import layered
+import numpy as np
+from optuna import Study, Trial
+from optuna.distributions import BaseDistribution
+from optuna.exceptions import ExperimentalWarning
+from optuna.samplers import BaseSampler, GPSampler, RandomSampler, TPESampler
+from optuna.trial import FixedTrial, FrozenTrial
+
+from experiments.plan import PlannedRun, check_settings, plan
+from experiments.study import AgentSpec, layered
 from pipeline.errors import UserError
+from pipeline.files import json_text
+from tuning.search_spaces import SearchSpace
 from tuning.tuning_spec import TuningSpec
-
-if TYPE_CHECKING:
-    from optuna import Trial
-
-    from tuning.search_spaces import SearchSpace
 
 # Values of each number in the finest grid there is.
 MOST_VALUES = 100
@@ -24,34 +41,91 @@ MOST_VALUES = 100
 MOST_POINTS = 1_000_000
 
 
-class Suggestions:
-    """Entries of hyperparameters by trial.
+class SeededSampler(BaseSampler):
+    """A sampler made anew for each trial, and for each parameter that is drawn alone."""
 
-    Args:
-        tuning: what is asked for.
-        space: what may be chosen, as its file says.
-        shipped: the entry as it is without the search, with what the user has fixed.
+    def __init__(self, make: Callable[[int], BaseSampler], seed: int) -> None:
+        self._make, self._seed = make, seed
 
-    Attributes:
-        space: with the shipped settings inside.
-        first: the parameters of these.
+    def _made(self, *numbers: int) -> BaseSampler:
+        seeds = np.random.SeedSequence([self._seed, *numbers])
+        return self._make(int(seeds.generate_state(1)[0]))
+
+    def infer_relative_search_space(
+        self, study: Study, trial: FrozenTrial
+    ) -> dict[str, BaseDistribution]:
+        # The first that a trial asks; the sampler remembers it for the second.
+        self._sampler = self._made(trial.number)
+        return self._sampler.infer_relative_search_space(study, trial)
+
+    def sample_relative(
+        self, study: Study, trial: FrozenTrial, search_space: dict[str, BaseDistribution]
+    ) -> dict[str, Any]:
+        return self._sampler.sample_relative(study, trial, search_space)
+
+    def sample_independent(
+        self,
+        study: Study,
+        trial: FrozenTrial,
+        param_name: str,
+        param_distribution: BaseDistribution,
+    ) -> Any:
+        # By its name: after a kill some of a trial's parameters are in the storage, and not drawn.
+        sampler = self._made(trial.number, zlib.crc32(param_name.encode()))
+        return sampler.sample_independent(study, trial, param_name, param_distribution)
+
+
+def make_sampler(tuning: TuningSpec) -> BaseSampler:
+    """The sampler that a tuning asks for; of a grid, whose trials are settled, one for nothing.
+
+    Options are said although they are version 5's defaults: version 5 changed them. By TPE
+    parameters are drawn together, those that exist only under a condition with the others of that
+    condition (``group``), and settings under way count as bad ones (``constant_liar``), so that
+    trials side by side do not try the same.
     """
+
+    def make(seed: int) -> BaseSampler:
+        match tuning.sampler:
+            case "tpe":
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", ExperimentalWarning)  # of ``group``, since 2.8
+                    return TPESampler(
+                        n_startup_trials=tuning.n_startup_trials,
+                        n_ei_candidates=24,
+                        seed=seed,
+                        multivariate=True,
+                        group=True,
+                        constant_liar=True,
+                    )
+            case "gp":
+                return GPSampler(
+                    seed=seed,
+                    independent_sampler=RandomSampler(seed=seed),
+                    n_startup_trials=tuning.n_startup_trials,
+                    deterministic_objective=False,
+                    warn_independent_sampling=False,
+                )
+            case "random" | "grid":
+                return RandomSampler(seed=seed)
+
+    return SeededSampler(make, tuning.seed)
+
+
+class Suggestions:
+    """Entries of hyperparameters by trial; ``shipped`` has what the user has fixed, too."""
 
     def __init__(self, tuning: TuningSpec, space: SearchSpace, shipped: Mapping[str, Any]) -> None:
         self.tuning, self.shipped = tuning, dict(shipped)
         self.space = space.including(self.shipped)
-        self.first = self.space.params_of(self.shipped)
+        self.first = self.space.params_of(self.shipped)  # the parameters of the first trial
         self._fixed = self._settled()
 
     def _settled(self) -> dict[str, Any]:
         """Parameters of settings that the user has fixed."""
         given = set(self.tuning.agent.settings)
-        settled: dict[str, Any] = {}
-        for entry in self.space.entries.values():
-            if set(entry.dimension.keys) <= given:
-                names = entry.dimension.distributions()
-                settled |= {name: self.first[name] for name in names if name in self.first}
-        return settled
+        dimensions = [each for each in self.space.entries.values() if given.issuperset(each.keys)]
+        names = [name for each in dimensions for name in each.distributions]
+        return {name: self.first[name] for name in names if name in self.first}
 
     @property
     def n_free(self) -> int:
@@ -60,11 +134,7 @@ class Suggestions:
 
     @cached_property
     def grid(self) -> list[dict[str, Any]]:
-        """The points of the finest grid that the trials allow, in an order of chance.
-
-        Raises:
-            UserError: if they allow none.
-        """
+        """The points of the finest grid that the trials allow, in an order of chance."""
         n_trials, found = self.tuning.n_trials - 1, self._points(2)
         if len(found) > n_trials:
             raise UserError(
@@ -82,8 +152,6 @@ class Suggestions:
 
     def _points(self, n: int) -> list[dict[str, Any]]:
         """What is asked for at each point, each once: some parameters exist under conditions."""
-        from optuna.trial import FixedTrial
-
         values = {**self.space.grid(n), **{name: [v] for name, v in self._fixed.items()}}
         points: dict[str, dict[str, Any]] = {}
         for number, point in enumerate(itertools.product(*values.values())):
@@ -120,3 +188,37 @@ class Suggestions:
         """The hyperparameters with what is suggested, and what the user has fixed."""
         entry = self.space.merged(self.shipped, suggested)
         return layered(entry, self.tuning.agent.settings)
+
+
+# --- the runs of a trial: one for each seed, in folders that equal settings share -----------------
+
+
+def name_of(entry: Mapping[str, Any]) -> str:
+    """What settings are called: the same for the same, in whatever order they stand."""
+    text = json_text({key: entry[key] for key in sorted(entry)})
+    return f"settings-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+def shipped_run(tuning: TuningSpec, root: Path) -> PlannedRun:
+    """A run of the agent as it is without the search."""
+    return plan(replace(tuning.study, n_seeds=1), root)[0]
+
+
+def check_entry(tuning: TuningSpec, root: Path, entry: Mapping[str, Any]) -> None:
+    """Make sure that the agent can be made with settings of the space."""
+    where = "its space" if tuning.search_space is None else str(tuning.search_space)
+    agent = replace(_agent(tuning, tuning.agent.algo, entry), where=where)
+    study = replace(tuning.study, agents=(agent,), n_seeds=1)
+    check_settings(study, plan(study, root))
+
+
+def planned_run(tuning: TuningSpec, root: Path, entry: Mapping[str, Any], seed: int) -> PlannedRun:
+    """One run of a trial."""
+    agent = _agent(tuning, name_of(entry), entry)
+    study = replace(tuning.study, agents=(agent,), first_seed=seed, n_seeds=1)
+    (planned,) = plan(study, root)
+    return planned
+
+
+def _agent(tuning: TuningSpec, label: str, entry: Mapping[str, Any]) -> AgentSpec:
+    return AgentSpec(label, tuning.agent.algo, tuning.searched(entry), tuned=False)

@@ -1,21 +1,38 @@
-"""Where the trials of a tuning are kept: a file of its own, or what ``--storage`` names."""
+"""Where the trials of a tuning are kept, and how any number of drivers share them.
+
+A study of Optuna's has as many places as trials were asked for. A driver takes a free one, says in
+it who it is, and gives it back where it is stopped. A place whose driver is gone is free again: the
+same settings are tried on, with the seeds that are done. Optuna's own heartbeat would try them as
+another trial, and a journal has none.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import math
 import re
+import secrets
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
+from pipeline import locks
 from pipeline.errors import UserError, one_line, shown
+from pipeline.locks import FolderGoneError, FolderInUseError, folder_lock, is_gone
+from pipeline.signs_of_life import Heartbeat
 
+# Optuna takes long to load, and a mistake on the command line is told before.
 if TYPE_CHECKING:
+    from optuna import Study, Trial
+    from optuna.samplers import BaseSampler
     from optuna.storages import BaseStorage
+    from optuna.trial import FrozenTrial
+
+    from tuning.tuning_spec import TuningSpec
 
 OWN_FILE = "trials.db"
 SECONDS_TO_WAIT = 120  # for others who write into the same SQLite file
@@ -32,17 +49,20 @@ _ANY_PORT = 13000  # of Optuna's proxy
 _DATABASES = ("sqlite", "postgresql", "mysql", "mariadb")
 KNOWN = "a file for a journal, sqlite:///FILE, postgresql://..., mysql://..., grpc://HOST:PORT"
 
+# What the study says of all of its trials.
+ASKED, JUDGED_BY = "asked", "judged by"
+# What a trial says of itself, besides what Optuna knows.
+DRIVER, FAILURE, FIGURES = "driver", "failure", "figures"
+SETTINGS, SECONDS = "settings", "seconds"
+
+SECONDS_BETWEEN_SIGNS = 15.0
+SECONDS_OF_SILENCE = 60.0
+_SECONDS_BETWEEN_TURNS = 0.02
+_MOST_NAMED = 3  # of what makes it another search
+
 
 def open_storage(root: Path, given: str | None) -> BaseStorage:
-    """The storage of a tuning.
-
-    Args:
-        root: the folder of the tuning.
-        given: what ``--storage`` says; None for a SQLite file in that folder.
-
-    Raises:
-        UserError: if it cannot be opened.
-    """
+    """What ``--storage`` names; a SQLite file in the folder of the tuning where it says nothing."""
     if given is None:
         return _own_file(root / OWN_FILE)
     try:
@@ -61,14 +81,7 @@ def open_storage(root: Path, given: str | None) -> BaseStorage:
 
 @contextlib.contextmanager
 def failing_in_a_line(given: str | None) -> Iterator[None]:
-    """Say in one line what the storage fails of, whenever it does: full, gone, or damaged.
-
-    Args:
-        given: what ``--storage`` says.
-
-    Raises:
-        UserError: in place of what the libraries raise.
-    """
+    """Say in one line what the storage fails of, whenever it does: full, gone, or damaged."""
     try:
         yield
     except Exception as error:
@@ -82,11 +95,7 @@ def failing_in_a_line(given: str | None) -> Iterator[None]:
 
 
 def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
-    """What a storage is by its name.
-
-    Raises:
-        UserError: if it is none.
-    """
+    """What a storage is by its name."""
     scheme = _SCHEME.match(given)
     if scheme is None:
         return "journal"
@@ -194,3 +203,227 @@ def _reason(error: Exception) -> str:
     for rest in ("(Background on", "[SQL: "):
         said = said.partition(rest)[0]
     return without_secret(said.strip())
+
+
+# --- the study ------------------------------------------------------------------------------------
+
+
+def open_study(
+    tuning: TuningSpec,
+    root: Path,
+    storage: BaseStorage,
+    sampler: BaseSampler,
+    asked: Mapping[str, Any],
+) -> Study:
+    """The study of a tuning, a new one where there is none; refused where another has its name.
+
+    ``asked`` is what makes it this tuning and no other, as JSON.
+    """
+    import optuna
+
+    name = tuning.study.name
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    with turn(root):
+        study = optuna.create_study(
+            study_name=name,
+            storage=storage,
+            sampler=sampler,
+            pruner=optuna.pruners.NopPruner(),  # what is hopeless is said by `tuning.pruning`
+            direction="minimize" if tuning.is_cost else "maximize",
+            load_if_exists=True,
+        )
+        before = study.user_attrs.get(ASKED)
+        if before is None:
+            study.set_user_attr(ASKED, dict(asked))
+        elif before != asked:
+            raise UserError(_difference(name, before, asked))
+    return study
+
+
+def _difference(name: str, before: Any, asked: Mapping[str, Any]) -> str:
+    there, now = _flat(before), _flat(asked)
+    named = [
+        # Distributions as JSON are no reading matter.
+        key
+        if key.startswith("search_space")
+        else f"{key}: {shown(there.get(key))} there, {shown(now.get(key))} now"
+        for key in {**there, **now}
+        if there.get(key) != now.get(key)
+    ]
+    words = "; ".join(named[:_MOST_NAMED])
+    words += f"; and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+    return f"{name}: the tuning there is another ({words}): --name NAME makes one of its own"
+
+
+def _flat(asked: object) -> dict[str, Any]:
+    """Settings as they are called, hyperparameters and parts of the space among them."""
+    flat: dict[str, Any] = {}
+    for key, value in asked.items() if isinstance(asked, Mapping) else ():
+        if isinstance(value, Mapping):
+            flat |= {f"{key} {inner}": item for inner, item in value.items()}
+        else:
+            flat[key] = value
+    return flat
+
+
+# --- the places of a study ------------------------------------------------------------------------
+
+
+class TrialQueue:
+    """The places of a study, as one driver sees them; those beyond ``n_trials`` are left alone.
+
+    Drivers that share the folder ``root`` take turns.
+    """
+
+    def __init__(self, study: Study, root: Path, n_trials: int) -> None:
+        self.study, self.root, self.n_trials = study, root, n_trials
+        # The one that the study asks, which remembers what it has read.
+        self.storage = study._storage
+        self._token = secrets.token_hex(8)
+        self._n_signs = 0
+        self._heard: dict[tuple[int, str], tuple[object, float]] = {}
+        self._heart = Heartbeat(self._beat, SECONDS_BETWEEN_SIGNS)
+
+    def add_places(self) -> None:
+        """Make sure that the study has a place for each trial."""
+        from optuna.trial import TrialState, create_trial
+
+        with turn(self.root):
+            for _ in range(len(self.study.get_trials(deepcopy=False)), self.n_trials):
+                self.study.add_trial(create_trial(state=TrialState.WAITING))
+
+    def __enter__(self) -> TrialQueue:
+        self.add_places()
+        self.free_dead()  # of a driver that was killed, its trial comes first, as it would have
+        self.give_sign()
+        self._heart.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._heart.stop()
+
+    def trials(self) -> list[FrozenTrial]:
+        """All that there is a place for, by number."""
+        found = self.study.get_trials(deepcopy=False)
+        return sorted(found, key=lambda trial: trial.number)[: self.n_trials]
+
+    @property
+    def known_figure(self) -> str | None:
+        """What runs of the study are judged by; None before the first."""
+        known = self.study.user_attrs.get(JUDGED_BY)
+        return None if known is None else str(known)
+
+    def is_done(self) -> bool:
+        """Whether every trial has ended."""
+        trials = self.trials()
+        return len(trials) >= self.n_trials and all(t.state.is_finished() for t in trials)
+
+    def claim(self, params: Callable[[int], Mapping[str, Any]]) -> Trial | None:
+        """Take a free place, if there is one; ``params`` says what is settled by its number."""
+        from optuna import Trial
+        from optuna.trial import TrialState
+
+        with turn(self.root):  # SQLite would let two drivers take the same place
+            for place in self.trials():
+                number = place._trial_id
+                if place.state != TrialState.WAITING or not self.storage.set_trial_state_values(
+                    number, TrialState.RUNNING
+                ):
+                    continue
+                owner = {**locks.mark(), "token": self._token}
+                self.storage.set_trial_user_attr(number, DRIVER, owner)
+                if settled := dict(params(place.number)):
+                    self.storage.set_trial_system_attr(number, "fixed_params", settled)
+                return Trial(self.study, number)
+        return None
+
+    def give_back(self, trial: Trial) -> None:
+        """Let another driver, or this one later, go on with a trial."""
+        from optuna.exceptions import OptunaError
+        from optuna.trial import TrialState
+
+        with contextlib.suppress(OptunaError, ValueError), turn(self.root):
+            now = self.storage.get_trial(trial._trial_id)
+            is_mine = now.user_attrs.get(DRIVER, {}).get("token") == self._token
+            if is_mine and now.state == TrialState.RUNNING:
+                self.storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+
+    def free_dead(self) -> list[int]:
+        """Give back the trials of drivers that are gone; their numbers."""
+        from optuna.trial import TrialState
+
+        if not any(map(self._is_dead, self.trials())):
+            return []
+        freed = []
+        with turn(self.root):
+            for trial in self.trials():  # as they are now: another may have freed them
+                if self._is_dead(trial):
+                    self.storage.set_trial_state_values(trial._trial_id, TrialState.WAITING)
+                    freed.append(trial.number)
+        return freed
+
+    def _is_dead(self, trial: FrozenTrial) -> bool:
+        """Whether nobody is at work on it: of a driver elsewhere, once it has long been silent."""
+        from optuna.trial import TrialState
+
+        if trial.state != TrialState.RUNNING:
+            return False
+        owner = trial.user_attrs.get(DRIVER)
+        owner = owner if isinstance(owner, Mapping) else {}
+        token = str(owner.get("token"))
+        if token == self._token:
+            return False
+        is_alive = locks.is_alive(owner)
+        if is_alive is not None:
+            return not is_alive
+        # Without an owner it may have been taken a moment ago.
+        sign, now = self.study.user_attrs.get(f"driver {token}"), time.monotonic()
+        last, since = self._heard.setdefault((trial.number, token), (sign, now))
+        if last != sign:
+            self._heard[trial.number, token] = (sign, now)
+            return False
+        return now - since > SECONDS_OF_SILENCE
+
+    def give_sign(self) -> None:
+        """Tell drivers on other machines that this one is at work."""
+        self._n_signs += 1
+        self.study.set_user_attr(f"driver {self._token}", self._n_signs)
+
+    def _beat(self) -> None:
+        # A storage that is gone for a moment is no reason to fall silent for good.
+        with contextlib.suppress(Exception):
+            self.give_sign()
+
+
+@contextlib.contextmanager
+def turn(root: Path) -> Iterator[None]:
+    """Be the only driver inside the ``with`` statement, of those that share a folder."""
+    with contextlib.ExitStack() as stack:
+        while True:
+            if is_gone(root):
+                raise FolderGoneError(root)
+            try:
+                # Of a lock that is held for an instant nobody needs to be told.
+                stack.enter_context(folder_lock(root, lambda: None, lambda _: None))
+                break
+            except (FolderInUseError, FileNotFoundError):  # another removed it, as it was empty
+                time.sleep(_SECONDS_BETWEEN_TURNS)
+        yield
+
+
+def figures_of(said: Mapping[str, Any]) -> dict[int, float]:
+    """What is known of a trial's seeds; nothing where it is no such thing that stands there."""
+    given = said.get(FIGURES)
+    if not isinstance(given, Mapping):
+        return {}
+    return {
+        int(seed): float(figure)
+        for seed, figure in given.items()
+        if str(seed).isdecimal() and isinstance(figure, int | float) and math.isfinite(figure)
+    }
+
+
+def seconds_of(said: Mapping[str, Any]) -> float:
+    """What the runs of a trial took together, as far as it is said."""
+    given = said.get(SECONDS)
+    return float(given) if isinstance(given, int | float) else 0.0

@@ -1,8 +1,8 @@
-"""What a tuning is asked to do, as one immutable value."""
+"""What a tuning is asked to do, as one immutable value, and what a setting is worth to it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -14,7 +14,7 @@ from experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudyS
 from pipeline.errors import UserError
 from pipeline.files import plain
 
-Sampler = Literal["tpe", "gp", "random", "grid", "cmaes"]
+Sampler = Literal["tpe", "gp", "random", "grid"]
 Objective = Literal["mean", "iqm", "lower"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 OBJECTIVES: tuple[Objective, ...] = get_args(Objective)
@@ -24,8 +24,8 @@ FIGURES = ("score", *METRICS, "steps", "seconds")
 CHEAPER_IS_BETTER = (*COSTS, "steps", "seconds")
 
 AUTO = "auto"
-
 SHIPPED = "shipped"
+LOWER = 0.25
 
 # What may change when a tuning goes on; all else makes another tuning.
 _MAY_CHANGE = ("study", "n_trials", "retest", "retest_seeds", "first_retest_seed")
@@ -33,39 +33,23 @@ _MAY_CHANGE = ("study", "n_trials", "retest", "retest_seeds", "first_retest_seed
 
 @dataclass(frozen=True)
 class TuningSpec:
-    """A search over settings of one agent on one environment, and the re-test of what it finds.
+    """A search over settings of one agent on one environment, and the re-test of what it finds."""
 
-    Attributes:
-        study: the agent, called `SHIPPED`, as it is without the search, the environment, and what
-            every run has in common. Its seeds are those of trials. What the agent's ``settings``
-            say holds in every trial, whatever is suggested.
-        n_trials: how many settings to try.
-        figure: what a run is judged by, one of `FIGURES`; or `AUTO`, until it is known what the
-            runs are.
-        objective: how a setting is judged by its seeds: by their mean, their interquartile mean, or
-            the quarter below which the worst lie.
-        sampler: what suggests settings.
-        pruner: what ends trials early.
-        n_startup_trials: how many are drawn at random before the sampler learns from them.
-        seed: of the sampler, and of the order of seeds.
-        search_space: a file with the space to search; None for the agent's own.
-        retest: how many of the best are run again on other seeds.
-        retest_seeds: on how many.
-        first_retest_seed: the first of them.
-    """
-
+    #: The agent, called `SHIPPED`, as it is without the search, the environment, and what every run
+    #: has in common. Its seeds are those of trials. What the agent's ``settings`` say holds in
+    #: every trial, whatever is suggested.
     study: StudySpec
-    n_trials: int = 100
-    figure: str = AUTO
-    objective: Objective = "mean"
-    sampler: Sampler = "tpe"
-    pruner: str = "auto"
-    n_startup_trials: int = 10
-    seed: int = 0
-    search_space: Path | None = None
-    retest: int = 3
-    retest_seeds: int = 20
-    first_retest_seed: int = 1000
+    n_trials: int = 100  #: how many settings to try
+    figure: str = AUTO  #: one of `FIGURES`; or `AUTO`, until it is known what the runs are
+    objective: Objective = "mean"  #: how a setting is judged by its seeds, see `judged`
+    sampler: Sampler = "tpe"  #: what suggests settings
+    pruner: str = "auto"  #: what ends trials early
+    n_startup_trials: int = 10  #: drawn at random before the sampler learns from them
+    seed: int = 0  #: of the sampler, and of the order of seeds
+    search_space: Path | None = None  #: a file with the space; None for the agent's own
+    retest: int = 3  #: how many of the best are run again on other seeds
+    retest_seeds: int = 20  #: on how many
+    first_retest_seed: int = 1000  #: the first of them
 
     @property
     def agent(self) -> AgentSpec:
@@ -103,11 +87,7 @@ class TuningSpec:
         return {**({"engine": "auto"} if "auto" in engines[1:] else {}), **entry}
 
     def check(self) -> None:
-        """Make sure that nothing is judged on what it was chosen by.
-
-        Raises:
-            UserError: if seeds of the search are among those of the re-test.
-        """
+        """Make sure that the seeds of the search are none of the re-test's."""
         shared = sorted(set(self.seeds) & set(self.held_out))
         if self.retest and shared:
             raise UserError(
@@ -116,19 +96,12 @@ class TuningSpec:
             )
 
     def identity(self, shipped: Mapping[str, Any], space: Mapping[str, Any]) -> dict[str, Any]:
-        """What makes it this tuning and no other, as JSON.
-
-        Args:
-            shipped: all settings of the agent as it is without the search.
-            space: the distributions of the space, as JSON.
-        """
-        kept = {key: value for key, value in vars(self).items() if key not in _MAY_CHANGE}
+        """What makes it this tuning and no other, as JSON."""
         entry = self.searched(shipped)
-        engine = {"search_engine": entry["engine"]} if entry.keys() - shipped.keys() else {}
         data = plain(
             {
-                **kept,
-                **engine,
+                **{key: value for key, value in vars(self).items() if key not in _MAY_CHANGE},
+                **({"search_engine": entry["engine"]} if entry.keys() - shipped.keys() else {}),
                 "algo": self.agent.algo,
                 "env": self.environment.env_id,
                 "hyperparams": dict(shipped),
@@ -142,3 +115,22 @@ class TuningSpec:
         )
         assert isinstance(data, dict)
         return data
+
+
+def judged(figures: Sequence[float], objective: Objective, *, is_cost: bool) -> float:
+    """What a setting is worth by its runs.
+
+    Args:
+        figures: of its runs, at least one.
+        objective: ``mean``; ``iqm``, the mean of the middle half; ``lower``, the quarter below
+            which the worst lie.
+        is_cost: whether the lower figure is the better; ``lower`` is then the quarter above which
+            the worst lie.
+    """
+    values = np.sort(np.asarray(figures, dtype=np.float64))
+    if objective == "mean":
+        return float(values.mean())
+    if objective == "iqm":
+        cut = len(values) // 4
+        return float(values[cut : len(values) - cut].mean())
+    return float(np.quantile(values, 1 - LOWER if is_cost else LOWER))

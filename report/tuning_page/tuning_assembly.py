@@ -28,7 +28,7 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     """Write the page of a tuning, one file that needs nothing else and no network.
 
     Args:
-        record: what the tuning wrote down, see `tuning.record`.
+        record: what the tuning wrote down, see `tuning.retesting`.
         path: the file, which is replaced.
         retest_page: the page of the re-test as seen from there; empty where there is none.
     """

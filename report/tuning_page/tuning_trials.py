@@ -19,7 +19,7 @@ class Trials:
     """What a tuning has tried.
 
     Attributes:
-        record: what the tuning wrote down, see `tuning.record`.
+        record: what the tuning wrote down, see `tuning.retesting`.
         ended: the trials that have ended, in their order, as they stand there.
     """
 

@@ -19,7 +19,7 @@ from pipeline.engine_outlook import EngineOutlook, planned_outlook
 from pipeline.errors import UserError
 from pipeline.packing.model_card import card
 from tuning.retesting import Candidate, retest_study
-from tuning.trial_runs import planned_run
+from tuning.suggesting import planned_run
 
 ENV = ["--env", "FrozenLake-v1"]
 

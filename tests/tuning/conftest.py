@@ -12,14 +12,10 @@ from optuna.storages import InMemoryStorage
 
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from tuning import searching
-from tuning.judging import RunOutcome
-from tuning.opening import OpenTuning
-from tuning.samplers import make_sampler
 from tuning.search_spaces import read_search_space
-from tuning.study_opening import open_study
-from tuning.suggesting import Suggestions
-from tuning.trial_queue import TrialQueue
-from tuning.trial_storage import open_storage
+from tuning.searching import OpenTuning, RunOutcome, Search
+from tuning.suggesting import Suggestions, make_sampler
+from tuning.trial_storage import TrialQueue, open_storage, open_study
 from tuning.tuning_spec import SHIPPED, TuningSpec
 
 SHIPPED_ENTRY = {"learning_rate": 0.5, "gamma": 0.9, "n_episodes": 10}
@@ -54,14 +50,8 @@ def opened(storages, tuning, root, storage=None):
     path.write_text(SPACE)
     space = read_search_space("qlearning", "FrozenLake-v1", path)
     suggestions = Suggestions(tuning, space, SHIPPED_ENTRY)
-    study = open_study(
-        "toy",
-        root,
-        keeping,
-        make_sampler(tuning),
-        tuning.identity(SHIPPED_ENTRY, {}),
-        is_cost=tuning.is_cost,
-    )
+    asked = tuning.identity(SHIPPED_ENTRY, {})
+    study = open_study(tuning, root, keeping, make_sampler(tuning), asked)
     queue = TrialQueue(study, root, suggestions.n_trials)
     return OpenTuning(tuning, root, study, queue, suggestions)
 
@@ -108,16 +98,7 @@ def search(monkeypatch, place, launcher, figure=score, judged_by="score", **opti
 
     monkeypatch.setattr(searching, "outcome_of", outcome_of)
     with place.queue, suppress(KeyboardInterrupt):
-        searching.Search(
-            place.tuning,
-            place.root,
-            place.queue,
-            place.suggestions,
-            launcher,
-            place.hopeless,
-            Quiet(),
-            **options,
-        ).run()
+        Search(place, launcher, Quiet(), **options).run()
     return launcher
 
 

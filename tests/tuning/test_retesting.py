@@ -7,17 +7,17 @@ import pytest
 
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import read_hyperparams, seeds_tuned_on
-from tuning.entry_files import entry_text
 from tuning.retesting import (
     Outcome,
     Retested,
     _winner,
     best_trials,
     chosen_for_retest,
+    entry_text,
     optimism,
     retest_study,
+    write_winner,
 )
-from tuning.winner_files import remove_winner, write_winner
 from verdicts import Estimate
 
 NOTHING = Estimate(math.nan, math.nan, math.nan, 0)
@@ -118,5 +118,3 @@ def test_the_file_of_the_winner_says_where_it_comes_from(toy, tmp_path):
     assert "On the seeds 1000 to 1019, which the search has not seen: 0.85 (95 % interval" in said
     assert "0.5 to 0.9, 20 runs, 3 of them failed); the settings before, there: 0.7" in said
     assert said.endswith("Verdict: better.")
-    remove_winner(tmp_path)
-    assert not path.exists()

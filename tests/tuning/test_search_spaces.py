@@ -2,6 +2,7 @@
 
 import math
 from functools import cache
+from pathlib import Path
 
 import gymnasium as gym
 import optuna
@@ -19,7 +20,7 @@ from tuning import search_spaces
 from tuning.dimensions import same
 from tuning.search_spaces import corners, read_search_space
 
-FOLDER = search_spaces._FOLDER
+FOLDER = Path(search_spaces.__file__).parents[1] / "hyperparams" / "search_spaces"
 NOTHING_TO_SEARCH = {"optimal", "random", "angle", "mabwiser_thompson"}
 SEARCHED = [name for name in ALGORITHMS if name not in NOTHING_TO_SEARCH]
 
@@ -117,7 +118,7 @@ def test_shipped_settings_are_a_trial_and_come_back(algo):
         params = space.params_of(entry)
         assert params.keys() <= space.distributions().keys()
         again = space.merged(entry, space.suggest(FixedTrial(params)))
-        before, after = space._flat(entry), space._flat(again)
+        before, after = space.flat(entry), space.flat(again)
         for key in space.keys:
             # What is left out now exists under a condition that is not met.
             assert same(after[key], before[key]) or key not in again
@@ -143,7 +144,7 @@ def test_an_agent_takes_every_end_and_every_choice(algo):
 def test_every_wrapper_is_there_and_takes_its_arguments(algo):
     for env_id in read_yaml(FOLDER / f"{algo}.yml"):
         for entry in read_search_space(algo, env_id).entries.values():
-            for option in getattr(entry.dimension, "options", {}).values():
+            for option in getattr(entry, "options", {}).values():
                 for key, value in option.items():
                     if key in {"env_wrapper", "train_env_wrapper"}:
                         wrapper_factory(value, where=key)
