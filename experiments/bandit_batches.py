@@ -13,8 +13,8 @@ from agents.bandits.one_by_one import run_one_by_one
 from agents.compiled.compile_envs import NotCompilable
 from experiments.bandit_results import STATISTICS_FILE, suited, true_means
 from experiments.pull_statistics import PullStatistics, pull_statistics
-from mdp.machine_code import compile_timer
-from mdp.work_time import WorkTime
+from machine_code.compiling import compile_timer
+from machine_code.work_time import WorkTime
 from pipeline.environments import make_single_env
 from pipeline.finite_numbers import NotFiniteError, is_finite
 from pipeline.preparation import algorithm_kwargs

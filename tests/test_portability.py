@@ -14,6 +14,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = [
     "safe_files",
     "snapshots",
+    "machine_code",
     "mdp",
     "verdicts",
     "envs",
@@ -45,7 +46,7 @@ GUARDED = {
     ("experiments/awaited_child.py", "os.kill"): "asks for the platform before it",
     ("experiments/fork_server.py", "os.kill"): "asks for the platform before it",
     ("experiments/run_limits.py", "/proc"): "refuses to measure on Windows",
-    ("mdp/code_cache.py", ".chmod"): "modes are neither set nor checked on Windows",
+    ("machine_code/cache.py", ".chmod"): "modes are neither set nor checked on Windows",
     ("pipeline/liveness.py", "os.kill"): "asks _winapi on Windows, before it",
     ("pipeline/liveness.py", "/proc"): "does without where there is none",
     ("pipeline/run_record.py", "/proc"): "does without where there is none",

@@ -21,7 +21,7 @@ from commands.run_output import (
     watch_command,
 )
 from commands.terminal import TextConsole
-from mdp.work_time import WorkTime
+from machine_code.work_time import WorkTime
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.run_folder import Run
 from pipeline.settings.hyperparams import split
