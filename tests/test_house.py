@@ -202,6 +202,7 @@ def published_files() -> Iterator[Path]:
 def test_all_that_is_compiled_stands_where_the_digest_of_machine_code_looks() -> None:
     """Compiled functions, and what is compiled into them, are sources of `mdp` and `agents`."""
     importlib.import_module("agents")
+    importlib.import_module("mdp")
     kept = kept_packages()
 
     compiling = {
