@@ -11,10 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agents.compiled.generators import next_uniform
+from agents.compiled.generators import next_uniform, skip_uniform
 from agents.compiled.training_records import env_dtype
-from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
+from mdp.machine_code import inlined
 
 FINITE_ENV = env_dtype(("state", np.int64))
 
@@ -75,9 +75,12 @@ class FiniteModel(NamedTuple):
     @inlined
     def step(self, env: Any, handle: Any) -> None:
         """Do ``env.action`` in ``env.state``."""
-        # The environment draws its number also where there is one outcome alone.
-        uniform = next_uniform(handle)
-        outcome = pick_outcome(self.outcomes, env.state, env.action, uniform)
+        outcome = 0
+        if self.outcomes.shape[2] > 1:
+            uniform = next_uniform(handle)
+            outcome = pick_outcome(self.outcomes, env.state, env.action, uniform)
+        else:
+            skip_uniform(handle)
         result = self.outcomes[env.state, env.action, outcome]
         env.state = result.next_state
         env.reward = result.agent_reward

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from agents.compiled.generators import handles_of, next_uniform
-from machine_code.compiling import kernel
+from agents.compiled.generators import handles_of, next_uniform, skip_uniform
+from mdp.machine_code import kernel
 
 KINDS = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox)
 
@@ -13,7 +13,7 @@ KINDS = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Phil
 def draw(handles, skipped, numbers):
     for i in range(len(numbers)):
         for _ in range(skipped):
-            next_uniform(handles[0])
+            skip_uniform(handles[0])
         numbers[i] = next_uniform(handles[0])
 
 
@@ -28,3 +28,8 @@ def test_numbers_are_the_generators_own(kind, skipped):
     assert numbers.tolist() == own.random((1000, skipped + 1))[:, -1].tolist()
     assert str(rng.bit_generator.state) == str(own.bit_generator.state)
     assert rng.integers(9, dtype=np.uint32) == own.integers(9, dtype=np.uint32)
+
+
+def test_only_pcg64_is_stepped_where_it_lies():
+    handles = handles_of([np.random.Generator(kind(7)) for kind in KINDS])
+    assert handles["pcg64"].astype(bool).tolist() == [True, False, False, False]
