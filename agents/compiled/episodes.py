@@ -11,9 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.monitor import Monitor
 
+from agents.compiled.row_text import whole_rows
 from mdp.array_types import Bools, Floats, Ints
 
 DECIMALS = 6
+# Of Monitor, besides its own attributes: to look at a million numbers later would take long.
+_N_WHOLE = "n_whole_returns"
 MOST_BEGINNINGS = 10_000
 
 
@@ -76,6 +79,7 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
         times.append(round(elapsed, DECIMALS))
         chosen = slice(None) if len(monitors) == 1 else episodes.envs == i
         returns, lengths = episodes.returns[chosen], episodes.lengths[chosen]
+        _note_whole(monitor, returns)
         monitor.episode_returns += returns.tolist()
         monitor.episode_lengths += lengths.tolist()
         monitor.episode_times += [elapsed] * len(returns)
@@ -84,12 +88,26 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
     return times
 
 
+def n_whole_returns(monitor: Monitor) -> int:
+    """How many returns, from the first one on, Monitor is known to hold that are whole numbers."""
+    return int(vars(monitor).get(_N_WHOLE, 0))
+
+
+def _note_whole(monitor: Monitor, returns: Floats) -> None:
+    n_before = len(monitor.episode_returns)
+    if n_whole_returns(monitor) == n_before and (returns == np.rint(returns)).all():
+        vars(monitor)[_N_WHOLE] = n_before + len(returns)
+
+
 def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> None:
     """Append rows as csv.DictWriter would."""
     end = f"{seconds}\r\n"
-    # As one number, which is found sooner than a pair of them.
-    rows = (returns + 1j * lengths).tolist()
-    file.write(end.join(map(_beginnings.__getitem__, rows)) + end)
+    text = whole_rows(np.ascontiguousarray(returns), np.ascontiguousarray(lengths), end)
+    if text is None:
+        # As one number, which is found sooner than a pair of them.
+        rows = (returns + 1j * lengths).tolist()
+        text = end.join(map(_beginnings.__getitem__, rows)) + end
+    file.write(text)
     file.flush()
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.compiled.episodes import n_whole_returns
 from pipeline.resuming.log_positions import MONITOR_FILES, Position
 from safe_files.regular_files import NO_LIMIT, opened
 from snapshots.filling import NotRestorableError
@@ -48,7 +49,7 @@ def lists_in_files(env: VecEnv, folder: Path, positions: Mapping[str, Position])
 
 
 def _are_whole(monitor: Monitor[Any, Any]) -> bool:
-    returns = np.array(monitor.episode_returns, float)
+    returns = np.array(monitor.episode_returns[n_whole_returns(monitor) :], float)
     return bool((returns == np.rint(returns)).all())
 
 
