@@ -9,7 +9,7 @@ SEED ?= 0
 JOBS ?= 2
 
 # What is installed, and has to work on systems other than this one.
-PACKAGES := safe_files mdp verdicts envs agents pipeline experiments tuning report commands
+PACKAGES := safe_files machine_code mdp verdicts envs agents pipeline experiments tuning report commands
 
 BIN := .venv/bin
 STAMP := .venv/.installed

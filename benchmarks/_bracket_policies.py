@@ -8,12 +8,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from _double_pendulum import N_TORQUES, way_up
+from _pushed_motion import MOTIONS, PushedMotion, best_action, interpolated_costs
 
-from envs.brackets.classic_motions import MOTIONS
 from mdp.array_types import Floats
-from mdp.interpolated_costs import best_action, interpolated_costs
-from mdp.pushed_motion import PushedMotion
-from mdp.swing_up import N_TORQUES, way_up
 
 # A policy is handed what is observed, and how many steps of the episode are done.
 Policy = Callable[[Any, int], Any]

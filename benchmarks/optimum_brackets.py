@@ -26,12 +26,18 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import gymnasium as gym
 import numpy as np
 from _bracket_policies import blind_policies, policy_of, returns_of
+from _double_pendulum import ENERGY_OF_BEING_UP, fewest_steps, greatest_energies
+from _pushed_motion import (
+    COST_FREE_RETURN,
+    MOTIONS,
+    STARTS,
+    cells_of,
+    mean_cost,
+    optimistic_costs,
+)
 
-from envs.brackets.classic_motions import COST_FREE_RETURN, MOTIONS, STARTS
 from envs.brackets.known_brackets import DATA, constants_of
 from mdp.array_types import Floats
-from mdp.optimistic_costs import cells_of, mean_cost, optimistic_costs
-from mdp.swing_up import ENERGY_OF_BEING_UP, fewest_steps, greatest_energies
 from verdicts.mean_bounds import least_mean
 
 LEVEL = 0.001

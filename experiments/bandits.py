@@ -382,8 +382,8 @@ def _is_drifting(bandit: Any) -> bool:
 
 def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
     """Do ``n_runs`` runs, from the spec's seed on, and leave their statistics in the run folder."""
-    from mdp.machine_code import compile_timer
-    from mdp.work_time import WorkTime
+    from machine_code.compiling import compile_timer
+    from machine_code.work_time import WorkTime
 
     started = WorkTime.now()
     with compile_timer() as time_compiling:

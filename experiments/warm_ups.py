@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from experiments.plan import PlannedRun
-from mdp.code_cache import PACKAGES
+from machine_code.sources import kept_packages
 from pipeline.models.load import agent_class
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
@@ -50,7 +50,7 @@ def _is_compiled_rule_of_users(algo: str) -> bool:
     from agents.compiled.learning_algorithm import LearningAlgorithm
 
     algorithm = agent_class(algo)
-    is_ours = algorithm.__module__.partition(".")[0] in PACKAGES
+    is_ours = algorithm.__module__.partition(".")[0] in kept_packages()
     return issubclass(algorithm, LearningAlgorithm) and not is_ours
 
 

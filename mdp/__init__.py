@@ -9,20 +9,22 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
+from machine_code.sources import keep_machine_code
 from mdp.transition_model import TransitionModel
 
 if TYPE_CHECKING:
-    from mdp.far_limit import optimum_far_from_limit
-    from mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
-    from mdp.optimal_policies import Plan, policy_iteration, value_iteration
-    from mdp.policy_evaluation import (
+    from mdp.evaluation import (
+        PolicyReturn,
         baseline_policies,
         baseline_return,
+        optimal_choices,
         policy_return,
+        state_values,
         state_visitation,
     )
-    from mdp.policy_returns import PolicyReturn
-    from mdp.valuation import optimal_choices, state_values
+    from mdp.finite_horizon import FiniteHorizonPlan, finite_horizon_optimum
+    from mdp.large_maps import optimum_far_from_limit
+    from mdp.planning import Plan, policy_iteration, value_iteration
 
 __all__ = [
     "FiniteHorizonPlan",
@@ -44,18 +46,20 @@ __all__ = [
 _HOMES = {
     "FiniteHorizonPlan": "mdp.finite_horizon",
     "finite_horizon_optimum": "mdp.finite_horizon",
-    "Plan": "mdp.optimal_policies",
-    "policy_iteration": "mdp.optimal_policies",
-    "value_iteration": "mdp.optimal_policies",
-    "PolicyReturn": "mdp.policy_returns",
-    "baseline_return": "mdp.policy_evaluation",
-    "baseline_policies": "mdp.policy_evaluation",
-    "policy_return": "mdp.policy_evaluation",
-    "state_visitation": "mdp.policy_evaluation",
-    "optimal_choices": "mdp.valuation",
-    "optimum_far_from_limit": "mdp.far_limit",
-    "state_values": "mdp.valuation",
+    "Plan": "mdp.planning",
+    "policy_iteration": "mdp.planning",
+    "value_iteration": "mdp.planning",
+    "PolicyReturn": "mdp.evaluation",
+    "baseline_return": "mdp.evaluation",
+    "baseline_policies": "mdp.evaluation",
+    "policy_return": "mdp.evaluation",
+    "state_visitation": "mdp.evaluation",
+    "optimal_choices": "mdp.evaluation",
+    "optimum_far_from_limit": "mdp.large_maps",
+    "state_values": "mdp.evaluation",
 }
+
+keep_machine_code("mdp")
 
 
 def __getattr__(name: str) -> object:

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from machine_code.compiling import compiled
 from mdp.array_types import AnyInts, Bools, Floats, Ints
-from mdp.machine_code import compiled
-from mdp.sweeps import TIE_TOLERANCE
+from mdp.planning import TIE_TOLERANCE
 from mdp.transition_model import TransitionModel, allowed_actions
 
 # Of as few bytes each as the number of actions allows.

@@ -14,15 +14,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mdp.array_types import AnyInts, Bools, Floats
-
-if TYPE_CHECKING:
-    from scipy.sparse import csr_array
 
 PROBABILITY_TOLERANCE = 1e-9
 
@@ -144,21 +141,6 @@ class TransitionModel:
         start = self.initial > 0
         found = reached_from(start, self.prob, self.next_state, self.terminated, allowed)
         return _read_only(found)
-
-    def continuing(self, action: int) -> csr_array:
-        """Probabilities of going from state to state by ``action`` without the episode ending.
-
-        Returns:
-            A sparse matrix of shape (S, S); its rows sum to one minus the probability of ending.
-        """
-        from scipy.sparse import csr_array
-
-        kept = (self.prob[:, action] > 0) & ~self.terminated[:, action]
-        states, _ = np.nonzero(kept)
-        return csr_array(
-            (self.prob[:, action][kept], (states, self.next_state[:, action][kept])),
-            shape=(self.n_states, self.n_states),
-        )
 
     def _freeze(self, name: str, dtype: type[Any]) -> None:
         """Replace an array by a read-only view, so that the caller's own stays writable."""

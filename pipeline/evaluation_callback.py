@@ -15,7 +15,7 @@ from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from agents.common.callback_horizons import Horizon, calls_until_multiple
-from mdp.work_time import WorkTime
+from machine_code.work_time import WorkTime
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing

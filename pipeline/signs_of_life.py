@@ -113,7 +113,7 @@ class CompilationNotice(logging.Handler):
     def __init__(self, say: Callable[[], object]) -> None:
         super().__init__(logging.INFO)
         self._say = say
-        self.log = logging.getLogger("mdp.machine_code")
+        self.log = logging.getLogger("machine_code")
         self.level_before = self.log.level
 
     def listen(self) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from functools import cache
 
-from mdp.source_files import content_lines, digest_of, source_paths
+from machine_code.sources import content_lines, digest_of, source_paths
 
 # What the objects of a training, and what is recorded of them, are made by.
-OF_TRAINING = ("safe_files", "mdp", "envs", "agents", "pipeline")
+OF_TRAINING = ("safe_files", "machine_code", "mdp", "envs", "agents", "pipeline")
 
 
 @cache

@@ -24,7 +24,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from agents.common.callback_horizons import BlockCallback, Horizon
-from mdp.work_time import WorkTime
+from machine_code.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.files import files_below, sync_file

@@ -12,8 +12,8 @@ from uuid import uuid4
 
 from rich.console import Console
 
-from mdp.machine_code import compile_timer
-from mdp.work_time import WorkTime
+from machine_code.compiling import compile_timer
+from machine_code.work_time import WorkTime
 from pipeline.digests import VERSION, VERSION_FIELD
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation

@@ -206,11 +206,11 @@ def test_positions_behind_letters_of_two_bytes(drawing):
 def test_imports_lead_through_names_that_a_package_loads_on_first_use(drawing):
     from imports import Imports
 
-    imports = Imports(Path(__file__).parents[1], ["mdp", "verdicts", "tests"])
-    distances = imports.distances("mdp/valuation.py")
-    assert distances["mdp/valuation.py"] == 0
-    assert distances["tests/mdp/test_valuation.py"] == 1
+    imports = Imports(Path(__file__).parents[1], ["machine_code", "mdp", "verdicts", "tests"])
+    distances = imports.distances("mdp/evaluation.py")
+    assert distances["mdp/evaluation.py"] == 0
+    assert distances["tests/mdp/test_evaluation.py"] == 1
     assert "verdicts/scores.py" not in distances
     beneath = imports.beneath_machine_code()
-    assert {"mdp/machine_code.py", "mdp/sweeps.py"} <= beneath
+    assert {"machine_code/compiling.py", "mdp/planning.py"} <= beneath
     assert "verdicts/scores.py" not in beneath

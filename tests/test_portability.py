@@ -13,6 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGES = [
     "safe_files",
+    "machine_code",
     "mdp",
     "verdicts",
     "envs",
@@ -43,7 +44,7 @@ ABSENT = ("/tmp", "/dev/", "/proc")  # noqa: S108  # nothing is written there
 GUARDED = {
     ("experiments/child_processes.py", "os.kill"): "asks for the platform before it",
     ("experiments/run_limits.py", "/proc"): "refuses to measure on Windows",
-    ("mdp/code_cache.py", ".chmod"): "modes are neither set nor checked on Windows",
+    ("machine_code/cache.py", ".chmod"): "modes are neither set nor checked on Windows",
     ("pipeline/locks.py", "os.kill"): "asks _winapi on Windows, before it",
     ("pipeline/locks.py", "/proc"): "does without where there is none",
     ("pipeline/runs.py", "/proc"): "does without where there is none",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envs.known_models import transition_model
-from mdp.chain import PolicyChain
+from mdp.graph import PolicyChain
 
 FOLDER = Path(__file__).resolve().parent.parent / "textbook"
 

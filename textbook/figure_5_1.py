@@ -15,7 +15,7 @@ from _figures import Statement, agent_on, arguments, finish, learn_episodes
 from matplotlib.figure import Figure
 
 from mdp.array_types import Floats
-from mdp.chain import PolicyChain
+from mdp.graph import PolicyChain
 
 FEW, MANY = 10_000, 500_000
 

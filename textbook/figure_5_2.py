@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.utils import LinearSchedule
 
 from mdp.array_types import Ints
+from mdp.evaluation import policy_return
 from mdp.finite_horizon import finite_horizon_optimum
-from mdp.policy_evaluation import policy_return
 
 N_EPISODES = 500_000
 LONGEST = 25  # cards; a hand is bust before

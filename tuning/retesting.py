@@ -22,8 +22,7 @@ from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalys
 from experiments.study import METRICS, AgentSpec, Metric, StudySpec
 from pipeline.digests import DamagedFileError
 from pipeline.files import plain, write_json, write_text
-from pipeline.settings.hyperparams import TUNED_ON as TUNED_ON
-from pipeline.settings.hyperparams import seeds_tuned_on
+from pipeline.settings.hyperparams import TUNED_ON, seeds_tuned_on
 from tuning.searching import OpenTuning, UnjudgedError, outcome_of
 from tuning.suggesting import name_of
 from tuning.trial_storage import ASKED, FAILURE, SETTINGS, figures_of, seconds_of

@@ -20,8 +20,8 @@ from agents.bandits.score_agent import (
     learn,
 )
 from agents.compiled.generators import generator_of
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined, kernel
 
 
 class AllowedTables(NamedTuple):

@@ -14,8 +14,8 @@ from agents.bandits.score_agent import ScoreAgent
 from agents.bandits.table_bandit import TableArguments
 from agents.common.setting_checks import check_above_zero, check_share, settings_of
 from agents.compiled.generators import generator_of
+from machine_code.compiling import inlined
 from mdp.array_types import Floats
-from mdp.machine_code import inlined
 
 
 @inlined

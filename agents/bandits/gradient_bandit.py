@@ -13,7 +13,7 @@ from agents.bandits.score_agent import ScoreAgent, mean_reward, total_count
 from agents.bandits.table_bandit import TableArguments
 from agents.common.exploration import boltzmann_action
 from agents.compiled.generators import generator_of
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

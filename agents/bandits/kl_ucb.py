@@ -14,7 +14,7 @@ from agents.bandits.score_agent import ScoreAgent
 from agents.bandits.table_bandit import TableArguments
 from agents.bandits.upper_bounds import UpperBoundBandit
 from agents.common.setting_checks import check_at_least, settings_of
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 MAX_NEWTON_STEPS = 60
 PRECISION = 1e-13

@@ -15,8 +15,8 @@ from agents.bandits.score_agent import Feedback
 from agents.common.exploration import greedy_action
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import generator_of
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined, kernel
 
 
 class Regressions(NamedTuple):

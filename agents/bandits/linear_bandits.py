@@ -35,8 +35,8 @@ from agents.common.setting_checks import (
 )
 from agents.common.signatures import ExplorationDecay
 from agents.compiled.generators import generator_of, handles_of
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined
 
 
 class LinearArguments(BanditArguments, total=False):

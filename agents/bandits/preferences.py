@@ -8,8 +8,8 @@ from agents.bandits.score_agent import ScoreTables
 from agents.bandits.score_policy import mean_rewards
 from agents.bandits.table_bandit import TableBandit
 from agents.common.exploration import highest_value
+from machine_code.compiling import inlined
 from mdp.array_types import Floats
-from mdp.machine_code import inlined
 
 
 @inlined

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.compiled.dispatch import CompiledOnlyError, by_type
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined, kernel
 
 # A pull and its reward, kept until the feedback is due.
 PULL = np.dtype(

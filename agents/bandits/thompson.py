@@ -20,8 +20,8 @@ from agents.common.setting_checks import (
     settings_of,
 )
 from agents.compiled.generators import generator_of
+from machine_code.compiling import inlined
 from mdp.array_types import Floats
-from mdp.machine_code import inlined
 
 Likelihood = Literal["bernoulli", "gaussian"]
 

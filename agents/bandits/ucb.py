@@ -13,7 +13,7 @@ from agents.bandits.score_agent import ScoreAgent
 from agents.bandits.table_bandit import TableArguments
 from agents.bandits.upper_bounds import UpperBoundBandit
 from agents.common.setting_checks import check_at_least, check_option, settings_of
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 Variant = Literal["ucb1", "sutton_barto"]
 

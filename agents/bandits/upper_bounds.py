@@ -10,7 +10,7 @@ from agents.bandits.table_bandit import TableBandit
 from agents.common.exploration import greedy_action
 from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.generators import generator_of
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @by_type

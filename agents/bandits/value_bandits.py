@@ -17,7 +17,7 @@ from agents.common.signatures import ExplorationDecay
 from agents.common.step_sizes import step_size
 from agents.compiled.generators import generator_of
 from agents.compiled.learning_algorithm import StepSize
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

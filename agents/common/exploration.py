@@ -13,8 +13,8 @@ import math
 
 import numpy as np
 
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats
-from mdp.machine_code import inlined
 
 EPSILON_GREEDY = 0
 BOLTZMANN = 1

@@ -15,7 +15,7 @@ from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 from torch.distributions.transforms import AffineTransform, ComposeTransform, ExpTransform
 
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 LINEAR = 0.0
 EXPONENTIAL = 1.0

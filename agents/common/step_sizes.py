@@ -5,7 +5,7 @@ Sutton and Barto (2nd edition), section 2.4 (sample averages) and 2.5 (constant 
 
 from __future__ import annotations
 
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 SAMPLE_AVERAGE = "sample_average"
 

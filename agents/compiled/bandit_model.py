@@ -18,8 +18,8 @@ from agents.compiled.generators import generator_of
 from agents.compiled.training_records import env_dtype
 from envs.bandits import BernoulliBandit, GaussianBandit, LinearBandit, SegmentBandit
 from envs.known_models import time_limit
+from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined
 
 CLICKS = 0
 GAUSSIAN = 1

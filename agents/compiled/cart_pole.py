@@ -9,8 +9,8 @@ import numpy as np
 
 from agents.compiled.generators import next_uniform
 from agents.compiled.training_records import env_dtype
+from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined
 
 STATE = ("x", "x_dot", "theta", "theta_dot")
 CART_POLE_ENV = env_dtype(*((name, np.float64) for name in STATE))

@@ -15,7 +15,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from agents.compiled.cart_pole import CartPole
 from agents.compiled.finite_model import OUTCOME, FiniteModel
-from agents.compiled.kept_worlds import World, keep_world, kept_world, recipe_of
 from agents.compiled.mountain_car import MountainCar
 from envs.checking.claimed_models import is_trusted
 from envs.known_models import (
@@ -38,6 +37,7 @@ from envs.wrappers import (
 from mdp.transition_model import TransitionModel
 
 Env = gym.Env[Any, Any]
+World = FiniteModel | CartPole | MountainCar
 
 # Wrappers whose work the engine does itself, or that have none to do.
 COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
@@ -84,14 +84,9 @@ def compile_envs(vec_env: VecEnv) -> World:
             raise NotCompilable("the environment is shown on the screen")
         _check_monitor(env)
     first, *others = vec_env.envs
-    recipe = recipe_of(layers(first))
-    world = kept_world(recipe)
-    if world is None:
-        world = _world_of(first)
+    world = _world_of(first)
     for other in others:
-        if recipe is None or recipe_of(layers(other)) != recipe:
-            _check_alike(world, first, other)
-    keep_world(vec_env, recipe, world)
+        _check_alike(world, first, other)
     return world
 
 

@@ -17,9 +17,8 @@ from numba.core import types
 from numba.extending import overload
 
 from agents.common.signatures import CheckedConstructor
-from mdp.code_cache import RULE_PREFIX
-from mdp.code_parts import WITHOUT_WRAPPERS, PartCompiler
-from mdp.machine_code import INLINED_OPTIONS, is_interpreted
+from machine_code.cache import RULE_PREFIX
+from machine_code.compiling import INLINED_OPTIONS, WITHOUT_WRAPPERS, PartCompiler, is_interpreted
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -82,7 +81,7 @@ def check_functions(algorithm: type) -> None:
         if not hasattr(vars(algorithm)[name], "py_func"):
             raise TypeError(
                 f"{algorithm.__name__}.{name} is called by compiled code: put @inlined of "
-                "mdp.machine_code on the function"
+                "machine_code.compiling on the function"
             )
 
 

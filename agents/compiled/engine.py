@@ -18,13 +18,12 @@ from agents.common.callback_horizons import (
     wants_position,
 )
 from agents.common.online import is_read
-from agents.compiled.compile_envs import compile_envs
+from agents.compiled.compile_envs import World, compile_envs
 from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
 from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.generators import handles_of
 from agents.compiled.greedy_play import CompiledEvaluations, Playground
 from agents.compiled.interrupts import interrupts_held
-from agents.compiled.kept_worlds import World
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.log_records import (
     Statistics,

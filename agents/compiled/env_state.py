@@ -15,11 +15,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents.compiled.cart_pole import CART_POLE_ENV, STATE, CartPole
-from agents.compiled.compile_envs import layers, monitor_of
+from agents.compiled.compile_envs import World, layers, monitor_of
 from agents.compiled.env_steps import add_to_return
 from agents.compiled.episodes import Episodes
 from agents.compiled.finite_model import FINITE_ENV
-from agents.compiled.kept_worlds import World
 from agents.compiled.mountain_car import CAR_STATE, MOUNTAIN_CAR_ENV, MountainCar
 from agents.compiled.training_records import env_records
 from mdp.array_types import Floats

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

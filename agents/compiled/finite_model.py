@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from agents.compiled.generators import next_uniform, skip_uniform
 from agents.compiled.training_records import env_dtype
+from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined
 
 FINITE_ENV = env_dtype(("state", np.int64))
 

@@ -26,7 +26,7 @@ from numba.extending import intrinsic
 from numpy.random import PCG64
 from numpy.typing import NDArray
 
-from mdp.machine_code import inlined, internal
+from machine_code.compiling import inlined, internal
 
 if TYPE_CHECKING:
     from numpy.random import Generator

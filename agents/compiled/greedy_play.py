@@ -27,8 +27,8 @@ from agents.compiled.finite_model import FiniteModel
 from agents.compiled.generators import handles_of
 from agents.compiled.loop import EpisodeLog, act, learn_from_last_step, run_block
 from agents.compiled.training_records import EPISODE, PROGRESS, RECORD, UNDECIDED
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Ints
-from mdp.machine_code import inlined
 
 # Some hundredths of a second with networks: what a signal waits for.
 STEPS_AT_ONCE = 4096

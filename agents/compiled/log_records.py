@@ -21,8 +21,8 @@ from stable_baselines3.common.logger import DISABLED, KVWriter, Logger, TensorBo
 
 from agents.common.online import is_read
 from agents.compiled.episodes import Episodes
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined, kernel
 
 # Numbers that lie in memory at once, where windows of them are averaged.
 _AT_ONCE = 1_000_000

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from agents.common.schedules import schedule_value
 from agents.compiled.dispatch import by_type
 from agents.compiled.env_steps import begin_episode, end_step
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Floats
-from mdp.machine_code import inlined, kernel
 
 
 @by_type

@@ -9,7 +9,7 @@ import numpy as np
 
 from agents.compiled.generators import next_uniform
 from agents.compiled.training_records import env_dtype
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 CAR_STATE = ("position", "velocity")
 MOUNTAIN_CAR_ENV = env_dtype(*((name, np.float64) for name in CAR_STATE))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined, kernel
 
 MOST_DIGITS = 19
 # Python writes larger whole numbers with an exponent.

@@ -18,8 +18,8 @@ from agents.linear.softmax import (
 )
 from agents.linear.weighted_tiles import LinearAgent, look
 from agents.networks.observations import AFTER, BEFORE, move_on
+from machine_code.compiling import called
 from mdp.array_types import Floats
-from mdp.machine_code import called
 
 
 class Critic(NamedTuple):

@@ -21,8 +21,8 @@ from agents.linear.softmax import (
 from agents.linear.weighted_tiles import LinearAgent, look
 from agents.networks.observations import AFTER, BEFORE, move_on
 from envs.known_models import time_limit
+from machine_code.compiling import called
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import called
 
 Baseline = Literal["none", "value"]
 

@@ -26,8 +26,8 @@ from agents.compiled.training_records import UNDECIDED
 from agents.linear.tile_algorithm import TileAlgorithm, TileArguments
 from agents.linear.weighted_tiles import LinearAgent, add_up, look, move_sum, sum_of
 from agents.networks.observations import AFTER, BEFORE, move_on
+from machine_code.compiling import called
 from mdp.array_types import Floats
-from mdp.machine_code import called
 
 
 @by_type

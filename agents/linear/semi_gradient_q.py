@@ -7,7 +7,7 @@ from typing import Any
 from agents.common.exploration import highest_value
 from agents.linear.semi_gradient import SemiGradientAlgorithm
 from agents.linear.weighted_tiles import LinearAgent
-from mdp.machine_code import called
+from machine_code.compiling import called
 
 
 @called

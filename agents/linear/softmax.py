@@ -21,8 +21,8 @@ from agents.common.setting_checks import check_finite
 from agents.compiled.generators import next_uniform
 from agents.linear.tile_algorithm import TileAlgorithm, TileArguments
 from agents.linear.weighted_tiles import LinearAgent, add_up, move_sum
+from machine_code.compiling import called
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import called
 
 
 @called

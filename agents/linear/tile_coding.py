@@ -17,8 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from machine_code.compiling import called, kernel
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import called, kernel
 
 # How tiles lie along a dimension; one array is compiled sooner than four.
 DIMENSION = np.dtype(

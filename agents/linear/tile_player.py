@@ -8,8 +8,8 @@ from agents.linear.tile_coding import Tiles
 from agents.linear.weighted_tiles import LinearAgent, Room, add_up, look
 from agents.networks.observations import BEFORE, move_on
 from agents.networks.q_updates import best_of
+from machine_code.compiling import called
 from mdp.array_types import Floats
-from mdp.machine_code import called
 
 
 class TilePlayer(NamedTuple):

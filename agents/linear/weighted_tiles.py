@@ -16,8 +16,8 @@ from agents.compiled.loop import act, learn_from_step
 from agents.compiled.training_records import UNDECIDED
 from agents.linear.tile_coding import Tiles, active_tiles
 from agents.networks.observations import BEFORE, observe
+from machine_code.compiling import called, kernel
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import called, kernel
 
 
 class Room(NamedTuple):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from agents.networks.matrix_products import Singles
-from mdp.machine_code import called, internal, vectorised
+from machine_code.compiling import called, internal, vectorised
 
 IDENTITY, RELU, TANH, ELU, LEAKY_RELU, SIGMOID = range(6)
 SELU, SOFTPLUS, SILU, GELU, FAST_GELU, MISH = range(6, 12)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from agents.networks.matrix_products import Singles
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

@@ -17,7 +17,7 @@ import torch as th
 from gymnasium import spaces
 from torch import nn
 
-from mdp.code_cache import is_compiled_before
+from machine_code.cache import is_compiled_before
 
 # Processor seconds, measured on one core with one thread; `machine_pace` compares other machines.
 # Of the library's loop:

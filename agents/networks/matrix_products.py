@@ -16,7 +16,7 @@ from numba.extending import get_cython_function_address, intrinsic
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from mdp.machine_code import internal
+from machine_code.compiling import internal
 
 Singles = NDArray[np.float32]
 

@@ -27,7 +27,7 @@ from agents.networks.perceptron import (
 from agents.networks.q_updates import best_of
 from agents.networks.references import Reference, address_of, call
 from agents.networks.shared_tensors import FlatTensors
-from mdp.machine_code import inlined, kernel
+from machine_code.compiling import inlined, kernel
 
 # By so much, relative to the largest output, the best has to be ahead: many times what rounding
 # makes of layers of 256 units. And by so much at least, since PyTorch compares probabilities.

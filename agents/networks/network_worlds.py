@@ -18,7 +18,7 @@ from agents.compiled.mountain_car import MountainCar
 from agents.compiled.training_records import env_dtype
 from agents.networks.observations import Numbers, OwnVectors, StateVectors
 from envs.known_models import observations_of_states
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 # What acting leaves for learning.
 _ESTIMATES = (("value", np.float64), ("log_probability", np.float64))

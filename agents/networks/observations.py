@@ -14,7 +14,7 @@ import numpy as np
 from agents.compiled.dispatch import by_type
 from agents.networks.matrix_products import Singles
 from agents.networks.perceptron import Inputs
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 # Before a step; after it, also where it has ended the episode; and after the reset that followed.
 BEFORE, AFTER, NOW = range(3)

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from agents.networks.matrix_products import Singles
-from mdp.machine_code import vectorised
+from machine_code.compiling import vectorised
 
 ADAM, ADAMW, RMSPROP, RMSPROP_TENSORFLOW = range(4)
 

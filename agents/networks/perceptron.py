@@ -30,8 +30,8 @@ from agents.networks.matrix_products import (
     multiply_transposed_right,
     sgemm_address,
 )
+from machine_code.compiling import vectorised, view
 from mdp.array_types import Ints
-from mdp.machine_code import vectorised, view
 
 
 class Layers(NamedTuple):

@@ -18,8 +18,8 @@ from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.policy_updates import RolloutMinibatch
 from agents.networks.references import call
 from agents.networks.rollouts import Rollout, explained_variance, shuffle
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Ints
-from mdp.machine_code import inlined, kernel
 
 # Settings, under the library's names where it has one.
 RULES = np.dtype(

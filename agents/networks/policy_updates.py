@@ -17,8 +17,8 @@ from agents.networks.categorical import fill_probabilities, log_normalizer, turn
 from agents.networks.matrix_products import Singles
 from agents.networks.optimizers import descend
 from agents.networks.perceptron import Inputs, backward, forward, last_outputs
+from machine_code.compiling import called, kernel
 from mdp.array_types import Ints
-from mdp.machine_code import called, kernel
 
 # What the library's log has of a minibatch.
 LOSSES = np.dtype(

@@ -15,8 +15,8 @@ from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
 from agents.networks.q_updates import best_of, follow
 from agents.networks.references import call
 from agents.networks.replay_batches import Minibatch
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Ints
-from mdp.machine_code import inlined, kernel
 
 # Settings, under the library's names where it has one.
 RULES = np.dtype(

@@ -12,7 +12,7 @@ import numpy as np
 from agents.networks.matrix_products import Singles
 from agents.networks.optimizers import descend
 from agents.networks.perceptron import backward, forward, last_outputs
-from mdp.machine_code import called, inlined, kernel
+from machine_code.compiling import called, inlined, kernel
 
 # What the value of the next state is taken from.
 TARGET_NETWORK, DOUBLE, ONLINE_NETWORK = range(3)

@@ -27,7 +27,7 @@ from numba.extending import (
     unbox,
 )
 
-from mdp.machine_code import internal
+from machine_code.compiling import internal
 
 ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
 

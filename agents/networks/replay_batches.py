@@ -16,8 +16,8 @@ from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
 from agents.networks.observations import show
 from agents.networks.perceptron import Inputs
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined, kernel
 
 
 class Replay(NamedTuple):

@@ -10,8 +10,8 @@ import numpy as np
 from agents.compiled.generators import next_uniform
 from agents.networks.matrix_products import Singles
 from agents.networks.observations import show
+from machine_code.compiling import called, inlined, kernel
 from mdp.array_types import Ints
-from mdp.machine_code import called, inlined, kernel
 
 
 class Rollout(NamedTuple):

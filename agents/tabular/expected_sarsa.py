@@ -7,7 +7,7 @@ from typing import Any
 from agents.common.exploration import expected_value
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, exploration_rate
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

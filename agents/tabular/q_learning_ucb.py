@@ -11,7 +11,7 @@ from agents.common.setting_checks import check_at_least, check_finite, settings_
 from agents.tabular.optimistic_algorithm import OptimisticAlgorithm
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import best_value
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

@@ -6,7 +6,7 @@ from typing import Any
 
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, choose
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

@@ -19,8 +19,8 @@ from agents.compiled.generators import generator_of, next_uniform
 from agents.compiled.loop import act, learn_from_step
 from agents.compiled.training_records import UNDECIDED
 from agents.tabular.value_tables import MaskedTables, Room, action_at, room_at, with_mean_values
+from machine_code.compiling import inlined, kernel
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined, kernel
 
 
 class TabularAgent(NamedTuple):

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 from agents.common.exploration import highest_value
 from agents.compiled.dispatch import CompiledOnlyError, by_type
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined
 
 
 class Room(NamedTuple):

@@ -16,7 +16,7 @@ import envs  # noqa: F401  # registers the environments
 from agents.known_algorithms import ALGORITHMS
 from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import TransitionModel, baseline_policies, finite_horizon_optimum, policy_return
-from mdp.policy_returns import PolicyReturn
+from mdp.evaluation import PolicyReturn
 from pipeline.settings.hyperparams import entry_names
 from pipeline.settings.values import parse_assignments
 

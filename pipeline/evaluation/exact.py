@@ -113,7 +113,7 @@ class ExactEvaluator:
         return optimal_choices(self.model, self.horizon)
 
     def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
-        """The agent's policy, in one of the forms of `mdp.policies`.
+        """The agent's policy, in one of the forms of `mdp.evaluation`.
 
         Probabilities of shape (S, A); or actions, of shape (S,), or (horizon, S) where they depend
         on the time.

@@ -11,7 +11,7 @@ from agents.common.callback_horizons import BlockCallback
 from agents.compiled.training_records import UNDECIDED
 from agents.tabular.q_learning import QLearning
 from agents.tabular.temporal_difference import td_learning
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 class Footprints(NamedTuple):

@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import FloatSchedule
 import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
 from agents.common.callback_horizons import BlockCallback, Horizon, calls_until_multiple
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 class Change(BlockCallback):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from agents.compiled.generators import handles_of, next_uniform, skip_uniform
-from mdp.machine_code import kernel
+from machine_code.compiling import kernel
 
 KINDS = (np.random.PCG64, np.random.PCG64DXSM, np.random.MT19937, np.random.Philox)
 

@@ -11,7 +11,6 @@ from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv, Pendulum
 from gymnasium.wrappers import ClipReward, FlattenObservation, RescaleAction, TimeLimit
 
 import train
-from envs.brackets.classic_motions import MOTIONS
 from envs.brackets.known_brackets import (
     OptimumBracket,
     known_entries,
@@ -19,7 +18,6 @@ from envs.brackets.known_brackets import (
     optimum_bracket,
 )
 from envs.wrappers import DiscretizeObservation, ScaleReward
-from mdp.pushed_motion import moved
 
 SCRIPT = Path(train.__file__).parent / "benchmarks" / "optimum_brackets.py"
 ENTRIES = {
@@ -168,30 +166,6 @@ def test_it_may_have_been_played_before():
     env.reset(seed=0)
     env.step(2)
     assert optimum_bracket(env) is not None
-
-
-@pytest.mark.parametrize("name", MOTIONS)
-def test_motions_are_those_of_gymnasium(name):
-    """From states in the whole range, at walls and the greatest speed too."""
-    motion, env, rng = MOTIONS[name], gym.make(name).unwrapped, np.random.default_rng(0)
-    env.reset(seed=0)
-    for _ in range(300):
-        position = rng.uniform(motion.low, motion.high)
-        speed = motion.most_speed * rng.uniform(-1, 1)
-        action = rng.choice(motion.actions)
-        env.state = np.array([position, speed])
-        given = np.array([action], np.float32) if motion.is_continuous else int(action) + 1
-        _, reward, terminated, _, _ = env.step(given)
-        expected = moved(motion, position, speed, action)
-        apart = np.abs(np.array(env.state) - expected)
-        if motion.is_circle:
-            apart[0] = abs((apart[0] + np.pi) % (2 * np.pi) - np.pi)
-        assert (apart <= max(motion.rounding, 1e-9) + 1e-7 * motion.is_continuous).all()
-        cost = motion.step_cost + motion.action_cost * action**2
-        cost += motion.position_cost * position**2 + motion.speed_cost * speed**2
-        assert terminated == (expected[0] >= motion.high)
-        gained = 100.0 if terminated and motion.final_cost else 0.0
-        assert reward == pytest.approx(gained - cost, abs=1e-5)
 
 
 @pytest.mark.parametrize("name", ENTRIES)

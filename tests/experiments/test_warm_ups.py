@@ -10,7 +10,7 @@ from agents.tabular.tabular_algorithm import TabularAlgorithm
 from experiments import warm_ups
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 from pipeline.user_modules import UserModule
 
 

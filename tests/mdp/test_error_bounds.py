@@ -10,8 +10,7 @@ import pytest
 
 from mdp import TransitionModel, policy_iteration, value_iteration
 from mdp.graph import steps_to_end
-from mdp.problem import PlanningProblem
-from mdp.undiscounted import FinitePart
+from mdp.planning import FinitePart, PlanningProblem
 
 STATES, ACTIONS, OUTCOMES = 3, 2, 2
 EPSILON = float(np.finfo(np.float64).eps)

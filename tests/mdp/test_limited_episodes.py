@@ -15,16 +15,14 @@ from mdp import (
     TransitionModel,
     baseline_policies,
     baseline_return,
-    far_limit,
     finite_horizon_optimum,
-    limited_episodes,
     optimum_far_from_limit,
     policy_return,
     state_values,
     value_iteration,
 )
-from mdp.far_limit import Drift, _chance_of_losing, _drift
-from mdp.limited_episodes import LimitedEpisodes
+from mdp.evaluation import LimitedEpisodes
+from mdp.large_maps import Drift, _chance_of_losing, _drift
 
 
 def random_model(seed: int, outcomes: int, reward: float | None = None) -> TransitionModel:
@@ -70,7 +68,7 @@ def test_all_ways_come_to_the_same(
         patch.setattr(LimitedEpisodes, "along_ways", lambda *_: None)
         backwards = figures(model, policy, horizon, discount)
         values_backwards = state_values(model, policy, horizon)
-        patch.setattr(limited_episodes, "MOST_BACKWARDS", 0)
+        patch.setattr("mdp.evaluation.MOST_BACKWARDS", 0)
         forwards = figures(model, policy, horizon, discount)
     np.testing.assert_allclose(found, backwards, rtol=1e-10, atol=1e-10)
     np.testing.assert_allclose(forwards, backwards, rtol=1e-10, atol=1e-9)
@@ -100,7 +98,7 @@ def test_giving_up_early_changes_no_baseline(seed: int, horizon: int) -> None:
         policy_return(model, policy, horizon).expected_return for policy in baseline_policies(model)
     ]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(limited_episodes, "MOST_BACKWARDS", 0)
+        patch.setattr("mdp.evaluation.MOST_BACKWARDS", 0)
         assert baseline_return(model, horizon) == pytest.approx(max(returns), abs=1e-10)
 
 
@@ -121,7 +119,7 @@ def test_a_hopeless_policy_is_given_up() -> None:
         return episodes.result(1.0, none, with_success=False, floor=floor).expected_return
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(limited_episodes, "MOST_BACKWARDS", 0)
+        patch.setattr("mdp.evaluation.MOST_BACKWARDS", 0)
         assert told(worth - 1e-9) == pytest.approx(worth)
         assert told(worth + 0.5) == -np.inf
 
@@ -208,5 +206,5 @@ def test_a_task_that_never_ends_is_not_planned_without_a_limit(
 ) -> None:
     model = far_goal(10)
     endless = replace(model, terminated=np.zeros_like(model.terminated))
-    monkeypatch.setattr(far_limit, "value_iteration", lambda *args: pytest.fail("planned"))
+    monkeypatch.setattr("mdp.large_maps.value_iteration", lambda *args: pytest.fail("planned"))
     assert optimum_far_from_limit(endless, 200) is None

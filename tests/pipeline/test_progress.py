@@ -214,7 +214,7 @@ class Compiling(BaseCallback):
 
     def _on_step(self):
         for _ in range(self.times):
-            logging.getLogger("mdp.machine_code").info("compiling run_block")
+            logging.getLogger("machine_code").info("compiling run_block")
         return True
 
 
@@ -228,5 +228,5 @@ def test_compiling_is_said_once(clock, times, said):
     agent.learn(3, callback=[Compiling(times), ProgressDisplay(console, live=False)])
     assert console.file.getvalue().partition("100%")[0] == said
     # Afterwards nobody listens any more.
-    logging.getLogger("mdp.machine_code").info("compiling run_block")
+    logging.getLogger("machine_code").info("compiling run_block")
     assert console.file.getvalue().count("compiling") == bool(times)

@@ -50,7 +50,7 @@ def plain(text):
 
 
 def compile_something():
-    logging.getLogger("mdp.machine_code").info("compiling run_block")
+    logging.getLogger("machine_code").info("compiling run_block")
 
 
 # --- where lines stay ----------------------------------------------------------------------------

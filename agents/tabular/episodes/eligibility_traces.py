@@ -19,8 +19,8 @@ from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.learning_algorithm import StepSize
 from agents.tabular.episodes.learning_in_turn import EpisodicAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, count_visit, value_ahead
+from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined
 
 TraceType = Literal["accumulating", "replacing", "dutch"]
 ACCUMULATING, REPLACING, DUTCH = 0, 1, 2

@@ -10,7 +10,7 @@ from agents.compiled.training_records import UNDECIDED
 from agents.tabular.tabular_algorithm import TabularAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, commit, exploration_rate
 from agents.tabular.value_tables import Room, action_at
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 NOTHING_LEARNT = -1.0
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from agents.tabular.episodes.episode_records import RecordAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, choose, move_towards
+from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined
 
 
 class VisitRecords(NamedTuple):

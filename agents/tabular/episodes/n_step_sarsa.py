@@ -7,7 +7,7 @@ from typing import Any
 from agents.tabular.episodes.step_windows import WindowAlgorithm
 from agents.tabular.sarsa import commit_to_next_action, committed_value
 from agents.tabular.temporal_difference import TabularAgent
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

@@ -11,8 +11,8 @@ from agents.tabular.episodes.episode_records import RecordAlgorithm
 from agents.tabular.episodes.importance_policy import ImportanceTablePolicy
 from agents.tabular.episodes.learning_in_turn import place_of, probability_of
 from agents.tabular.temporal_difference import TabularAgent, act_on_values, values_at
+from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined
 
 # Beyond it the sum of the weights would soon be infinite.
 LARGEST_WEIGHT = 1e150

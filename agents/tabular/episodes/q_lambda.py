@@ -8,7 +8,7 @@ from agents.common.exploration import highest_value
 from agents.tabular.episodes.eligibility_traces import TraceAlgorithm
 from agents.tabular.q_learning import best_next_value
 from agents.tabular.temporal_difference import TabularAgent, values_at
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

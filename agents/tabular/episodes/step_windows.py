@@ -17,8 +17,8 @@ from agents.compiled.dispatch import CompiledOnlyError, by_type
 from agents.compiled.learning_algorithm import StepSize
 from agents.tabular.episodes.learning_in_turn import MOST_STEPS, NOTHING_LEARNT, EpisodicAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, move_towards, value_ahead
+from machine_code.compiling import inlined
 from mdp.array_types import Floats, Ints
-from mdp.machine_code import inlined
 
 
 class Windows(NamedTuple):

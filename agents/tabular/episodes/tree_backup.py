@@ -12,7 +12,7 @@ from agents.tabular.episodes.learning_in_turn import place_of, probability_of
 from agents.tabular.episodes.step_windows import WindowAlgorithm
 from agents.tabular.temporal_difference import TabularAgent, exploration_rate, values_at
 from agents.tabular.value_tables import Room
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 TargetPolicy = Literal["exploring", "greedy"]
 

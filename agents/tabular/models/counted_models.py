@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import best_value
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined
 
 # Of the largest value: what one sweep after the other goes on changing by rounding.
 ROUNDING = 1e-13

@@ -15,7 +15,7 @@ from agents.tabular.models.model_keeping import MOST_PLANNING, ModelKeeper
 from agents.tabular.q_learning import QLearning
 from agents.tabular.temporal_difference import TabularAgent, update
 from agents.tabular.value_tables import best_value
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @by_type

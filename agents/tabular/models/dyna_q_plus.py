@@ -13,8 +13,8 @@ from agents.tabular.models.learnt_models import add_pair, note_outcome
 from agents.tabular.models.model_policy import ModelPolicy
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import action_at, room_at
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined
 
 
 class DatedModel(NamedTuple):

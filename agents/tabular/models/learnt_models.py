@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined
 
 
 class LearntModel(NamedTuple):

@@ -13,7 +13,7 @@ from agents.tabular.models.sweeping_model import NONE, enqueue, most_urgent, rem
 from agents.tabular.models.sweeping_policy import SweepingPolicy
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import best_value
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

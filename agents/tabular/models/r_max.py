@@ -19,7 +19,7 @@ from agents.tabular.models.model_policy import ModelPolicy
 from agents.tabular.optimistic_algorithm import OptimisticAlgorithm
 from agents.tabular.temporal_difference import TabularAgent
 from agents.tabular.value_tables import best_value
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 
 @inlined

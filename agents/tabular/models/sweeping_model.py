@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from agents.tabular.models.learnt_models import note_outcome
+from machine_code.compiling import inlined
 from mdp.array_types import Bools, Floats, Ints
-from mdp.machine_code import inlined
 
 NONE = -1
 

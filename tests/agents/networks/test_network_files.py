@@ -26,9 +26,11 @@ AGENTS = {
 ELSEWHERE = """
 import sys
 
+OURS = {"agents", "envs", "machine_code", "mdp", "pipeline", "safe_files"}
+
 class Nothing:
     def find_spec(self, name, path=None, target=None):
-        if name.split(".")[0] in {"agents", "envs", "mdp", "pipeline", "safe_files"}:
+        if name.split(".")[0] in OURS:
             raise ModuleNotFoundError(name)
 
 sys.meta_path.insert(0, Nothing())

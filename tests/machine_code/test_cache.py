@@ -13,9 +13,11 @@ from pathlib import Path
 
 import pytest
 
-from mdp import code_cache
+import agents
+from machine_code import cache as code_cache
+from machine_code import sources
 
-ROOT = Path(code_cache.__file__).resolve().parent.parent
+ROOT = Path(agents.__file__).resolve().parent.parent
 
 # What is compiled in this process, and what is said of it besides.
 NOTE = """
@@ -25,7 +27,7 @@ names = []
 class Note(logging.Handler):
     def emit(self, record):
         names.append(record.getMessage())
-log = logging.getLogger("mdp.machine_code")
+log = logging.getLogger("machine_code")
 log.addHandler(Note()); log.setLevel(logging.INFO); log.propagate = False
 """
 
@@ -47,7 +49,7 @@ print(int(value), model.engine_in_use, int("compiling run_block" in names))
 
 # The same in small: a function, and another of another package that it is compiled into.
 RULE = """
-from mdp.machine_code import inlined
+from machine_code.compiling import inlined
 
 @inlined
 def rule(x):
@@ -55,14 +57,14 @@ def rule(x):
 """
 LOOP = """
 from agents.common.small_rule import rule
-from mdp.machine_code import kernel
+from machine_code.compiling import kernel
 
 @kernel
 def run_small(x):
     return rule(x) + 1.0
 """
 SMALL = f"""{NOTE}
-from mdp.small_loop import run_small
+from agents.small_loop import run_small
 print(int(run_small(4.0)), "compiled", int("compiling run_small" in names))
 """
 
@@ -71,11 +73,11 @@ print(int(run_small(4.0)), "compiled", int("compiling run_small" in names))
 def checkout(tmp_path_factory):
     """A copy of what trains, and nothing compiled in it."""
     root = tmp_path_factory.mktemp("checkout")
-    for package in ("safe_files", "mdp", "agents", "envs"):
+    for package in ("safe_files", "machine_code", "mdp", "agents", "envs"):
         ignored = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / package, root / package, ignore=ignored)
     (root / "agents" / "common" / "small_rule.py").write_text(RULE)
-    (root / "mdp" / "small_loop.py").write_text(LOOP)
+    (root / "agents" / "small_loop.py").write_text(LOOP)
     return root
 
 
@@ -130,7 +132,7 @@ def test_so_it_is_in_small(checkout):
 
 def test_damaged_machine_code_is_compiled_anew(checkout):
     outcome(checkout)
-    folder = checkout / "mdp" / "__pycache__" / "machine_code"
+    folder = checkout / "agents" / "__pycache__" / "machine_code"
     for place, path in enumerate(sorted(folder.rglob("*.nb[ic]"))):
         # Below the digest's folder; Numba writes each file under a longer name first.
         name = path.relative_to(folder).as_posix().partition("/")[2] + ".tmp.0123456789abcdef"
@@ -145,14 +147,15 @@ def test_where_nothing_can_be_written_it_is_compiled_in_memory(checkout, tmp_pat
     root = tmp_path / "closed"
     shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
     # A file where a folder is wanted stops root as well, whom permissions do not stop.
-    (root / "mdp" / "__pycache__").write_text("")
+    for package in ("mdp", "agents"):
+        (root / package / "__pycache__").write_text("")
     (tmp_path / "home").write_text("")
     done = run(root, HOME=str(tmp_path / "home"), XDG_CACHE_HOME="")
     assert done.stdout.split() == ["13", "compiled", "1"]
     assert "Traceback" not in done.stderr
     warnings = run(
         root,
-        "import mdp.machine_code, mdp.sweeps, agents.tabular.q_learning",
+        "import mdp.planning, agents.tabular.q_learning",
         HOME=str(tmp_path / "home"),
         XDG_CACHE_HOME="",
     ).stderr
@@ -164,7 +167,7 @@ def test_where_nothing_can_be_written_it_is_compiled_in_memory(checkout, tmp_pat
 def test_a_folder_serves_only_if_its_paths_are_short_enough(tmp_path, monkeypatch):
     """Windows takes 260 characters; Numba's own names add up to 120."""
     deep, home = tmp_path / "deep" / ("x" * 100), tmp_path / "home"
-    limit = len(str(home)) + 1 + len(code_cache.digest()) + 1 + 130
+    limit = len(str(home)) + 1 + len(code_cache.digest("agents")) + 1 + 130
 
     def as_on_windows(dir, prefix=""):  # noqa: A002  # as it is called
         if len(f"{dir}/{prefix}12345678") > limit:
@@ -172,18 +175,18 @@ def test_a_folder_serves_only_if_its_paths_are_short_enough(tmp_path, monkeypatc
         return io.BytesIO()
 
     monkeypatch.setattr(code_cache.tempfile, "TemporaryFile", as_on_windows)
-    monkeypatch.setattr(code_cache, "parents", lambda: iter([deep, home]))
-    assert code_cache.folder.__wrapped__() == home / code_cache.digest()
+    monkeypatch.setattr(code_cache, "parents", lambda package: iter([deep, home]))
+    assert code_cache.folder.__wrapped__("agents") == home / code_cache.digest("agents")
 
 
 def test_a_home_serves_where_the_checkout_cannot_be_written(checkout, tmp_path):
     root = tmp_path / "closed"
     shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
-    (root / "mdp" / "__pycache__").write_text("")
+    (root / "agents" / "__pycache__").write_text("")
     cache = tmp_path / "cache"
-    code = "from mdp import code_cache; print(code_cache.folder())"
+    code = "import agents; from machine_code import cache; print(cache.folder('agents'))"
     folder = Path(run(root, code, XDG_CACHE_HOME=str(cache)).stdout.strip())
-    assert folder.parent == cache / "yardstick" / "machine_code"
+    assert folder.parent == cache / "yardstick" / "machine_code" / "agents"
     assert folder.is_dir()
 
 
@@ -191,8 +194,9 @@ def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
     """It has the old sources or the new: the digest cannot tell, so nothing is kept."""
     code = """
     from pathlib import Path
-    from mdp import code_cache
-    folder = code_cache.folder()
+    import agents
+    from machine_code import cache
+    folder = cache.folder("agents")
     source = Path("mdp/graph.py")
     source.write_text(source.read_text() + "\\n")
     import numpy as np
@@ -211,7 +215,7 @@ def test_sources_that_change_under_a_running_process_are_not_kept(checkout):
 OWN_RULE = """
 import gc
 gc.disable()
-from mdp.machine_code import inlined
+from mdp.machine_code import inlined  # its name in earlier versions
 from agents.tabular.q_learning import QLearning
 from stable_baselines3.common.env_util import make_vec_env
 WORTH = {worth}
@@ -261,10 +265,10 @@ def test_old_machine_code_goes_away(tmp_path, monkeypatch):
     for age in range(6):
         (parent / f"old{age}").mkdir(parents=True)
         os.utime(parent / f"old{age}", (now - 100 - age, now - 100 - age))
-    own = parent / code_cache.digest()
+    own = parent / code_cache.digest("agents")
     own.mkdir()
     os.utime(own, (now - 1000, now - 1000))
-    code_cache.remove_old(parent)
+    code_cache.remove_old(own)
     left = {path.name for path in parent.iterdir()}
     assert left >= {own.name, "old0", "old1"}
     assert len(left) <= 2 + code_cache.KEPT_BESIDE
@@ -369,7 +373,7 @@ def plant(folder, payload, change):
 )
 def test_a_file_of_anyones_in_ones_own_folder_is_not_unpickled(checkout, tmp_path, change):
     assert outcome(checkout)[2] is not None
-    plant(checkout / "mdp", pickle.dumps(Payload(tmp_path / "mark")), change)
+    plant(checkout / "agents", pickle.dumps(Payload(tmp_path / "mark")), change)
     said = f"{SMALL}print(sum('cannot be used' in name for name in names))"
     assert run(checkout, said).stdout.split()[:3] == ["13", "compiled", "1"]
     assert not (tmp_path / "mark").exists()
@@ -381,7 +385,7 @@ def test_a_folder_of_anyones_is_passed_over_in_one_line(checkout, tmp_path):
     root, cache = tmp_path / "open", tmp_path / "home"
     shutil.copytree(checkout, root, ignore=shutil.ignore_patterns("__pycache__"))
     assert outcome(root) == (13, "compiled", True)
-    folder = root / "mdp" / "__pycache__" / "machine_code"
+    folder = root / "agents" / "__pycache__" / "machine_code"
     plant(folder, pickle.dumps(Payload(tmp_path / "mark")), lambda path: None)
     folder.chmod(0o777)
     cache.write_text("")
@@ -393,3 +397,44 @@ def test_a_folder_of_anyones_is_passed_over_in_one_line(checkout, tmp_path):
         "compiled anew in each process"
     )
     assert not (tmp_path / "mark").exists()
+
+
+# --- the sources themselves -----------------------------------------------------------------------
+
+
+def test_names_and_contents_count_and_other_files_do_not(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "ROOT", tmp_path)
+
+    def digest():
+        paths = sources.source_paths(["second", "first"])
+        return sources.digest_of(sources.content_lines(paths))
+
+    for name in ("first", "second", "third"):
+        (tmp_path / name / "deep").mkdir(parents=True)
+    rule = tmp_path / "first" / "deep" / "rule.py"
+    rule.write_text("x = 1")
+    (tmp_path / "second" / "other.py").write_text("")
+    before = digest()
+    (tmp_path / "third" / "rule.py").write_text("x = 2")
+    (tmp_path / "first" / "notes.txt").write_text("x = 2")
+    assert digest() == before
+    rule.write_text("x = 2")
+    changed = digest()
+    rule.write_text("x = 1")
+    assert digest() == before
+    moved = rule.rename(tmp_path / "first" / "rule.py")
+    assert len({before, changed, digest()}) == 3
+    paths = sources.source_paths(["second", "first"])
+    assert paths == [moved, tmp_path / "second" / "other.py"]
+    # As Windows would write it too.
+    assert sources.content_lines(paths)[0].startswith("first/rule.py ")
+
+
+def test_what_a_state_was_made_by_is_known_without_the_compiler():
+    code = """
+import sys
+from pipeline.source_digest import source_digest
+assert len(source_digest()) == 16 and source_digest() != source_digest("experiments")
+assert not {"numba", "scipy", "torch"} & sys.modules.keys()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -1,14 +1,16 @@
-"""What compiled functions call is compiled as a part of them, once, and is no machine code."""
+"""Compiled functions: parts are compiled once, and what compiling takes is told."""
 
 import os
 import subprocess
 import sys
+import time
 
 import numpy as np
 import pytest
 from numba.core import event
 
-from mdp.machine_code import called, inlined, kernel
+from machine_code.compiling import called, compile_timer, compiled, inlined, kernel
+from machine_code.work_time import WorkTime
 
 
 @called
@@ -81,3 +83,38 @@ for name in ("envs:Warehouse-v0", "FrozenLake-v1"):
     assert warehouse == ["79.0", "79.0"]
     planned, earned = map(float, frozen_lake)
     assert earned == pytest.approx(planned, abs=1e-12)
+
+
+def test_durations_add_up():
+    assert WorkTime(3.0, 2.0) + WorkTime(1.0, 0.5) == WorkTime(4.0, 2.5)
+    assert WorkTime(3.0, 2.0) - WorkTime(1.0, 0.5) == WorkTime(2.0, 1.5)
+    assert WorkTime(1.23456, 0.00049).as_data() == {"seconds": 1.235, "cpu_seconds": 0.0}
+
+
+def test_sleep_takes_no_processor():
+    begun = WorkTime.now()
+    time.sleep(0.2)
+    slept = WorkTime.now() - begun
+    assert slept.seconds >= 0.2
+    assert slept.cpu_seconds < 0.1
+
+
+def test_compiling_is_timed_as_a_whole():
+    @compiled
+    def inner(x):
+        return x * np.pi + 1
+
+    @compiled
+    def outer(x):
+        return inner(x) - np.pi
+
+    begun = WorkTime.now()
+    with compile_timer() as time_compiling:
+        assert time_compiling() == WorkTime()
+        outer(2.0)
+        first = time_compiling()
+        outer(3.0)
+        assert time_compiling() == first
+    taken = WorkTime.now() - begun
+    assert 0 < first.seconds <= taken.seconds
+    assert 0 < first.cpu_seconds <= taken.cpu_seconds

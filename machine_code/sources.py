@@ -1,4 +1,4 @@
-"""The sources of packages, and a digest that stands for what they say."""
+"""The sources of packages, a digest that stands for what they say, and whose code they decide."""
 
 from __future__ import annotations
 
@@ -8,6 +8,24 @@ from pathlib import Path
 
 # The folder of all packages.
 ROOT = Path(__file__).resolve().parent.parent
+
+# By package: all packages whose sources decide about the machine code of its functions.
+_SOURCES_OF_CODE: dict[str, tuple[str, ...]] = {}
+
+
+def keep_machine_code(package: str, *others: str) -> None:
+    """Keep the machine code of a package's functions on disk.
+
+    Args:
+        package: its name.
+        others: the packages from which functions, types or constants are compiled into them.
+    """
+    _SOURCES_OF_CODE[package] = (package, *others, __name__.partition(".")[0])
+
+
+def kept_packages() -> dict[str, tuple[str, ...]]:
+    """The packages whose machine code is kept, each with those whose sources decide about it."""
+    return dict(_SOURCES_OF_CODE)
 
 
 def source_paths(packages: Iterable[str]) -> list[Path]:
