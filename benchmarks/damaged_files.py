@@ -41,7 +41,7 @@ from pipeline.errors import UserError
 from pipeline.models.continuation import agent_to_continue
 from pipeline.models.model_choice import ChosenModel, ModelRequest, choose_model
 from pipeline.models.model_loading import load_model
-from safe_files.tensors import tensors_in
+from safe_files.known_objects import tensors_in
 
 REFUSED, RIGHT, WRONG, ANOTHER, BROKEN = "refused", "right", "wrong", "another run", "broken"
 UNNAMED = "refused, and the file not named"

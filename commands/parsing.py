@@ -23,7 +23,7 @@ from commands.streams import standard_streams
 from pipeline.errors import UserError, one_line, visible
 from pipeline.exhaustion import exhaustion
 from pipeline.stopping import default_for_signals, n_stops
-from safe_files.refusals import UnsafeFileError
+from safe_files.files import UnsafeFileError
 
 MISTAKE = 2
 

@@ -13,8 +13,7 @@ from experiments.looks import Design, Look, LookLog, Looks, Question
 from experiments.study_spec import METRICS
 from pipeline.errors import UserError, one_line
 from pipeline.files import write_json
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.files import UnsafeFileError, read_file
 
 FILE = "looks.json"
 _FORMAT = 1

@@ -13,7 +13,7 @@ from pipeline.files import kept_later, put_in_place, settle, sync_together
 from pipeline.folder_clock import SECONDS_BETWEEN_SIGNS, give_sign
 from pipeline.signs_of_life import Heartbeat
 from pipeline.user_modules import import_again
-from safe_files.regular_files import hold
+from safe_files.files import hold
 
 
 def do_planned_run(planned: PlannedRun, root: Path, command: str) -> None:

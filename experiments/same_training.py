@@ -8,7 +8,7 @@ from experiments.run_figures import read_episodes, read_evaluations
 from pipeline.file_digests import DamagedFileError
 from pipeline.run_folder import Run
 from safe_files.archives import read_members
-from safe_files.refusals import UnsafeFileError
+from safe_files.files import UnsafeFileError
 
 
 def difference(run: Run, other: Run) -> str:

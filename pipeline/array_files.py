@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from pipeline.errors import one_line
 from pipeline.file_digests import DamagedFileError
 from safe_files.archives import read_member
-from safe_files.limits import Budget
+from safe_files.files import Budget
 
 MOST_ARRAYS = 1000
 _KINDS = "biuf"  # booleans, integers, floats

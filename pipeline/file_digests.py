@@ -20,9 +20,7 @@ from typing import Any
 from pipeline.errors import UserError, one_line
 from pipeline.files import files_below
 from pipeline.json_text import plain
-from safe_files.limits import Budget
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, hold, opened, read_file
+from safe_files.files import NO_LIMIT, Budget, UnsafeFileError, hold, opened, read_file
 
 RECORD = "run.json"
 FIELD = "files"

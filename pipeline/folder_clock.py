@@ -8,8 +8,7 @@ import re
 import secrets
 from pathlib import Path
 
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, opened
+from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 
 SECONDS_BETWEEN_SIGNS = 5.0
 

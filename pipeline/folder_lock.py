@@ -29,8 +29,7 @@ from pipeline.folder_clock import (
     seconds_silent,
 )
 from pipeline.signs_of_life import Heartbeat
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NEW, open_number, read_file
+from safe_files.files import NEW, UnsafeFileError, open_number, read_file
 
 SECONDS_OF_SILENCE = 60.0
 _SECONDS_BETWEEN_LOOKS = 0.2

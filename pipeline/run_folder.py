@@ -38,7 +38,7 @@ from pipeline.files import (
 )
 from pipeline.liveness import is_alive, mark
 from pipeline.run_files import RunFiles, environment_name
-from safe_files.regular_files import hold
+from safe_files.files import hold
 
 RUNNING = "running"
 FINISHED = "finished"

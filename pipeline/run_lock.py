@@ -13,7 +13,7 @@ from pipeline.errors import UserError
 from pipeline.folder_lock import folder_lock
 from pipeline.liveness import is_alive
 from pipeline.run_folder import PROCESS, RUNNING, Run
-from safe_files.regular_files import take_up
+from safe_files.files import take_up
 
 
 @contextmanager

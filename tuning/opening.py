@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from agents import ALGORITHMS
 from experiments.study_plan import check_settings
 from pipeline.errors import UserError
-from safe_files.regular_files import take_up
+from safe_files.files import take_up
 from tuning.judging import judged
 from tuning.pruning import is_hopeless
 from tuning.samplers import make_sampler

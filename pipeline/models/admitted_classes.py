@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.user_modules import UserModule
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
-
-# Where the schedule lived that zips of library agents once held.
-_SCHEDULES = ("agents.schedules", "agents.common.schedules")
 
 
 def own_classes(
@@ -45,15 +42,3 @@ def own_classes(
 
 def _lies_in(cls: type, homes: Iterable[str]) -> bool:
     return any(f"{cls.__module__}.".startswith(f"{home}.") for home in homes)
-
-
-def own_makers() -> Mapping[str, Any]:
-    """What makes objects of ours, by the full names of their classes."""
-    from agents.common.schedules import ExponentialSchedule
-    from safe_files.pickle_trees import Made
-    from safe_files.rebuilding import Build, fields
-
-    def schedule(made: Made, build: Build) -> ExponentialSchedule:
-        return ExponentialSchedule(**fields(made, build))
-
-    return {f"{module}.ExponentialSchedule": schedule for module in _SCHEDULES}

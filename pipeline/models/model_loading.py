@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from agents import load_algorithm
 from pipeline.errors import UserError, one_line
-from pipeline.models.admitted_classes import own_classes, own_makers
+from pipeline.models.admitted_classes import own_classes
 from pipeline.models.model_zips import (
     ModelFile,
     _is_hand_written,
@@ -103,7 +103,6 @@ def _loaded(
         file.stream(),
         env,
         classes=own_classes(algorithm, modules),
-        makers=own_makers(),
         **kwargs,
     )
 
@@ -203,7 +202,7 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
 
     from agents.dqn import MaskedReplayBuffer
     from safe_files import load_replay_buffer as load_safely
-    from safe_files.limits import MAX_BUFFER_BYTES
+    from safe_files.files import MAX_BUFFER_BYTES
 
     if not isinstance(model, OffPolicyAlgorithm):
         return

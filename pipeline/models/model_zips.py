@@ -56,7 +56,7 @@ def read_model(path: Path, run: Run | None = None) -> ModelFile:
         UserError: if it is missing, unreadable, damaged, too large, or something else.
     """
     from safe_files.archives import first_look
-    from safe_files.limits import MAX_ARCHIVE_BYTES
+    from safe_files.files import MAX_ARCHIVE_BYTES
 
     try:
         content = read_recorded(run, path, MAX_ARCHIVE_BYTES)

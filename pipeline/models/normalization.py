@@ -56,8 +56,8 @@ def read_statistics(path: Path, run: Run | None = None) -> Statistics:
     Raises:
         UserError: if the file is no such thing, or not as the run left it.
     """
-    from safe_files.limits import MAX_STATISTICS_BYTES
-    from safe_files.vec_normalize import read_normalization
+    from safe_files.buffers_and_statistics import read_normalization
+    from safe_files.files import MAX_STATISTICS_BYTES
 
     try:
         saved = read_normalization(read_recorded(run, path, MAX_STATISTICS_BYTES))

@@ -23,7 +23,7 @@ from pipeline.file_digests import RECORD, DamagedFileError, read_record
 from pipeline.run_files import environment_name
 from pipeline.run_folder import Run
 from pipeline.settings.strict_yaml import read_saved_settings
-from safe_files.regular_files import read_file
+from safe_files.files import read_file
 
 _SETTINGS_FILES = ("args.yml", "config.yml")
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from pipeline.errors import UserError
 from pipeline.file_digests import STATE_FOLDER
 from pipeline.files import replacing
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, opened
+from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 
 EVENT_FILES = "events.out.tfevents.*"
 # By the numbers of the environments: a wrapper that the settings name begins its file anew.

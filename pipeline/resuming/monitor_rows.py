@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from agents.compiled.episodes import n_whole_returns
 from pipeline.resuming.log_positions import MONITOR_FILES, Position
-from safe_files.regular_files import NO_LIMIT, opened
+from safe_files.files import NO_LIMIT, opened
 from snapshots.filling import NotRestorableError
 
 RETURNS, LENGTHS, TIMES = "episode_returns", "episode_lengths", "episode_times"

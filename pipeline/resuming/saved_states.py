@@ -11,8 +11,7 @@ from pipeline.errors import UserError
 from pipeline.files import replacing, sync_folders
 from pipeline.resuming.state_folder import state_file, state_files
 from pipeline.source_digest import source_digest
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, opened
+from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 from snapshots.recording import Snapshot
 from snapshots.snapshot_files import BadSnapshotError, read_snapshot, write_snapshot
 from snapshots.user_key import user_key

@@ -18,8 +18,7 @@ from yaml.nodes import MappingNode, Node, SequenceNode
 
 from pipeline.errors import UserError
 from pipeline.settings.yaml_loaders import SavedSettingsLoader, StrictLoader
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.files import UnsafeFileError, read_file
 
 # Twenty times what the longest file of settings has, and read in well under a second.
 _MAX_BYTES = 256 * 1024
