@@ -42,17 +42,7 @@ def read_members(
     budget: Budget | None = None,
     most: int = MAX_MEMBERS,
 ) -> dict[str, bytes]:
-    """The members of a zip, by their names.
-
-    Args:
-        content: the zip.
-        expected: the names that members may have; None for any.
-        budget: pays for the members; None for that of such a file.
-        most: how many there may be.
-
-    Raises:
-        UnsafeFileError: if it is no whole zip, unpacks to too much, or has other members.
-    """
+    """The members of a zip, by their names; those expected, if any are, and at most so many."""
     budget = budget or Budget(len(content))
     with opened_zip(content, budget) as archive:
         infos = archive.infolist()

@@ -52,11 +52,7 @@ def shown(value: object) -> str:
 
 
 class Budget:
-    """The memory that one file may take: whoever makes something of it pays before.
-
-    Args:
-        n_bytes: size of the file.
-    """
+    """The memory that a file of so many bytes may take: who makes something of it pays before."""
 
     def __init__(self, n_bytes: int) -> None:
         self.n_bytes = n_bytes
@@ -111,12 +107,9 @@ def hold(folder: Path) -> None:
 
 
 def take_up(folder: Path) -> None:
-    """Hold a folder in which nothing lies but files and folders.
+    """Hold a folder, once it is sure that nothing lies there but files and folders.
 
     Libraries that open paths by themselves may then be let in.
-
-    Raises:
-        UnsafeFileError: naming a link, pipe or device inside.
     """
     hold(folder)
     pending = [str(folder)]
@@ -137,13 +130,9 @@ def take_up(folder: Path) -> None:
 
 @contextmanager
 def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
-    """The folder of a path, as functions of `os` take it.
+    """The folder of a path as functions of `os` take it: what to put before a name, and ``dir_fd``.
 
-    Yields:
-        What to put before a name in it, and ``dir_fd``.
-
-    Raises:
-        OSError: if it is not there, or lies behind a link in a folder that is held.
+    An OSError says that it is not there, or lies behind a link in a folder that is held.
     """
     whole = _whole(path)
     held = _held_above(whole)
@@ -165,11 +154,7 @@ def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
 
 
 def open_number(path: Path, flags: int) -> int:
-    """The descriptor of a file, whatever kind it is of, opened without waiting for it.
-
-    Raises:
-        OSError: if that fails, or it is or lies behind a link in a folder that is held.
-    """
+    """The descriptor of a file, whatever kind it is of, opened without waiting for it."""
     held = _held_above(_whole(path))
     if held is None:  # the user's own place
         return os.open(path, flags | _ALWAYS)
@@ -181,16 +166,10 @@ def open_number(path: Path, flags: int) -> int:
 
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[io.BufferedReader]:
-    """A regular file, open for reading: what is checked is what is used.
+    """A regular file of at most so many bytes, open for reading: what is checked is what is used.
 
-    Args:
-        path: the file.
-        limit: the most bytes that it may have.
-
-    Raises:
-        UnsafeFileError: if it is no regular file (a pipe or a device could go on for ever), or
-            larger than that, or behind a link in a folder that is held.
-        OSError: if it cannot be read.
+    A pipe or a device is refused, which could go on for ever, and what lies behind a link in a
+    folder that is held.
     """
     try:
         # Of a folder, Python says so itself, and closes it again.
@@ -220,12 +199,7 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def content_of(source: Source, limit: int) -> bytes:
-    """All of a regular file, or of a stream.
-
-    Raises:
-        UnsafeFileError: if it is larger than ``limit``, or the file is no regular one.
-        OSError: if it cannot be read.
-    """
+    """All of a regular file, or of a stream, of at most so many bytes."""
     if not isinstance(source, io.BufferedIOBase):
         return read_file(Path(source), limit)
     content = source.read(limit + 1)

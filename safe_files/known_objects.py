@@ -203,16 +203,11 @@ _CLASSES_OF_NUMPY: Mapping[str, type] = {
 # most once.
 
 _DTYPES: Mapping[str, th.dtype] = {
-    "torch.BoolStorage": th.bool,
+    f"torch.{kind}Storage": getattr(th, kind.lower())
+    for kind in ("Bool", "Short", "Int", "Long", "Half", "BFloat16", "Float", "Double")
+} | {
     "torch.ByteStorage": th.uint8,
     "torch.CharStorage": th.int8,
-    "torch.ShortStorage": th.int16,
-    "torch.IntStorage": th.int32,
-    "torch.LongStorage": th.int64,
-    "torch.HalfStorage": th.float16,
-    "torch.BFloat16Storage": th.bfloat16,
-    "torch.FloatStorage": th.float32,
-    "torch.DoubleStorage": th.float64,
     "torch.ComplexFloatStorage": th.complex64,
     "torch.ComplexDoubleStorage": th.complex128,
 }
@@ -237,15 +232,7 @@ class _TensorReader(Reader):
 
 
 def load_tensors(content: bytes, budget: Budget | None = None) -> Any:
-    """What a ``.pth`` file holds: tensors in dictionaries and lists.
-
-    Args:
-        content: the file.
-        budget: pays for the tensors; None for that of such a file.
-
-    Raises:
-        UnsafeFileError: if it holds anything else, is damaged, or says more than it holds.
-    """
+    """What a ``.pth`` file holds: tensors in dictionaries and lists."""
     budget = budget or Budget(len(content))
     try:
         with opened_zip(content, budget) as archive:
@@ -340,7 +327,7 @@ def check_values(files: Mapping[str, Any]) -> None:
     for name, content in files.items():
         for path, tensor in tensors_in(content):
             where = f"{name}: {shown(path)[1:-1]}"
-            if tensor.is_complex() or tensor.is_quantized or tensor.layout != th.strided:
+            if tensor.is_complex():
                 raise UnsafeFileError(f"{where} is not made of real numbers")
             if tensor.is_floating_point() and not bool(th.isfinite(tensor).all()):
                 raise UnsafeFileError(f"{where} holds numbers that are not finite")
@@ -637,14 +624,7 @@ def read_pickle(
 ) -> Any:
     """What a pickle stands for, made without unpickling.
 
-    Args:
-        pickled: the pickle.
-        classes: further classes that it may name, by their full names.
-        makers: what makes further objects in it, likewise.
-        budget: pays for it; None for that of a file that is this pickle.
-
-    Raises:
-        UnsafeFileError: if it is damaged, or holds what may not stand in it.
+    It may also name further classes, and objects for which there are further makers.
     """
     budget = budget or Budget(len(pickled))
     build = Build({**_MAKERS, **(makers or {})}, {**_library_classes(), **(classes or {})}, budget)

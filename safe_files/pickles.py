@@ -179,10 +179,7 @@ Reader.dispatch = {ord(op.code): _instruction(op) for op in pickletools.opcodes}
 
 
 def read_tree(pickled: bytes, budget: Budget | None = None) -> Any:
-    """What a pickle of protocol 4 or 5 says; a part that the file shares is shared.
-
-    Without a budget, that of such a file pays for it.
-    """
+    """What a pickle of protocol 4 or 5 says; a part that the file shares is shared."""
     budget = budget or Budget(len(pickled))
     budget.charge(len(pickled))
     return Reader(io.BytesIO(pickled), budget).load()
@@ -208,11 +205,8 @@ Maker = Callable[[Made, "Build"], Any]
 class Build:
     """Makes the parts of a tree by fixed tables; what is shared in it is made once.
 
-    Args:
-        makers: what makes an object, and refuses what does not fit, by the full names of what the
-            file says is to make it.
-        classes: those that a file may name, by their full names.
-        budget: pays for what is made.
+    A maker makes an object, and refuses what does not fit. It is found by the full name of what the
+    file says is to make it. The budget pays for all of it.
     """
 
     def __init__(
