@@ -17,7 +17,6 @@ from agents.compiled.cart_pole import CartPole
 from agents.compiled.finite_model import OUTCOME, FiniteModel
 from agents.compiled.kept_worlds import World, keep_world, kept_world, recipe_of
 from agents.compiled.mountain_car import MountainCar
-from envs.checking.claimed_models import is_trusted
 from envs.known_models import (
     model_check,
     observations_of_states,
@@ -26,6 +25,7 @@ from envs.known_models import (
     time_limit,
     transition_model,
 )
+from envs.model_claims import is_trusted
 from envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,

@@ -20,8 +20,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from agents.compiled.cart_pole import CartPole
 from agents.compiled.finite_model import FiniteModel
 from agents.compiled.mountain_car import MountainCar
-from envs.checking.model_sources import Sources, pickled, sources_of
 from envs.known_models import clips_to_numbers
+from envs.model_claims import Sources, pickled, sources_of
 
 World = FiniteModel | CartPole | MountainCar
 
