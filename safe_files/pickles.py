@@ -49,7 +49,7 @@ _BYTES_PER_KEY = 160
 MAX_DEPTH = 40
 # What a value takes, with its place in what holds it; a list, dictionary or object besides; and
 # what is noted down about one that is not empty.
-_BYTES_PER_VALUE, _BYTES_PER_HOLDER, _BYTES_PER_NOTE = 32, 80, 320
+_BYTES_PER_VALUE, _BYTES_PER_HOLDER, _BYTES_PER_NOTE = 32, 80, 256
 # Constructors of spaces make several arrays of each that they are given.
 _SPACES, _COPIES_OF_A_SPACE = "gymnasium.spaces.", 4
 _REFUSED = "which may not stand in such a file"
