@@ -33,7 +33,8 @@ _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
 _COPIES = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
 
 # What Python raises at zips that are damaged, encrypted, or of a kind that it does not know.
-_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, ValueError, EOFError, RuntimeError)
+_ODD = (OverflowError, RuntimeError, ValueError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, *_ODD)
 
 
 def read_members(
