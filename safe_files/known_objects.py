@@ -217,7 +217,7 @@ _STORAGE = Name("torch.storage", "TypedStorage")
 class _TensorReader(Reader):
     """Reads pickles of protocol 2, as PyTorch writes them: storages stand beside the pickle."""
 
-    prices = PRICES | {"GLOBAL": 72, "BINPUT": 104, "LONG_BINPUT": 104, "BINPERSID": 320}
+    prices = PRICES | {"GLOBAL": 104, "BINPUT": 104, "LONG_BINPUT": 104, "BINPERSID": 320}
 
     def __init__(self, file: io.BytesIO, budget: Budget) -> None:
         super().__init__(file, budget)

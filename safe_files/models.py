@@ -16,7 +16,7 @@ import io
 import json
 import math
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,7 +51,7 @@ from safe_files.known_objects import (
     read_pickle,
     tensors_in,
 )
-from safe_files.pickles import Name, parts_of, read_tree
+from safe_files.pickles import Reader
 
 # What is trained and part of no network: the entropy coefficient of SAC and its kin.
 _OF_ENTROPY = frozenset({"log_ent_coef", "ent_coef_tensor"})
@@ -426,8 +426,9 @@ def _setting(key: str, value: Any, budget: Budget) -> tuple[str, list[str]]:
         return shown(value), doubts
     try:
         pickled = _decoded(key, value[_SERIALIZED])
-        found = _names_in(read_tree(pickled, budget))
-        names = sorted({shown(one.name).strip("'") for one in found})
+        reader = Reader(io.BytesIO(pickled), budget)
+        reader.load()
+        names = sorted({shown(name.name).strip("'") for name in reader.names})
         text = "a pickle of " + (", ".join(names) if names else "plain data")
     except UnsafeFileError as error:
         return "a pickle that cannot be read", [*doubts, f"{name} {error}"]
@@ -436,16 +437,3 @@ def _setting(key: str, value: Any, budget: Budget) -> tuple[str, list[str]]:
     except UnsafeFileError as error:
         doubts.append(f"{name} {error}")
     return text, doubts
-
-
-def _names_in(tree: Any) -> Iterator[Name]:
-    """The classes and functions that a tree refers to, each place that it does once."""
-    pending, seen = [tree], set()
-    while pending:
-        part = pending.pop()
-        if id(part) in seen:
-            continue
-        seen.add(id(part))
-        if isinstance(part, Name):
-            yield part
-        pending.extend(parts_of(part))

@@ -27,9 +27,9 @@ _BY_PRICE = {
     32: "PROTO FRAME STOP NONE NEWTRUE NEWFALSE EMPTY_TUPLE POP POP_MARK APPEND APPENDS ADDITEMS "
     "SETITEM SETITEMS BINGET LONG_BINGET BUILD",
     72: "BININT BININT1 BININT2 LONG1 LONG4 BINFLOAT EMPTY_LIST EMPTY_DICT TUPLE1 TUPLE2 TUPLE3 "
-    "TUPLE STACK_GLOBAL",
+    "TUPLE",
     104: "MARK MEMOIZE SHORT_BINUNICODE BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 "
-    "BYTEARRAY8",
+    "BYTEARRAY8 STACK_GLOBAL",
     320: "EMPTY_SET FROZENSET REDUCE NEWOBJ",
 }
 PRICES = {name: price for price, names in _BY_PRICE.items() for name in names.split()}
@@ -105,6 +105,7 @@ class Reader(pickle._Unpickler):
     def __init__(self, file: io.BytesIO, budget: Budget) -> None:
         super().__init__(file)
         self.budget = budget
+        self.names: set[Name] = set()  # all that the file refers to
 
     def load(self) -> Any:
         """The next pickle of the file, as lists, names, objects to make, and plain data."""
@@ -144,7 +145,9 @@ class Reader(pickle._Unpickler):
 
     def find_class(self, module: str, name: str) -> Name:
         """Note down a name; the machine calls this where it would import something."""
-        return Name(module, name)
+        found = Name(module, name)
+        self.names.add(found)
+        return found
 
     def load_reduce(self) -> None:
         """Note down a call."""
