@@ -39,7 +39,7 @@ from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.errors import UserError
 from pipeline.models.choose import ChosenModel, ModelRequest, agent_to_continue, choose_model
 from pipeline.models.load import load_model
-from safe_files.tensors import tensors_in
+from safe_files.known_objects import tensors_in
 
 REFUSED, RIGHT, WRONG, ANOTHER, BROKEN = "refused", "right", "wrong", "another run", "broken"
 UNNAMED = "refused, and the file not named"

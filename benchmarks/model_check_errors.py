@@ -25,8 +25,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.random import Generator
 
-from envs import check_transition_model
-from envs.checking import odd_frequencies
+from envs import check_transition_model, checking
 
 N_MODELS = 10_000
 STEPS = 500
@@ -104,7 +103,7 @@ def random_table(rng: Generator) -> tuple[Table, list[float]]:
 
 def false_alarms(n_models: int, bound: float) -> int:
     """How many of so many right models are refused."""
-    odd_frequencies.FALSE_ALARMS = bound
+    checking.FALSE_ALARMS = bound
     refused = 0
     for seed in range(n_models):
         rng = np.random.default_rng([seed, 1])
@@ -152,7 +151,7 @@ def main() -> None:
             f"({time.process_time() - started:.0f} s of processor time)",
             flush=True,
         )
-    odd_frequencies.FALSE_ALARMS = 1e-6
+    checking.FALSE_ALARMS = 1e-6
     print(f"\nshare of {REPEATS} wrong models refused, by the error of a probability of {WIND}")
     print(f"{'states x actions, wrong in':38}" + "".join(f"{error:>7}" for error in ERRORS))
     for n_states, n_actions in ((5, 2), (500, 4)):

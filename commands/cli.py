@@ -30,7 +30,7 @@ from pipeline.failures import OwnExit, exhaustion
 from pipeline.files import portable_name
 from pipeline.stopping import default_for_signals, n_stops
 from pipeline.unfinished_runs import SaveInterval
-from safe_files.refusals import UnsafeFileError
+from safe_files.files import UnsafeFileError
 
 MISTAKE = 2  # exit code
 

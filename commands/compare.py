@@ -163,7 +163,7 @@ def _compare(args: argparse.Namespace) -> int:
     from experiments.plan import plan
     from experiments.run_limits import RunLimits
     from pipeline.locks import folder_lock, told_if_gone
-    from safe_files.regular_files import take_up
+    from safe_files.files import take_up
 
     go_on_unread()
     root = Path(args.log_folder) / study.name

@@ -105,11 +105,10 @@ def inspect() -> int:
     parser.add_argument("model", metavar="ZIP", help="zip of an agent of Stable-Baselines3 or ours")
     path = Path(parser.parse_args().model)
     from commands.terminal import say, table_console
-    from pipeline.models.load import own_makers
     from safe_files import inspect_model
 
     try:
-        report = inspect_model(path, own_makers())
+        report = inspect_model(path)
     except FileNotFoundError:
         raise UserError(f"no such model file: {path}") from None
     except (OSError, ValueError) as error:

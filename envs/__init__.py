@@ -81,4 +81,4 @@ def __getattr__(name: str) -> Any:
     # Loaded on first use: registering environments is all that most need.
     if name not in __all__:
         raise AttributeError(f"module 'envs' has no attribute {name!r}")
-    return getattr(importlib.import_module("envs.checking.model_checks"), name)
+    return getattr(importlib.import_module("envs.checking"), name)

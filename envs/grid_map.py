@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mdp.array_types import Bools
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.files import UnsafeFileError, read_file
 
 START = "S"
 GOAL = "G"

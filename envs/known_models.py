@@ -4,7 +4,7 @@ The answer is None wherever something in the chain of wrappers is not known to l
 alone: a wrong model would make every figure computed from it wrong. For the same reason an
 environment's word is not proof: a model that comes neither from Gymnasium's own classes nor from
 this project's is held against `step` before it is believed, once a process: see
-`envs.checking.model_checks`.
+`envs.checking`.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from gymnasium.envs.toy_text.taxi import TaxiEnv
 from gymnasium.wrappers import ClipReward
 from numpy.typing import NDArray
 
-from envs.checking.claimed_models import Claim, claim_of, is_trusted
-from envs.checking.model_checks import ModelCheck, checked
+from envs.checking import ModelCheck, checked
 from envs.finite_env import MaskedFiniteEnv
 from envs.grid import GridWorld
 from envs.grid_map import GOAL
+from envs.model_claims import Claim, claim_of, is_trusted
 from envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,

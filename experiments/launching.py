@@ -37,7 +37,7 @@ from pipeline.files import write_text
 from pipeline.library_loading import loading_libraries
 from pipeline.locks import FolderGoneError, is_gone
 from pipeline.train_spec import FAMILIES, NETWORKS, TrainSpec, is_plain
-from safe_files.regular_files import hold
+from safe_files.files import hold
 
 if TYPE_CHECKING:
     from experiments.results import RunResults

@@ -17,8 +17,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from experiments.study import METRICS, StudySpec
 from pipeline.errors import UserError, one_line
 from pipeline.files import write_json
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.files import UnsafeFileError, read_file
 from verdicts import level_of_look
 
 ALPHA = 0.05  # of the studies, at most, say anything wrong on an environment

@@ -24,7 +24,7 @@ from pipeline.digests import DamagedFileError, read_arrays
 from pipeline.errors import one_line
 from pipeline.runs import Run
 from safe_files.archives import read_members
-from safe_files.refusals import UnsafeFileError
+from safe_files.files import UnsafeFileError
 
 LARGEST_FIGURE = 1e300
 _FORMER_BASELINE = "best_blind"  # what earlier versions called it

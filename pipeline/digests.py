@@ -24,9 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.errors import UserError, one_line
 from pipeline.files import files_below, plain
-from safe_files.limits import Budget
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, hold, opened, read_file
+from safe_files.files import NO_LIMIT, Budget, UnsafeFileError, hold, opened, read_file
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -22,7 +22,7 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from safe_files.regular_files import NEW, folder_of, open_number
+from safe_files.files import NEW, folder_of, open_number
 
 if TYPE_CHECKING:
     from concurrent.futures import ThreadPoolExecutor
@@ -109,7 +109,7 @@ def replacing(path: Path) -> Iterator[BufferedWriter]:
 
     Raises:
         OSError: if the folder is gone, as one that was renamed meanwhile, or lies behind a link in
-            a folder that is held: see `safe_files.regular_files`.
+            a folder that is held: see `safe_files.files`.
     """
     # A name that could be guessed might be there already, as a link to another's file.
     name = f".{path.name}.{secrets.token_hex(8)}.tmp"

@@ -30,8 +30,8 @@ from typing import Any
 
 from pipeline.digests import LOCK
 from pipeline.errors import UserError, visible
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NEW, NO_LIMIT, open_number, opened, read_file
+from pipeline.signs_of_life import Heartbeat
+from safe_files.files import NEW, NO_LIMIT, UnsafeFileError, open_number, opened, read_file
 
 _BOOT = "/proc/sys/kernel/random/boot_id"
 _MACHINES = ("/etc/machine-id", "/var/lib/dbus/machine-id")
@@ -265,8 +265,6 @@ def folder_lock(
         if not lost:
             lost.append(error)
             on_loss()
-
-    from pipeline.signs_of_life import Heartbeat  # with all that draws on terminals
 
     made = _make_folders(root)
     path, token = root / LOCK, secrets.token_hex(16)

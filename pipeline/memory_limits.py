@@ -14,7 +14,7 @@ from gymnasium import spaces
 
 from pipeline.errors import UserError
 from pipeline.settings.hyperparams import Hyperparams
-from safe_files.limits import memory_bytes
+from safe_files.files import memory_bytes
 
 _BYTES_PER_ENVIRONMENT = 20_000  # CartPole with its Monitor takes more
 _BYTES_PER_WEIGHT = 16  # of 32 bits, with its gradient and two moments of Adam

@@ -14,7 +14,7 @@ from typing import Any
 from pipeline.errors import UserError, shown
 from pipeline.files import files_below, replacing
 from pipeline.user_modules import UserModule, found_beside
-from safe_files.regular_files import NO_LIMIT, read_file
+from safe_files.files import NO_LIMIT, read_file
 
 # The folder of a run that keeps copies of the user's modules.
 COPIES = "modules"

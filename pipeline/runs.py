@@ -48,7 +48,7 @@ from pipeline.files import (
 )
 from pipeline.locks import folder_lock, is_alive, mark
 from pipeline.module_records import COPIES, keep_copies
-from safe_files.regular_files import hold, take_up
+from safe_files.files import hold, take_up
 
 if TYPE_CHECKING:
     from pipeline.train_spec import TrainSpec

@@ -39,8 +39,7 @@ from pipeline.files import replacing, sync_folders
 from pipeline.runs import state_file, state_files
 from pipeline.source_digest import source_digest
 from pipeline.states import Pickled, Place
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, opened
+from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 
 APPLICATION = "yardstick"
 SOURCES = "sources"

@@ -30,8 +30,7 @@ from pipeline.runs import (
 )
 from pipeline.train_spec import TrainSpec, completed
 from pipeline.user_modules import UserModule
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, opened
+from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 
 if TYPE_CHECKING:
     from pipeline.state_files import SavedState

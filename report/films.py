@@ -21,7 +21,7 @@ from pipeline.environments import MISTAKES
 from pipeline.errors import UserError, one_line
 from pipeline.files import replacing, write_json
 from pipeline.signs_of_life import Tell, tell_nobody
-from safe_files.regular_files import read_file
+from safe_files.files import read_file
 
 if TYPE_CHECKING:
     from experiments.results import StudyResults

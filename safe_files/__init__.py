@@ -8,13 +8,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from safe_files.refusals import UnsafeFileError
+from safe_files.files import UnsafeFileError
 
 if TYPE_CHECKING:
-    from safe_files.inspection import Report, inspect_model
-    from safe_files.models import load_model
-    from safe_files.replay_buffers import load_replay_buffer
-    from safe_files.vec_normalize import load_vec_normalize
+    from safe_files.buffers_and_statistics import load_replay_buffer, load_vec_normalize
+    from safe_files.models import Report, inspect_model, load_model
 
 __all__ = [
     "Report",
@@ -27,11 +25,11 @@ __all__ = [
 
 # Imported when they are asked for: the libraries take two seconds.
 _MODULES = {
-    "Report": "inspection",
-    "inspect_model": "inspection",
+    "Report": "models",
+    "inspect_model": "models",
     "load_model": "models",
-    "load_replay_buffer": "replay_buffers",
-    "load_vec_normalize": "vec_normalize",
+    "load_replay_buffer": "buffers_and_statistics",
+    "load_vec_normalize": "buffers_and_statistics",
 }
 
 

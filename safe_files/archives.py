@@ -14,33 +14,27 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from safe_files.limits import MAX_INTEGER_BITS, MAX_MEMBERS, Budget
-from safe_files.refusals import UnsafeFileError, shown
+from safe_files.files import Budget, UnsafeFileError, shown
 
 SETTINGS = "data"
 _NETWORKS = "policy policy.optimizer actor.optimizer critic.optimizer ent_coef_optimizer"
 TENSORS = frozenset(f"{name}.pth" for name in f"{_NETWORKS} pytorch_variables tensors".split())
 MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
-
 # Algorithms of the user's may keep further files of tensors.
 _TENSORS = re.compile(r"\w[\w.]*\.pth", re.ASCII)
 
+MAX_MEMBERS = 64
+# Of no use beyond this: counters of steps are far below.
+MAX_INTEGER_BITS = 128
 # What begins each entry of a zip's list of members, and what Python makes of one.
 _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
-# The library stores members as they are. Whoever packs a zip anew may deflate them.
-_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
+# The library stores members as they are. Whoever packs a zip anew may deflate them; then twice
+# what is unpacked is paid for, as Python puts it together from pieces.
+_COPIES = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
 
-# What the library raises at zips that are damaged, encrypted, or of a kind that it does not know.
-_DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    OSError,
-    ValueError,
-    EOFError,
-    OverflowError,
-    NotImplementedError,
-    RuntimeError,
-)
+# What Python raises at zips that are damaged, encrypted, or of a kind that it does not know.
+_ODD = (OverflowError, RuntimeError, ValueError)
+_DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, *_ODD)
 
 
 def read_members(
@@ -49,29 +43,16 @@ def read_members(
     budget: Budget | None = None,
     most: int = MAX_MEMBERS,
 ) -> dict[str, bytes]:
-    """The members of a zip, by their names.
-
-    Args:
-        content: the zip.
-        expected: the names that members may have; None for any.
-        budget: pays for the members; None for that of such a file.
-        most: how many there may be.
-
-    Raises:
-        UnsafeFileError: if it is no whole zip, unpacks to too much, or has other members.
-    """
+    """The members of a zip, by their names; those expected, if any are, and at most so many."""
     budget = budget or Budget(len(content))
     with opened_zip(content, budget) as archive:
         infos = archive.infolist()
-        names = [info.filename for info in infos]
-        strange = [] if expected is None else sorted(set(names) - expected)
+        strange = sorted({info.filename for info in infos} - expected) if expected else []
         if strange:
             raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
-        if len(names) > most:
+        if len(infos) > most:
             raise UnsafeFileError(f"holds more than {most} members")
-        # Twice what is unpacked: Python puts it together from pieces.
-        copies = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
-        budget.charge(sum(info.file_size * copies[info.compress_type] for info in infos))
+        budget.charge(sum(info.file_size * _COPIES[info.compress_type] for info in infos))
         return {info.filename: read_member(archive, info) for info in infos}
 
 
@@ -93,7 +74,7 @@ def opened_zip(content: bytes, budget: Budget) -> Iterator[zipfile.ZipFile]:
             infos = archive.infolist()
             if len({info.filename for info in infos}) != len(infos):
                 raise UnsafeFileError("holds a member twice")
-            if any(info.compress_type not in _METHODS for info in infos):
+            if any(info.compress_type not in _COPIES for info in infos):
                 raise UnsafeFileError("has a compression method that is not read here")
             yield archive
     except UnsafeFileError:
@@ -109,7 +90,9 @@ def first_look(content: bytes) -> dict[str, Any]:
     """
     budget = Budget(len(content))
     members = read_members(content, budget=budget)
-    strange = sorted(name for name in members if not _may_stand(name))
+    strange = sorted(
+        name for name in members if name not in MEMBERS and not _TENSORS.fullmatch(name)
+    )
     if strange:
         raise UnsafeFileError(f"holds {shown(strange[0])}, which no model file has")
     tensors = [name for name in members if name.endswith(".pth")]
@@ -121,18 +104,13 @@ def first_look(content: bytes) -> dict[str, Any]:
     return parse_settings(members, budget)
 
 
-def _may_stand(name: str) -> bool:
-    return name in MEMBERS or _TENSORS.fullmatch(name) is not None
-
-
 def parse_settings(members: Mapping[str, bytes], budget: Budget) -> dict[str, Any]:
     """The settings of a model as JSON."""
     if SETTINGS not in members:
         raise UnsafeFileError("is no whole zip of a model: it lacks its settings")
-    text = members[SETTINGS]
-    budget.charge_json(text)
+    budget.charge_json(members[SETTINGS])
     try:
-        data = json.loads(text.decode(), parse_int=_integer)
+        data = json.loads(members[SETTINGS].decode(), parse_int=_integer)
     except (ValueError, RecursionError) as error:
         raise UnsafeFileError(f"has settings that are no JSON: {error}") from error
     if not isinstance(data, dict):

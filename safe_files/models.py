@@ -1,4 +1,11 @@
-"""Models of Stable-Baselines3 and sb3-contrib, loaded from files of unknown origin."""
+"""Models of Stable-Baselines3 and sb3-contrib, loaded from files of unknown origin.
+
+The library's own `load` gets a zip that is written anew from what was checked, so that it meets
+nothing to unpickle. It makes the networks that the settings describe before it looks at the
+weights, and the buffers too: a file of some bytes could ask for all the memory that there is. And
+PyTorch turns one kind of numbers into another without a word, and looks at the shapes of an
+optimizer's averages when they are used for the first time.
+"""
 
 from __future__ import annotations
 
@@ -7,53 +14,64 @@ import binascii
 import inspect
 import io
 import json
+import math
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeVar
 
 import torch as th
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.save_util import recursive_getattr
+from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+from torch import nn, optim
+from torch.overrides import TorchFunctionMode
 
 from safe_files.archives import MEMBERS, SETTINGS, TENSORS, parse_settings, read_members
-from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
-from safe_files.objects import policy_classes, read_pickle
-from safe_files.rebuilding import Maker
-from safe_files.refusals import UnsafeFileError, shown
-from safe_files.regular_files import Source, content_of
-from safe_files.tensors import check_values, first_line, load_tensors
-from safe_files.weights import charged_tensors, check_fit, check_sizes, check_variable
+from safe_files.files import (
+    MAX_ARCHIVE_BYTES,
+    Budget,
+    Source,
+    UnsafeFileError,
+    content_of,
+    memory_bytes,
+    read_file,
+    shown,
+)
+from safe_files.known_objects import (
+    MAX_ROWS,
+    all_policy_classes,
+    check_values,
+    load_tensors,
+    policy_classes,
+    read_pickle,
+    tensors_in,
+)
+from safe_files.pickles import Reader
 
 # What is trained and part of no network: the entropy coefficient of SAC and its kin.
-VARIABLES = frozenset({"log_ent_coef", "ent_coef_tensor"})
+_OF_ENTROPY = frozenset({"log_ent_coef", "ent_coef_tensor"})
 
 # The files of those; the second is the name that the first once had.
 _VARIABLES = frozenset({"pytorch_variables.pth", "tensors.pth"})
 
 # What the reader's own side decides.
-NOT_READ = frozenset(
+_NOT_READ = frozenset(
     {"env", "device", "policy", "rollout_buffer", "replay_buffer", "tensorboard_log"}
     | {"_logger", "_custom_logger", "_vec_normalize_env", "_episode_storage"}
 )
 # Made anew from the learning rate and the shares of exploration.
-DERIVED = frozenset({"lr_schedule", "exploration_schedule"})
-SERIALIZED = ":serialized:"
+_DERIVED = frozenset({"lr_schedule", "exploration_schedule"})
+_SERIALIZED = ":serialized:"
 
 # What a class may have as the default of an attribute.
 _PLAIN = (bool, int, float, str, type(None))
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
-
-
-@dataclass(frozen=True)
-class Settings:
-    """A model's attributes."""
-
-    plain: Mapping[str, Any]  # those that are plain data
-    pickled: Mapping[str, bytes]  # those that the library pickles, as pickles
-
-    def __contains__(self, name: str) -> bool:
-        return name in self.plain or name in self.pickled
 
 
 def load_model(
@@ -63,7 +81,6 @@ def load_model(
     *,
     device: th.device | str = "auto",
     classes: Mapping[str, type] | None = None,
-    makers: Mapping[str, Maker] | None = None,
     custom_objects: Mapping[str, Any] | None = None,
     **replaced: Any,
 ) -> Algorithm:
@@ -76,7 +93,6 @@ def load_model(
         env: the environment to go on with, or None.
         device: where the tensors go.
         classes: classes of your own that the file may name, by their full names.
-        makers: what makes further objects that it may hold, by the full names of their classes.
         custom_objects: values for attributes of the file, which are not read then; names that it
             does not have are passed over.
         replaced: attributes to set instead of those in the file, which are not read then.
@@ -90,32 +106,39 @@ def load_model(
     content = content_of(path, MAX_ARCHIVE_BYTES)
     budget = Budget(len(content))
     members = read_members(content, MEMBERS | files, budget)
-    settings = read_settings(members, algorithm, budget)
+    plain, pickled = _read_settings(members, algorithm, budget)
     known = {**policy_classes(algorithm), **(classes or {})}
-    given = {name: value for name, value in (custom_objects or {}).items() if name in settings}
-    objects = {**_objects(settings, known, makers, {**replaced, **given}, budget), **given}
+    given = custom_objects or {}
+    objects = {name: given[name] for name in given if name in plain or name in pickled}
+    for key in [key for key in pickled if key not in objects and key not in replaced]:
+        try:
+            objects[key] = read_pickle(pickled[key], known, budget=budget)
+        except UnsafeFileError as error:
+            raise UnsafeFileError(f"{key} {error}", key) from error
     if not isinstance(objects.get("policy_class"), type):
         raise UnsafeFileError("does not say its policy's class", "policy_class")
     names = sorted(files & set(members))
     tensors = {name: load_tensors(members.pop(name), budget) for name in names}
     check_values(tensors)
     _check_variables(tensors, variables)
-    check_sizes({**settings.plain, **objects, **replaced}, budget)
+    _check_sizes({**plain, **objects, **replaced}, budget)
+    # The library looks for the keys of its custom objects among those of the file.
+    data = json.dumps({**plain, **dict.fromkeys(objects)}).encode()
     try:
         with charged_tensors(budget):
             model = _with_tensors(algorithm, tensors).load(
-                _zipped(_data(settings, objects), tensors),
+                _zipped(data, tensors),
                 env=env,
                 device=device,
                 custom_objects=objects,
                 **replaced,
             )
         model.__class__ = algorithm
-        check_fit(model, tensors)
+        _check_fit(model, tensors)
     except ValueError:
         raise  # it does not fit the environment
     except Exception as error:  # settings and weights that do not go together can fail anywhere
-        raise UnsafeFileError(f"holds no such model: {first_line(error)}") from error
+        raise UnsafeFileError(f"holds no such model: {_first_line(error)}") from error
     return model
 
 
@@ -132,23 +155,25 @@ def _with_tensors(algorithm: type[Algorithm], tensors: Mapping[str, Any]) -> typ
     return type(algorithm.__name__, (algorithm,), {"set_parameters": set_parameters})
 
 
-def read_settings(
+def _read_settings(
     members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
-) -> Settings:
-    """The attributes in a zip, those left out that a reader decides; the budget pays for them."""
-    data = parse_settings(members, budget)
+) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The attributes in a zip that are plain data, and the pickles of those that are not.
+
+    Those that a reader decides are left out.
+    """
     plain: dict[str, Any] = {}
     pickled: dict[str, bytes] = {}
-    for key, value in data.items():
-        if key in NOT_READ or key in DERIVED:
+    for key, value in parse_settings(members, budget).items():
+        if key in _NOT_READ or key in _DERIVED:
             continue
         if not key.isidentifier() or key.startswith("__") or hides(algorithm, key):
             raise UnsafeFileError(f"sets {shown(key)}, which is no attribute of a model", key)
-        if isinstance(value, dict) and SERIALIZED in value:
-            pickled[key] = decoded(key, value[SERIALIZED])
+        if isinstance(value, dict) and _SERIALIZED in value:
+            pickled[key] = _decoded(key, value[_SERIALIZED])
         else:
             plain[key] = value
-    return Settings(plain, pickled)
+    return plain, pickled
 
 
 def hides(algorithm: type, name: str) -> bool:
@@ -165,35 +190,16 @@ def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozens
         own: Any = algorithm._get_torch_save_params(algorithm.__new__(algorithm))
         files, variables = frozenset(f"{name}.pth" for name in own[0]), frozenset(own[1])
     except AttributeError:
-        return TENSORS, VARIABLES
-    return TENSORS | files, VARIABLES | variables
+        return TENSORS, _OF_ENTROPY
+    return TENSORS | files, _OF_ENTROPY | variables
 
 
-def decoded(key: str, text: Any) -> bytes:
+def _decoded(key: str, text: Any) -> bytes:
     """The pickle that stands in JSON as base64."""
     try:
         return base64.b64decode(text, validate=True)
     except (binascii.Error, TypeError, ValueError) as error:
         raise UnsafeFileError(f"{key} is damaged: {error}", key) from error
-
-
-def _objects(
-    settings: Settings,
-    classes: Mapping[str, type],
-    makers: Mapping[str, Maker] | None,
-    replaced: Mapping[str, Any],
-    budget: Budget,
-) -> dict[str, Any]:
-    """What the pickled attributes stand for."""
-    objects: dict[str, Any] = {}
-    for key, pickled in settings.pickled.items():
-        if key in replaced:
-            continue
-        try:
-            objects[key] = read_pickle(pickled, classes, makers, budget)
-        except UnsafeFileError as error:
-            raise UnsafeFileError(f"{key} {error}", key) from error
-    return objects
 
 
 def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
@@ -205,13 +211,13 @@ def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
         strange = sorted(map(str, set(variables) - known))
         if strange:
             raise UnsafeFileError(f"sets {shown(strange[0])}, which is no variable of a model")
-        for key in VARIABLES & set(variables):
-            check_variable(f"{name}: {key}", variables[key])
-
-
-def _data(settings: Settings, objects: Mapping[str, Any]) -> bytes:
-    # The library looks for the keys of its custom objects among those of the file.
-    return json.dumps({**settings.plain, **dict.fromkeys(objects)}).encode()
+        for key in _OF_ENTROPY & set(variables):
+            value = variables[key]
+            is_tensor = isinstance(value, th.Tensor) and value.dtype == th.float32
+            if not is_tensor or value.numel() != 1:
+                raise UnsafeFileError(
+                    f"{name}: {key} is not the one number of float32 that models have"
+                )
 
 
 def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
@@ -224,3 +230,210 @@ def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
                 th.save(held if name in _VARIABLES else {}, member)
     content.seek(0)
     return content
+
+
+def _first_line(error: BaseException) -> str:
+    """What a foreign exception says before it gives advice, or its kind where it says nothing."""
+    lines = str(error).strip().splitlines()
+    # PyTorch says below a heading which tensor it is.
+    n_lines = 2 if lines and lines[0].endswith(":") else 1
+    text = " ".join(line.strip() for line in lines[:n_lines])
+    return text.partition(". ")[0] or type(error).__name__
+
+
+# --- sizes in proportion to the file, and tensors of such a model ---------------------------------
+
+# Attributes that say how many rows a buffer has; they multiply where there are several.
+_BUFFER = ("buffer_size",)
+_ROLLOUT = ("n_steps", "n_envs")
+_FLAT_BYTES = 4
+# Of what a network tries its input with; the weights behind each take more than that.
+_BYTES_PER_INPUT = 40
+# What makes new tensors of sizes that it is told, or of what is there already.
+_MAKERS = frozenset(
+    {th.empty, th.zeros, th.ones, th.full, th.rand, th.randn, th.eye, th.arange, th.Tensor.repeat}
+    | {th.empty_like, th.zeros_like, th.ones_like, th.Tensor.clone, th.clone}
+)
+# Python's part of a tensor, and of the layer that has it.
+_BYTES_PER_TENSOR = 4096
+# Of the dictionary in which `HerReplayBuffer` keeps what environments say of each step.
+_BYTES_PER_INFO = 136
+
+# Those that keep, of each parameter, tensors of its own shape, and numbers.
+_NAMES = "Adadelta Adagrad Adam Adamax AdamW ASGD NAdam RAdam RMSprop Rprop SGD"
+_BY_ELEMENT = (*(getattr(optim, name) for name in _NAMES.split()), RMSpropTFLike)
+
+
+class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a function is
+    """While it is entered, the budget pays for tensors before they are made."""
+
+    def __init__(self, budget: Budget) -> None:
+        super().__init__()
+        self.budget = budget
+
+    def __torch_function__(
+        self, function: Any, types: Any, args: Any = (), kwargs: Any = None
+    ) -> Any:
+        kwargs = kwargs or {}
+        if function in _MAKERS:
+            # PyTorch's own device for tensors that take no memory.
+            like = [arg.to("meta") if isinstance(arg, th.Tensor) else arg for arg in args]
+            where = {} if like and isinstance(like[0], th.Tensor) else {"device": "meta"}
+            self.budget.charge(function(*like, **{**kwargs, **where}).nbytes + _BYTES_PER_TENSOR)
+        return function(*args, **kwargs)
+
+
+def _check_sizes(settings: Mapping[str, Any], budget: Budget) -> None:
+    """Make sure that the settings say their spaces, and that their buffers fit the memory."""
+    for key in ("observation_space", "action_space"):
+        if not isinstance(settings.get(key), spaces.Space):
+            raise UnsafeFileError(f"does not say its {key}", key)
+    n_inputs = get_flattened_obs_dim(settings["observation_space"])
+    budget.charge(n_inputs * _BYTES_PER_INPUT)
+    n_bytes = n_inputs * _FLAT_BYTES
+    if settings.get("replay_buffer_class") is HerReplayBuffer:
+        n_bytes += _BYTES_PER_INFO
+    for names in (_BUFFER, _ROLLOUT):
+        values = [settings.get(name, 1) for name in names]
+        if not all(isinstance(value, int) and 0 < value <= MAX_ROWS for value in values):
+            raise UnsafeFileError(f"has {' and '.join(names)} out of all proportion", names[0])
+        size = math.prod(values) * n_bytes
+        if size > memory_bytes():
+            raise UnsafeFileError(
+                f"asks for a buffer of {size:,} bytes, and this machine has {memory_bytes():,}: "
+                f"give another {names[0]}",
+                names[0],
+            )
+
+
+def _check_fit(model: BaseAlgorithm, tensors: Mapping[str, Any]) -> None:
+    """Make sure that a model could have written the tensors that it was given."""
+    for name in model._get_torch_save_params()[0]:
+        part, found = recursive_getattr(model, name), tensors.get(f"{name}.pth", {})
+        if isinstance(part, nn.Module):
+            for key, like in part.state_dict().items():
+                _check_alike(f"{name}.pth: {key}", found[key], like)
+        elif isinstance(part, optim.Optimizer):
+            _check_optimizer(f"{name}.pth", found, part)
+
+
+def _check_alike(where: str, value: Any, like: Any) -> None:
+    if not isinstance(like, th.Tensor):
+        return
+    if not isinstance(value, th.Tensor) or (value.dtype, value.shape) != (like.dtype, like.shape):
+        found = _described(value) if isinstance(value, th.Tensor) else type(value).__name__
+        raise UnsafeFileError(f"{where} is {found}, and the model has {_described(like)}")
+
+
+def _described(tensor: th.Tensor) -> str:
+    return f"{str(tensor.dtype).removeprefix('torch.')} of shape {tuple(tensor.shape)}"
+
+
+def _check_optimizer(name: str, found: Any, optimizer: optim.Optimizer) -> None:
+    for group in found["param_groups"]:
+        for key, value in group.items():
+            if key != "params" and not _is_setting(value, optimizer.defaults.get(key)):
+                raise UnsafeFileError(f"{name}: {shown(key)} is {shown(value)}, no such setting")
+    keys = [key for group in found["param_groups"] for key in group["params"]]
+    own = [parameter for group in optimizer.param_groups for parameter in group["params"]]
+    if len(keys) != len(own):
+        return  # of DQN before 2.4, which the library does without
+    parameters = dict(zip(keys, own, strict=True))
+    for key, state in found["state"].items():
+        if key not in parameters:
+            raise UnsafeFileError(f"{name}: {shown(key)} is no parameter of the model")
+        if isinstance(optimizer, _BY_ELEMENT):
+            for part, value in state.items():
+                _check_state(f"{name}: {shown(part)} of {shown(key)}", value, parameters[key])
+
+
+def _check_state(where: str, value: Any, parameter: th.Tensor) -> None:
+    if isinstance(value, th.Tensor) and value.numel() == 1 and value.is_floating_point():
+        return
+    if isinstance(value, th.Tensor) or not _is_setting(value, None):
+        _check_alike(where, value, parameter)
+
+
+def _is_setting(value: Any, like: Any) -> bool:
+    """Whether a value is such as an optimizer is told, where ``like`` is its default."""
+    if isinstance(like, tuple):
+        fits = isinstance(value, tuple | list) and len(value) == len(like)
+        return fits and all(_is_setting(*pair) for pair in zip(value, like, strict=True))
+    if value is None or isinstance(value, bool):
+        return like is None or isinstance(like, bool)
+    is_number = isinstance(value, int | float) and math.isfinite(value)
+    return is_number and not isinstance(like, bool)
+
+
+# --- looking into a zip, without making a model of it ---------------------------------------------
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a file holds.
+
+    Attributes:
+        sizes: bytes of each member of the zip.
+        weights: shapes of the tensors, by member and name.
+        settings: what each attribute is, as a text of one line.
+        suspicious: what should make a reader wary, each in one line; empty where nothing does.
+    """
+
+    sizes: dict[str, int]
+    weights: dict[str, tuple[int, ...]]
+    settings: dict[str, str]
+    suspicious: tuple[str, ...]
+
+
+def inspect_model(path: Path | str) -> Report:
+    """Look into a model's zip; nothing in it is run.
+
+    Args:
+        path: the zip.
+
+    Raises:
+        UnsafeFileError: if it is no zip of a model at all.
+        OSError: if it cannot be read.
+    """
+    content = read_file(Path(path), MAX_ARCHIVE_BYTES)
+    budget = Budget(len(content))
+    members = read_members(content, MEMBERS, budget)
+    settings: dict[str, str] = {}
+    suspicious: list[str] = []
+    for key, value in parse_settings(members, budget).items():
+        settings[shown(key).strip("'")], doubts = _setting(key, value, budget)
+        suspicious += doubts
+    weights: dict[str, tuple[int, ...]] = {}
+    for name in sorted(TENSORS & set(members)):
+        try:
+            tensors = load_tensors(members[name], budget)
+            check_values({name: tensors})
+        except UnsafeFileError as error:
+            suspicious.append(f"{name} {error}")
+        else:
+            found = tensors_in(tensors, name.removesuffix(".pth"))
+            weights |= {shown(where).strip("'"): tuple(tensor.shape) for where, tensor in found}
+    sizes = {name: len(content) for name, content in members.items()}
+    return Report(sizes, weights, settings, tuple(suspicious))
+
+
+def _setting(key: str, value: Any, budget: Budget) -> tuple[str, list[str]]:
+    """An attribute in one line, and what is suspicious about it."""
+    is_odd = key in _NOT_READ - {"tensorboard_log"} and value
+    name = shown(key).strip("'")
+    doubts = [f"{name} is set, which models do not keep"] if is_odd else []
+    if not (isinstance(value, dict) and _SERIALIZED in value):
+        return shown(value), doubts
+    try:
+        pickled = _decoded(key, value[_SERIALIZED])
+        reader = Reader(io.BytesIO(pickled), budget)
+        reader.load()
+        names = sorted({shown(name.name).strip("'") for name in reader.names})
+        text = "a pickle of " + (", ".join(names) if names else "plain data")
+    except UnsafeFileError as error:
+        return "a pickle that cannot be read", [*doubts, f"{name} {error}"]
+    try:
+        read_pickle(pickled, all_policy_classes(), budget=budget)
+    except UnsafeFileError as error:
+        doubts.append(f"{name} {error}")
+    return text, doubts

@@ -17,7 +17,7 @@ import pytest
 
 from experiments.child_processes import PRELOADED
 from pipeline.stopping import SIGNALS
-from safe_files import regular_files
+from safe_files import files as unsafe_files
 
 # Set before anything imports pygame, Matplotlib or PyTorch; child processes inherit them.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
@@ -81,9 +81,9 @@ def signals_are_left_as_they_were():
 @pytest.fixture(autouse=True)
 def folders_are_held_for_one_test():
     """A process holds folders for good; tests share one, and the folders above their own."""
-    before = set(regular_files._held)
+    before = set(unsafe_files._held)
     yield
-    regular_files._held.intersection_update(before)
+    unsafe_files._held.intersection_update(before)
 
 
 @pytest.fixture

@@ -27,7 +27,7 @@ from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from pipeline.files import DISK_ERRORS, plain
 from pipeline.locks import FolderGoneError, is_gone
-from safe_files.regular_files import take_up
+from safe_files.files import take_up
 from tuning.pruning import is_hopeless
 from tuning.search_spaces import read_search_space, steps_aside
 from tuning.suggesting import Suggestions, check_entry, make_sampler, planned_run, shipped_run

@@ -22,12 +22,9 @@ from stable_baselines3.common.utils import check_for_correct_spaces, get_system_
 
 from agents.common.serialization import UnknownTypeError, decode, encode
 from safe_files.archives import MEMBERS, parse_settings, read_members
-from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
-from safe_files.models import hides
-from safe_files.refusals import UnsafeFileError, shown
-from safe_files.regular_files import content_of
-from safe_files.tensors import check_values, load_tensors
-from safe_files.weights import charged_tensors
+from safe_files.files import MAX_ARCHIVE_BYTES, Budget, UnsafeFileError, content_of, shown
+from safe_files.known_objects import check_values, load_tensors
+from safe_files.models import charged_tensors, hides
 
 FORMAT_VERSION = 1
 TENSORS = frozenset({"policy.pth"})

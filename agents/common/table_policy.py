@@ -11,11 +11,9 @@ import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
 from agents.common.serialization import decode, encode
-from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
-from safe_files.tensors import check_values, load_tensors
-from safe_files.weights import charged_tensors
+from safe_files.files import MAX_ARCHIVE_BYTES, Budget, UnsafeFileError, read_file
+from safe_files.known_objects import check_values, load_tensors
+from safe_files.models import charged_tensors
 
 
 class TablePolicy(BasePolicy):

@@ -16,7 +16,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from agents.compiled.cart_pole import CartPole
 from agents.compiled.finite_model import OUTCOME, FiniteModel
 from agents.compiled.mountain_car import MountainCar
-from envs.checking.claimed_models import is_trusted
 from envs.known_models import (
     model_check,
     observations_of_states,
@@ -25,6 +24,7 @@ from envs.known_models import (
     time_limit,
     transition_model,
 )
+from envs.model_claims import is_trusted
 from envs.wrappers import (
     ActionMasks,
     DiscretizeObservation,

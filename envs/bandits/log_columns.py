@@ -17,8 +17,7 @@ import numpy as np
 
 from envs.bandits.bandit import MAX_ARMS
 from mdp.array_types import Bools, Floats, Ints
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import opened
+from safe_files.files import UnsafeFileError, opened
 
 ARM, REWARD, PROPENSITY = "arm", "reward", "propensity"
 

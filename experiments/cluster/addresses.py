@@ -16,8 +16,7 @@ from urllib.parse import urlsplit
 
 from pipeline.errors import UserError, shown
 from pipeline.settings.yaml import read_yaml
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.files import UnsafeFileError, read_file
 
 MOST_LOCAL_WORKERS = 1024
 _LARGEST_FILE = 1 << 20  # bytes, of a scheduler's file

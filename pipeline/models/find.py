@@ -28,7 +28,7 @@ from pipeline.digests import RECORD, DamagedFileError, read_record
 from pipeline.errors import UserError
 from pipeline.runs import INTERRUPTED, Run, environment_name
 from pipeline.settings.yaml import read_saved_settings
-from safe_files.regular_files import read_file
+from safe_files.files import read_file
 
 _SETTINGS_FILES = ("args.yml", "config.yml")
 

@@ -61,7 +61,7 @@ class ModelFile:
 def read_model(path: Path, run: Run | None = None) -> ModelFile:
     """Read a zip, which is a whole one of an agent; no agent is made of it."""
     from safe_files.archives import first_look
-    from safe_files.limits import MAX_ARCHIVE_BYTES
+    from safe_files.files import MAX_ARCHIVE_BYTES
 
     try:
         content = read_recorded(run, path, MAX_ARCHIVE_BYTES)
@@ -127,10 +127,6 @@ def _is_hand_written(algo: str) -> bool:
         return True
 
 
-# Where the schedule lived that zips of library agents once held.
-_SCHEDULES = ("agents.schedules", "agents.common.schedules")
-
-
 def own_classes(
     algorithm: type[BaseAlgorithm], modules: Iterable[UserModule]
 ) -> Mapping[str, type]:
@@ -152,18 +148,6 @@ def own_classes(
 
 def _lies_in(cls: type, homes: Iterable[str]) -> bool:
     return any(f"{cls.__module__}.".startswith(f"{home}.") for home in homes)
-
-
-def own_makers() -> Mapping[str, Any]:
-    """What makes objects of ours, by the full names of their classes."""
-    from agents.common.schedules import ExponentialSchedule
-    from safe_files.pickle_trees import Made
-    from safe_files.rebuilding import Build, fields
-
-    def schedule(made: Made, build: Build) -> ExponentialSchedule:
-        return ExponentialSchedule(**fields(made, build))
-
-    return {f"{module}.ExponentialSchedule": schedule for module in _SCHEDULES}
 
 
 # What a class of the user's may stand for in a zip.
@@ -238,7 +222,6 @@ def _loaded(
         file.stream(),
         env,
         classes=own_classes(algorithm, modules),
-        makers=own_makers(),
         **kwargs,
     )
 
@@ -325,7 +308,7 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
 
     from agents.dqn import MaskedReplayBuffer
     from safe_files import load_replay_buffer as load_safely
-    from safe_files.limits import MAX_BUFFER_BYTES
+    from safe_files.files import MAX_BUFFER_BYTES
 
     if not isinstance(model, OffPolicyAlgorithm):
         return
@@ -372,8 +355,8 @@ class Statistics:
 
 def read_statistics(path: Path, run: Run | None = None) -> Statistics:
     """Read what VecNormalize saved, as data: nothing in the file is run."""
-    from safe_files.limits import MAX_STATISTICS_BYTES
-    from safe_files.vec_normalize import read_normalization
+    from safe_files.buffers_and_statistics import read_normalization
+    from safe_files.files import MAX_STATISTICS_BYTES
 
     try:
         saved = read_normalization(read_recorded(run, path, MAX_STATISTICS_BYTES))

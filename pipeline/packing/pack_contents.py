@@ -17,7 +17,7 @@ from pipeline.module_records import COPIES
 from pipeline.packing.model_card import card, results
 from pipeline.packing.scrubbing import check_secrets, check_untold, record_to_tell, zip_to_tell
 from pipeline.runs import FINISHED, Run
-from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.files import MAX_ARCHIVE_BYTES
 
 CARD = "README.md"
 STUDY_RECORD = "study.json"  # of the pack of a study, with the digests of its files

@@ -23,9 +23,7 @@ from pipeline.module_records import COPIES
 from pipeline.packing.pack_contents import STUDY_RECORD, contents
 from pipeline.packing.scrubbing import zipped
 from safe_files.archives import opened_zip, read_member, read_members
-from safe_files.limits import MAX_ARCHIVE_BYTES, Budget
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.files import MAX_ARCHIVE_BYTES, Budget, UnsafeFileError, read_file
 
 _DEEPEST = 2  # folders of a name, the file itself counted
 _DEEPEST_MODULE = 8

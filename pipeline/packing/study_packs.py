@@ -28,8 +28,7 @@ from pipeline.packing.model_card import fenced, plain_text, to_type
 from pipeline.packing.pack_contents import CARD, STUDY_RECORD, contents
 from pipeline.packing.pack_files import check_name
 from pipeline.packing.scrubbing import check_untold, member_of, names_alone, zipped
-from safe_files.limits import MAX_ARCHIVE_BYTES
-from safe_files.regular_files import hold, read_file
+from safe_files.files import MAX_ARCHIVE_BYTES, hold, read_file
 
 RUNS = "runs"
 SETTINGS = "study.yml"  # written beside the page, see `experiments.study`

@@ -12,7 +12,7 @@ import numpy as np
 from mdp.array_types import Floats
 from pipeline.pictures.picture_files import fix_layout, write_png
 from pipeline.runs import Run
-from safe_files.regular_files import NO_LIMIT, read_file
+from safe_files.files import NO_LIMIT, read_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

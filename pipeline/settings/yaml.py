@@ -21,8 +21,7 @@ from yaml.events import AliasEvent
 from yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 
 from pipeline.errors import UserError, shown, visible
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import read_file
+from safe_files.files import UnsafeFileError, read_file
 
 # Twenty times what the longest file of settings has, and read in well under a second.
 _MAX_BYTES = 256 * 1024

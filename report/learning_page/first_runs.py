@@ -26,7 +26,7 @@ from pipeline.user_modules import import_again
 from report.learning_page.kept_pages import kept_page, note_page, page_path, without_page
 from report.learning_page.learning_assembly import write_learning_page
 from report.page.sections import LearningPage, first_runs
-from safe_files.regular_files import hold
+from safe_files.files import hold
 
 BATCH = "its runs were done as one batch, which leaves no agent"
 WITHOUT_STATES = StateKeeping(SaveInterval(is_off=True))

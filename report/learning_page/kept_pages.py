@@ -10,8 +10,7 @@ from experiments.plan import PlannedRun
 from pipeline.files import write_json
 from report.learning_page.learning_assembly import MOST_BYTES, page_version
 from report.page.sections import LearningPage
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import NO_LIMIT, read_file
+from safe_files.files import NO_LIMIT, UnsafeFileError, read_file
 
 FOLDER = "learning"
 LONGEST_WORDS = 300

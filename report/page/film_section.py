@@ -15,7 +15,7 @@ from report.films import MAX_BYTES, films_of, has_film
 from report.page.markup import data_uri
 from report.page.sections import Report, Section, first_runs
 from report.wording import number
-from safe_files.regular_files import NO_LIMIT, read_file
+from safe_files.files import NO_LIMIT, read_file
 
 MOST_FILMED = 8  # agents of an environment, the best of them
 ALL_BYTES = 1_000_000  # of the films of a page, a third more as text

@@ -8,7 +8,7 @@ from gymnasium.envs.toy_text.utils import categorical_sample
 from gymnasium.wrappers import TimeLimit
 
 from agents import load_algorithm
-from envs.checking import model_checks
+from envs import checking as model_checks
 from envs.known_models import transition_model
 
 

@@ -17,7 +17,7 @@ from agents.tabular.models.sweeping_policy import _are_lists, _is_queue
 from agents.tabular.temporal_difference import learn_from_all
 from envs.known_models import transition_model
 from mdp import TransitionModel, value_iteration
-from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.files import MAX_ARCHIVE_BYTES
 from tests.agents.test_engine import differences, make, state_of
 from tests.agents.test_temporal_difference import Spaces
 

@@ -21,8 +21,7 @@ from pipeline.files import replacing
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.unfinished_runs import SaveInterval, StateKeeping
-from safe_files.refusals import UnsafeFileError
-from safe_files.regular_files import hold, read_file
+from safe_files.files import UnsafeFileError, hold, read_file
 
 COMMANDS = {
     "train": train.main,

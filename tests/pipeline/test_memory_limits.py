@@ -14,8 +14,8 @@ from pipeline.memory_limits import check_agent, check_pulls, observation_bytes
 from pipeline.preparation import algorithm_kwargs
 from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.train_spec import TrainSpec
-from safe_files import limits
-from safe_files.limits import memory_bytes
+from safe_files import files as limits
+from safe_files.files import memory_bytes
 
 GIGABYTE = 2**30
 FOUR_FLOATS = spaces.Box(-1, 1, (4,), np.float32)  # 16 bytes

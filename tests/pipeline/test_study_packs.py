@@ -25,7 +25,7 @@ from pipeline.packing.study_packs import is_study, pack_study
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
-from safe_files.refusals import UnsafeFileError
+from safe_files.files import UnsafeFileError
 
 RUN = "runs/qlearning/FrozenLake-v1_2.zip"
 HOME = str(Path.home())

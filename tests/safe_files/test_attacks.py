@@ -7,6 +7,7 @@ import os
 import pickle
 import struct
 import tracemalloc
+import warnings
 import zipfile
 from functools import partial
 from pathlib import Path
@@ -14,13 +15,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch as th
-from stable_baselines3 import PPO, SAC
+from stable_baselines3 import DQN, PPO, SAC, HerReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.utils import ConstantSchedule
 
-from safe_files import UnsafeFileError, inspect_model, load_model
+from safe_files import UnsafeFileError, inspect_model, load_model, load_replay_buffer
 from safe_files.archives import first_look
-from safe_files.objects import read_pickle
-from safe_files.vec_normalize import read_normalization
+from safe_files.buffers_and_statistics import read_normalization
+from safe_files.known_objects import load_tensors, read_pickle
 
 UTILS = "stable_baselines3.common.utils"
 START = b"\x80\x04"
@@ -41,6 +43,26 @@ def shared_tuples(depth):
 
 
 LAYERS, TOP = shared_tuples(40)
+DEQUE = name("collections", "deque")
+CONSTANT = name(UTILS, "ConstantSchedule")
+FROM_BUFFER = name("numpy._core.numeric", "_frombuffer")
+FLOATS = name("numpy", "dtype") + text("f8") + b"\x89\x88\x87R"
+NAN = b"G\x7f\xf8" + bytes(6)
+SHORT_LAYERS, SHORT_TOP = shared_tuples(32)
+
+
+def array(data, shape):
+    """An array of float64 with a shape that is pickled already."""
+    return FROM_BUFFER + b"(C" + bytes([len(data)]) + data + FLOATS + shape + text("C") + b"tR"
+
+
+def space(kind, **state):
+    module, _, cls = kind.partition(".")
+    fields = b"".join(text(key) + value for key, value in state.items())
+    return name(f"gymnasium.spaces.{module}", cls) + b")\x81}(" + fields + b"ub"
+
+
+# Each is read by everything that reads pickles, see LOADERS.
 ATTACKS = {
     "a call of the system": START + name("os", "system") + text("true") + b"\x85R.",
     "the same in protocol 0": b"cos\nsystem\n(S'true'\ntR.",
@@ -85,19 +107,145 @@ ATTACKS = {
     "a whole number of thousands of digits": pickle.dumps(10**5000),
     "a length that is not there": START + b"\x8e\xff\xff\xff\xff\xff\xff\xff\x7f.",
     "an infinite schedule": pickle.dumps(ConstantSchedule(float("inf"))),
+    "a schedule that is no number": pickle.dumps(ConstantSchedule(float("nan"))),
+    "a schedule of a huge number": START
+    + CONSTANT
+    + b")\x81}"
+    + text("val")
+    + b"\x8a\xff"
+    # a number of 255 bytes, set, and built
+    + b"\x7f" * 255
+    + b"sb.",
+    # Calls of what calls return, and states of what is no new object.
+    "a call of a call": START + DEQUE + b")R)R.",
+    "a call of a call that is huge once it is written out": START
+    + SHORT_LAYERS
+    + DEQUE
+    + SHORT_TOP
+    + b"\x85R)R.",
+    "calls of calls, deep": START + DEQUE + b")R" * 20_000 + b".",
+    "tuples in tuples": START + b"N" + b"\x85" * 20_000 + b".",
+    "two states": START + CONSTANT + b")\x81}b}b.",
+    "the state of a list": START + b"]}b.",
+    "the state of a name": START + name("builtins", "int") + b"}b.",
+    "a state that is its own object": START
+    + name(UTILS, "FloatSchedule")
+    + b")\x81\x94}"
+    + text("value_schedule")
+    + b"h\x00sb.",
+    # Places of the stack and of the memo.
+    "an end before the beginning": START + b"0000.",
+    "marks without an end": START + b"(((N.",
+    "an end of no mark": START + b"N1.",
+    "items of no mark": START + b"]e.",
+    "a key without a value": START + b"}(K\x01u.",
+    "an item of a name": START + name("os", "environ") + b"Na.",
+    "an item of bytes": START + b"\x96" + struct.pack("<Q", 2) + b"abK\x01a.",
+    "a place of bytes": START + b"\x96" + struct.pack("<Q", 2) + b"abK\x00K\x01s.",
+    "a member of an object": START + DEQUE + b")R(K\x01\x90.",
+    "a place of the memo that is empty": START + b"h\x07.",
+    "a list of itself": START + b"]\x94h\x00a.",
+    "a tuple in its list": START + b"]\x94h\x00\x85a.",
+    "a dictionary under itself": START + b"}\x94" + text("a") + b"h\x00s.",
+    "an object among its own items": START + DEQUE + b")R\x94h\x00a.",
+    "an object in its own argument": START + b"]\x94" + DEQUE + b"h\x00\x85R\x94a.",
+    # Keys and members whose hash is not theirs alone, or takes for ever.
+    "a key that is an object": START + b"}" + DEQUE + b")RNs.",
+    "a key that is a truth": START + b"}\x88Ns.",
+    "members that are tuples": START + SHORT_LAYERS + b"\x8f(" + SHORT_TOP + b"\x90.",
+    "frozen members that are tuples": START + SHORT_LAYERS + b"(" + SHORT_TOP + b"\x91.",
+    "keys of an object that are tuples": START
+    + SHORT_LAYERS
+    + name("collections", "OrderedDict")
+    + b")R"
+    + SHORT_TOP
+    + b"Ns.",
+    # Instructions of no model, and of older protocols.
+    "an instance": b"(S'true'\nios\nsystem\n.",
+    "an object": START + b"(" + name("os", "system") + text("true") + b"o.",
+    "a persistent id": START + b"Px\n.",
+    "a persistent id on the stack": START + b"NQ.",
+    "an extension code": START + b"\x82\x01.",
+    "an extension code of four bytes": START + b"\x84\x01\0\0\0.",
+    "arguments by keyword": START + CONSTANT + b")}\x92.",
+    "a buffer from elsewhere": b"\x80\x05\x97.",
+    "a double": START + b"N2\x86.",
+    "a list of protocol 0": b"(I1\nl.",
+    "a dictionary of protocol 0": b"(I1\nI2\nd.",
+    "a whole number of protocol 0": b"I" + b"9" * 10**6 + b"\n.",
+    "a long number of protocol 0": b"L" + b"9" * 10**6 + b"L\n.",
+    "a huge place of protocol 0": b"Np99999999999999\n.",
+    "a long number of a megabyte": START
+    + b"\x8b"
+    + struct.pack("<i", 10**6)
+    + bytes(10**6 - 1)
+    # and a byte that makes it as long as it says
+    + b"\x7f.",
+    "a long number of -1 bytes": START + b"\x8b\xff\xff\xff\xff.",
+    "protocol 255": b"\x80\xff.",
+    "a frame without an end": START + b"\x95" + b"\xff" * 8 + b"N.",
+    "a frame in a frame": START + b"\x95" + struct.pack("<Q", 20) + b"\x95" + bytes(20) + b"N.",
+    "nothing": b"",
+    "no end": START + b"N",
+    "only an end": START + b".",
+    # Sizes that are no numbers, or too large.
+    "an array of no number": START + array(bytes(8), NAN + b"\x85") + b".",
+    "an array of -1 numbers": START + array(bytes(8), b"J\xff\xff\xff\xff\x85") + b".",
+    "an array of 33 dimensions": START + array(bytes(8), b"(" + b"K\x01" * 33 + b"t") + b".",
+    "a space of many values": START
+    + space("discrete.Discrete", n=b"\x8a\x0c" + b"\x7f" * 12, start=b"K\0")
+    + b".",
+    "a space of no number of values": START + space("multi_binary.MultiBinary", n=NAN) + b".",
+    "a deque of a length below 0": START + DEQUE + b")J\xfb\xff\xff\xff\x86R.",
+    "an attribute of a module": START + name("numpy", "core.os.system") + b".",
+    "a name that is a number": START + text("a") + b"K\x01\x93.",
 }
 
 
+@pytest.fixture(scope="module")
+def loaders(genuine):
+    """What reads pickles: by themselves, as statistics, as a buffer, and in the zip of a model."""
+    agent = DQN("MlpPolicy", "CartPole-v1", buffer_size=10, device="cpu")
+
+    def in_zip(content):
+        held = {":type:": "x", ":serialized:": base64.b64encode(content).decode()}
+        return io.BytesIO(zip_of(with_settings(genuine, invented=held)))
+
+    return {
+        "alone": read_pickle,
+        "statistics": read_normalization,
+        "a buffer": lambda content: load_replay_buffer(agent, io.BytesIO(content)),
+        "a zip": lambda content: load_model(PPO, in_zip(content)),
+    }
+
+
 @pytest.mark.parametrize("attack", ATTACKS)
-def test_attacks_by_pickle_are_refused(attack):
-    tracemalloc.start()
-    try:
-        with pytest.raises(UnsafeFileError):
-            read_pickle(ATTACKS[attack])
-        assert tracemalloc.get_traced_memory()[1] < 50e6
-    finally:
-        tracemalloc.stop()
+def test_attacks_by_pickle_are_refused(attack, loaders):
+    for loader, load in loaders.items():
+        tracemalloc.start()
+        try:
+            with pytest.raises(UnsafeFileError) as refusal:
+                load(ATTACKS[attack])
+            assert tracemalloc.get_traced_memory()[1] < 50e6, loader
+        finally:
+            tracemalloc.stop()
+        assert str(refusal.value).isprintable(), loader
     assert ConstantSchedule(0.5)(1.0) == 0.5
+
+
+# Odd, and harmless: nothing that the file names is made.
+HARMLESS = {
+    "a call that is thrown away": START + name("os", "system") + text("true") + b"\x85R0N.",
+    "bytes behind the end": pickle.dumps(None) + b"cos\nsystem\n",
+    "a pickle behind the end": pickle.dumps(None) + pickle.dumps(print),
+    "many empty frames": START + (b"\x95" + bytes(8)) * 1000 + b"N.",
+    "a frame beyond the file": START + b"\x95" + struct.pack("<Q", 1 << 40) + b"N.",
+}
+
+
+@pytest.mark.parametrize("oddity", HARMLESS)
+def test_what_is_odd_and_harmless_is_data(oddity):
+    assert read_pickle(HARMLESS[oddity]) is None
 
 
 @pytest.fixture(scope="module")
@@ -180,6 +328,10 @@ def test_attributes_that_would_hide_a_method_are_refused(genuine, tmp_path, key)
         ("n_steps", -1),
         ("n_steps", "many"),
         ("n_envs", 10**9),
+        ("n_steps", float("nan")),
+        ("n_envs", float("nan")),
+        ("policy_kwargs", {"net_arch": [float("nan")]}),
+        ("policy_kwargs", {"net_arch": [-5]}),
     ],
 )
 def test_settings_out_of_proportion_are_refused(genuine, tmp_path, key, value):
@@ -381,6 +533,75 @@ def test_what_zip64_says_leads_nowhere(genuine, tmp_path):
             load_model(PPO, tmp_path / "model.zip")
 
 
+def directory(raw, member, offset, packed):
+    """A zip whose list of members says something else of one of them."""
+    at = raw.find(b"PK\1\2")
+    while raw[at + 46 : at + 46 + len(member)] != member:
+        at = raw.find(b"PK\1\2", at + 4)
+    return raw[: at + offset] + packed + raw[at + offset + len(packed) :]
+
+
+def odd_zips(genuine):
+    """Zips that say one thing here and another there."""
+    raw, policy = zip_of(genuine), b"policy.pth"
+    two = io.BytesIO()
+    with zipfile.ZipFile(two, "w") as archive, warnings.catch_warnings(action="ignore"):
+        for member, held in [*genuine.items(), ("policy.pth", b"another")]:
+            archive.writestr(member, held)
+    longer = zip_of({**genuine, "policy.pth!x": b"another"})
+    link = zipfile.ZipInfo("policy.pth")
+    link.create_system, link.external_attr = 3, 0o120777 << 16
+    linked = io.BytesIO()
+    with zipfile.ZipFile(linked, "w") as archive:
+        archive.writestr(link, "/etc/passwd")
+        for member in genuine.keys() - {"policy.pth"}:
+            archive.writestr(member, genuine[member])
+    return {
+        "a member twice": two.getvalue(),
+        "a name with a zero in it": longer.replace(b"policy.pth!x", b"policy.pth\0x"),
+        "a member that is a link": linked.getvalue(),
+        "a member at another's place": directory(raw, policy, 42, bytes(4)),
+        "a smaller size": directory(raw, policy, 24, struct.pack("<L", 10)),
+        "a larger size": directory(raw, policy, 24, struct.pack("<L", 1 << 31)),
+        "larger sizes": directory(raw, policy, 20, struct.pack("<2L", 1 << 29, 1 << 29)),
+        "a place behind the end": directory(raw, policy, 42, struct.pack("<L", 1 << 30)),
+        "bzip2": directory(raw, policy, 10, struct.pack("<H", 12)),
+        "no method": directory(raw, policy, 10, struct.pack("<H", 93)),
+        "encrypted": directory(raw, policy, 8, struct.pack("<H", 1)),
+        "of a later version": directory(raw, policy, 6, struct.pack("<H", 255)),
+        "a field beyond the list": directory(raw, policy, 30, struct.pack("<H", 60_000)),
+        "another checksum": directory(raw, policy, 16, struct.pack("<L", 1)),
+        "a bomb in a bomb": zip_of(
+            {
+                **genuine,
+                "policy.pth": zip_of({"archive/data.pkl": bytes(100 * MB)}, zipfile.ZIP_DEFLATED),
+            },
+            zipfile.ZIP_DEFLATED,
+        ),
+    }
+
+
+def test_zips_that_contradict_themselves_are_refused(genuine):
+    for oddity, content in odd_zips(genuine).items():
+        assert refusal_of(content), oddity
+
+
+def refusal_of(content):
+    try:
+        load_model(PPO, io.BytesIO(content))
+    except UnsafeFileError as error:
+        return str(error)
+
+
+def test_what_stands_before_a_zip_and_how_many_members_it_says_is_not_read(genuine):
+    raw = zip_of(genuine)
+    others = zip_of({"extra.py": b"raise SystemExit"})
+    end = raw.rfind(b"PK\5\6")
+    fewer = raw[: end + 8] + struct.pack("<2H", 1, 1) + raw[end + 12 :]
+    for content in (START + b"cos\nsystem\n." + raw, others + raw, fewer):
+        assert isinstance(load_model(PPO, io.BytesIO(content)), PPO)
+
+
 def test_variables_of_other_names_than_the_algorithms_are_refused(genuine, tmp_path):
     changed = {**genuine, "pytorch_variables.pth": tensors({"policy.predict": th.zeros(1)})}
     with pytest.raises(UnsafeFileError, match=r"policy\.predict"):
@@ -420,6 +641,17 @@ def shared_array(n):
 
 
 ARRAY_MEMO, ARRAY = shared_array(4 * MB)
+NOISE = "stable_baselines3.common.noise"
+
+
+def noise(n):
+    """A noise of ``n`` actions."""
+    numbers = FROM_BUFFER + b"(" + long_bytes(8 * n) + FLOATS + b"J" + struct.pack("<i", n)
+    mean = numbers + b"\x85" + text("C") + b"tR"
+    fields = text("_mu") + mean + text("_sigma") + b"K\x01" + text("_dtype")
+    return name(NOISE, "NormalActionNoise") + b")\x81}(" + fields + name("numpy", "float32") + b"ub"
+
+
 M61 = (1 << 61) - 1  # whole numbers that it divides have one hash
 LONGS = b"".join(b"\x8a\x0f" + (M61 * i).to_bytes(15, "little") + b"N" for i in range(1, 20_000))
 BOMBS = {
@@ -435,6 +667,21 @@ BOMBS = {
     + b"\xf0\x9f\x98\x80.",
     "bytes that are not there": b"\x96" + (8 << 30).to_bytes(8, "little") + b".",
     "keys of one hash": b"}(" + LONGS + b"u.",
+    # What reading them takes just fits the budget.
+    "lists that just fit": b"](" + b"](Ne" * 230_000 + b"e.",
+    "empty lists that just fit": b"](" + b"]" * 900_000 + b"e.",
+    "empty dictionaries that just fit": b"](" + b"}" * 900_000 + b"e.",
+    "tuples that just fit": b"](" + b"N\x85" * 460_000 + b"e.",
+    "nothing at many places": b"](" + b"N" * 1_900_000 + b"e.",
+    "calls that just fit": DEQUE + b"\x940](" + b"h\x00)R" * 140_000 + b"e.",
+    "names that just fit": text("a") + b"\x940](" + b"h\x00h\x00\x93" * 300_000 + b"e.",
+    "a list in lists in lists": b"]("
+    + b"N" * 3000
+    + b"e\x940]("
+    + b"h\x00" * 3000
+    + b"e\x940]("
+    + b"h\x01" * 3000
+    + b"e.",
 }
 JSON_BOMBS = {
     "lists in JSON": "[" + "[]," * 3_000_000 + "[]]",
@@ -471,6 +718,81 @@ def zip_of(members, method=zipfile.ZIP_STORED):
         for member, held in members.items():
             archive.writestr(member, held)
     return content.getvalue()
+
+
+def pickled_text(value):
+    return b"X" + struct.pack("<I", len(value)) + value.encode()
+
+
+def storage(kind, key, size):
+    """A storage as PyTorch's pickles refer to it, by parts that are pickled already."""
+    return b"(" + pickled_text("storage") + kind + key + pickled_text("cpu") + size + b"tQ"
+
+
+def file_of(pickled, record):
+    """A file of tensors with one record of numbers."""
+    return zip_of({"archive/data.pkl": b"\x80\x02" + pickled + b".", "archive/data/0": record})
+
+
+NUMBERS = {"Byte": 1, "Char": 1, "Bool": 1, "Short": 2, "Int": 4, "Long": 8, "Half": 2} | {
+    "BFloat16": 2, "Float": 4, "Double": 8, "ComplexFloat": 8, "ComplexDouble": 16
+}  # fmt: skip
+PATH = pickled_text("0")
+FLOAT = b"ctorch\nFloatStorage\n"
+OLD_LAYERS = b"Nq\x000" + b"".join(b"h%ch%c\x86q%c0" % (i, i, i + 1) for i in range(32))
+REBUILT = b"ctorch._utils\n_rebuild_tensor_v2\n("
+FEW = storage(FLOAT, PATH, b"K\x04")
+
+
+def same_record_as_many_kinds(n):
+    kinds = [
+        REBUILT
+        + storage(f"ctorch\n{kind}Storage\n".encode(), PATH, b"J" + struct.pack("<i", n // size))
+        + b"K\x00K\x01\x85K\x01\x85\x89}tR"
+        for kind, size in NUMBERS.items()
+    ]
+    return file_of(b"](" + b"".join(kinds) + b"e", bytes(n))
+
+
+STORAGES = {
+    "a key that is huge once it is written out": file_of(
+        OLD_LAYERS + storage(FLOAT, b"h\x20", b"K\x01"), bytes(4)
+    ),
+    "a size that is huge once it is written out": file_of(
+        OLD_LAYERS + storage(FLOAT, PATH, b"h\x20"), bytes(4)
+    ),
+    "a kind that is huge once it is written out": file_of(
+        OLD_LAYERS + storage(b"h\x20", PATH, b"K\x01"), bytes(4)
+    ),
+    "a size that is a list": file_of(
+        storage(b"ctorch\nComplexDoubleStorage\n", PATH, b"](" + b"N" * 900_000 + b"e"), bytes(16)
+    ),
+    "a size that is no number": file_of(storage(FLOAT, PATH, NAN), bytes(4)),
+    "a size that is a float": file_of(storage(FLOAT, PATH, b"G?\xf0" + bytes(6)), bytes(4)),
+    "a storage that is no tuple": file_of(b"NQ", bytes(4)),
+    "a record elsewhere": file_of(storage(FLOAT, pickled_text("../x"), b"K\x01"), bytes(4)),
+    "the state of a storage": file_of(FEW + b"}b", bytes(16)),
+    "a stride that is no number": file_of(
+        REBUILT + FEW + b"K\x00K\x02\x85" + NAN + b"\x85\x89}tR", bytes(16)
+    ),
+    "a size that has no end": file_of(
+        REBUILT + FEW + b"K\x00\x8a\x08" + struct.pack("<q", 1 << 62) + b"\x85K\x01\x85\x89}tR",
+        bytes(16),
+    ),
+    "40 dimensions": file_of(
+        REBUILT + FEW + b"K\x00(" + b"K\x01" * 40 + b"t(" + b"K\x01" * 40 + b"t\x89}tR", bytes(16)
+    ),
+    "a record under two names": zip_of(
+        {"archive/data.pkl": b"\x80\x02" + FEW + b".", "archive/data/0": bytes(16)}
+        | {"other/data/0": b"\0\0\x80?" * 4}
+    ),
+    "one record as many kinds of numbers": same_record_as_many_kinds(48 * MB),
+}
+
+
+@pytest.mark.parametrize("attack", STORAGES)
+def test_storages_that_pytorch_does_not_write_are_refused(attack):
+    assert check_peak(attack, STORAGES[attack], lambda stream: load_tensors(stream.read()))
 
 
 VIEWS = {
@@ -558,6 +880,36 @@ def test_memory_is_in_proportion_to_a_models_file(genuine, tmp_path):
         assert check_peak(attack, content, partial(load_model, PPO)), attack
         check_peak(attack, content, look_into)
         check_peak(attack, content, lambda stream: inspect_model(path))  # noqa: B023
+
+
+def test_a_hindsight_buffer_has_its_rows_in_the_file():
+    """Its constructor makes a dictionary for each row that the file says it has."""
+    env = BitFlippingEnv(n_bits=3, max_steps=3)
+    settings = {"replay_buffer_class": HerReplayBuffer, "buffer_size": 50, "device": "cpu"}
+    agent = DQN("MultiInputPolicy", env, **settings)
+    buffer = io.BytesIO()
+    agent.save_replay_buffer(buffer)
+    rows = b"K2"  # of `buffer_size`
+    where = buffer.getvalue().index(rows, buffer.getvalue().index(b"buffer_size"))
+    more = buffer.getvalue()[:where] + b"J" + struct.pack("<i", 30 * 10**6)
+    content = unframed(more + buffer.getvalue()[where + len(rows) :])
+    told = check_peak("a buffer", content, lambda stream: load_replay_buffer(agent, stream))
+    assert "wrong infos" in told
+
+
+def unframed(pickled):
+    """A pickle without the marks of how long its parts are."""
+    start = pickled.index(b"\x95")
+    assert pickled.count(b"\x95") == 1
+    return pickled[:start] + pickled[start + 9 :]
+
+
+def test_a_noise_is_not_copied_for_each_environment():
+    """Its constructor copies the noise for one environment as often as there are environments."""
+    fields = text("_base_noise") + noise(130_000) + text("_noises") + b"](" + b"h\x00" * 20_000
+    vectorized = name(NOISE, "VectorizedActionNoise") + b")\x81}(" + fields + b"eub."
+    content = START + noise(1) + b"\x940" + vectorized
+    assert check_peak("a noise", content, lambda stream: read_pickle(stream.read())) == ""
 
 
 @pytest.mark.parametrize("attack", BOMBS)

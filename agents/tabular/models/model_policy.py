@@ -12,7 +12,7 @@ from stable_baselines3.common.type_aliases import Schedule
 
 from agents.tabular.models.learnt_models import LearntModel
 from agents.tabular.q_table_policy import QTablePolicy
-from safe_files.limits import MAX_ARCHIVE_BYTES
+from safe_files.files import MAX_ARCHIVE_BYTES
 
 # What is kept has to fit into a model file that is read again, with a little besides.
 MOST_BYTES = MAX_ARCHIVE_BYTES * 15 // 16

@@ -1,4 +1,4 @@
-"""The one door to files: regular files alone, and none through a link out of a folder that is held.
+"""Files of unknown origin: how they are opened, how large they may be, and how they are refused.
 
 A folder of runs may come from a stranger, with a link, a pipe or a device under any of its names.
 Once such a folder is held, what lies below it is opened step by step from the folder itself, where
@@ -7,20 +7,87 @@ no step may be a link. A link on the way to the folder is the user's own, and is
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import io
 import os
 import stat
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from safe_files.refusals import UnsafeFileError
+NO_LIMIT = 1 << 62  # bytes
+# A model of a hundred million parameters is larger than any that these algorithms train.
+MAX_ARCHIVE_BYTES = 1 << 30
+MAX_STATISTICS_BYTES = 64 << 20
+MAX_BUFFER_BYTES = 32 << 30
+# What may be made of a file: so many times its own bytes, and these.
+_TIMES = 4
+_FREE_BYTES = 64 << 20
+# Of an empty dictionary, with its place in what holds it: no value takes more beside its text.
+_BYTES_PER_JSON_VALUE = 100
+# Where no system tells; many machines have as much.
+_MEMORY_IF_UNKNOWN = 16 << 30
+
+
+class UnsafeFileError(ValueError):
+    """A file holds what may not stand in it, is damaged, or is too large: one line that says what.
+
+    Attributes:
+        key: the entry of a model file that is at fault, or None.
+    """
+
+    def __init__(self, message: str, key: str | None = None) -> None:
+        # What a terminal obeys instead of showing it is spelt out.
+        signs = (c if c.isprintable() else repr(c)[1:-1] for c in " ".join(message.split()))
+        super().__init__("".join(signs))
+        self.key = key
+
+
+def shown(value: object) -> str:
+    """A name from a file as a message quotes it: short, and nothing in it that a terminal obeys."""
+    text = ascii(value)
+    return text if len(text) <= 80 else f"{text[:76]}...'"
+
+
+class Budget:
+    """The memory that a file of so many bytes may take: who makes something of it pays before."""
+
+    def __init__(self, n_bytes: int) -> None:
+        self.n_bytes = n_bytes
+        self.left = _FREE_BYTES + _TIMES * n_bytes
+
+    def charge(self, n_bytes: int) -> None:
+        """Take so many bytes."""
+        self.left -= n_bytes
+        if self.left < 0:
+            raise UnsafeFileError(
+                f"would take more memory than {_TIMES} times its {self.n_bytes:,} bytes and "
+                f"{_FREE_BYTES >> 20} MB"
+            )
+
+    def charge_json(self, text: bytes) -> None:
+        """Take what Python makes of a text of JSON; see `charge`."""
+        # Of characters that are not of ASCII, one can make all others four bytes wide.
+        self.charge(len(text) * (2 if text.isascii() else 8))
+        self.charge(sum(map(text.count, (b"[", b"{", b",", b":"))) * _BYTES_PER_JSON_VALUE)
+
+
+def memory_bytes() -> int:
+    """Bytes of memory in this machine."""
+    size = _MEMORY_IF_UNKNOWN
+    if sys.platform != "win32":
+        with contextlib.suppress(ValueError, OSError):
+            size = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return size
+
+
+# --- opening --------------------------------------------------------------------------------------
 
 # What is read: a path, or a stream of bytes that were read already.
 Source = Path | str | io.BufferedIOBase
 
-NO_LIMIT = 1 << 62  # bytes
 # Each 0 where the system has no such thing. Who opens a pipe so does not wait for its other end.
 _BYTES = getattr(os, "O_BINARY", 0)
 _ALWAYS = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_NOCTTY", 0) | _BYTES
@@ -40,12 +107,9 @@ def hold(folder: Path) -> None:
 
 
 def take_up(folder: Path) -> None:
-    """Hold a folder in which nothing lies but files and folders.
+    """Hold a folder, once it is sure that nothing lies there but files and folders.
 
     Libraries that open paths by themselves may then be let in.
-
-    Raises:
-        UnsafeFileError: naming a link, pipe or device inside.
     """
     hold(folder)
     pending = [str(folder)]
@@ -66,13 +130,9 @@ def take_up(folder: Path) -> None:
 
 @contextmanager
 def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
-    """The folder of a path, as functions of `os` take it.
+    """The folder of a path as functions of `os` take it: what to put before a name, and ``dir_fd``.
 
-    Yields:
-        What to put before a name in it, and ``dir_fd``.
-
-    Raises:
-        OSError: if it is not there, or lies behind a link in a folder that is held.
+    An OSError says that it is not there, or lies behind a link in a folder that is held.
     """
     whole = _whole(path)
     held = _held_above(whole)
@@ -94,11 +154,7 @@ def folder_of(path: Path) -> Iterator[tuple[Path, int | None]]:
 
 
 def open_number(path: Path, flags: int) -> int:
-    """The descriptor of a file, whatever kind it is of, opened without waiting for it.
-
-    Raises:
-        OSError: if that fails, or it is or lies behind a link in a folder that is held.
-    """
+    """The descriptor of a file, whatever kind it is of, opened without waiting for it."""
     held = _held_above(_whole(path))
     if held is None:  # the user's own place
         return os.open(path, flags | _ALWAYS)
@@ -110,34 +166,28 @@ def open_number(path: Path, flags: int) -> int:
 
 @contextmanager
 def opened(path: Path, limit: int) -> Iterator[io.BufferedReader]:
-    """A regular file, open for reading: what is checked is what is used.
+    """A regular file of at most so many bytes, open for reading: what is checked is what is used.
 
-    Args:
-        path: the file.
-        limit: the most bytes that it may have.
-
-    Raises:
-        UnsafeFileError: if it is no regular file (a pipe or a device could go on for ever), or
-            larger than that, or behind a link in a folder that is held.
-        OSError: if it cannot be read.
+    A pipe or a device is refused, which could go on for ever, and what lies behind a link in a
+    folder that is held.
     """
     try:
-        number = open_number(path, os.O_RDONLY)
+        # Of a folder, Python says so itself, and closes it again.
+        file = open(  # noqa: SIM115  # what it raises is told apart from what its user raises
+            path, "rb", opener=lambda _path, _flags: open_number(path, os.O_RDONLY)
+        )
+    except IsADirectoryError:
+        raise UnsafeFileError(f"{path} is no regular file") from None
     except OSError as error:
         if error.strerror in _LINKS.values():
             raise UnsafeFileError(f"{path} is no regular file: {error.strerror}") from error
         raise
-    try:
-        status = os.fstat(number)
+    with file:
+        status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise UnsafeFileError(f"{path} is no regular file")
         if status.st_size > limit:
             raise UnsafeFileError(f"{path} is larger than {limit:,} bytes")
-        file = os.fdopen(number, "rb")
-    except BaseException:
-        os.close(number)
-        raise
-    with file:
         yield file
 
 
@@ -149,12 +199,7 @@ def read_file(path: Path, limit: int) -> bytes:
 
 
 def content_of(source: Source, limit: int) -> bytes:
-    """All of a regular file, or of a stream.
-
-    Raises:
-        UnsafeFileError: if it is larger than ``limit``, or the file is no regular one.
-        OSError: if it cannot be read.
-    """
+    """All of a regular file, or of a stream, of at most so many bytes."""
     if not isinstance(source, io.BufferedIOBase):
         return read_file(Path(source), limit)
     content = source.read(limit + 1)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from envs.checking import OutcomeClasses
 from mdp import TransitionModel
-from mdp.outcome_classes import OutcomeClasses
 
 
 @pytest.fixture
@@ -63,5 +63,5 @@ def test_what_uniform_numbers_choose(classes):
 def test_many_numbers_are_looked_up_in_parts(classes, monkeypatch):
     rows, uniforms = np.arange(1000) % 4, np.linspace(0, 0.999, 1000)
     whole = classes.predicted(rows, uniforms)
-    monkeypatch.setattr("mdp.outcome_classes.MAX_TABLE", 21)
+    monkeypatch.setattr("envs.checking.MAX_TABLE", 21)
     np.testing.assert_array_equal(classes.predicted(rows, uniforms), whole)

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdp.frequency_evidence import frequencies, log_evidence
+from envs.checking import frequencies, log_evidence
 
 
 @pytest.mark.parametrize(
@@ -50,13 +50,11 @@ def test_what_is_certain_says_nothing():
 
 
 def test_counts_by_group():
-    probabilities = np.array([[0.5, 0.5, 0.0], [0.2, 0.3, 0.5]])
-    # Groups 0 and 1 share the first row, 2 and 3 the second.
-    found = frequencies(
-        np.array([3, 0, 3, 3, 0, 2]), np.array([2, 1, 2, 0, 0, 1]), probabilities, 2
-    )
+    shared, other = [0.5, 0.5, 0.0], [0.2, 0.3, 0.5]
+    probabilities = np.array([shared, shared, other, other])
+    found = frequencies(np.array([3, 0, 3, 3, 0, 2]), np.array([2, 1, 2, 0, 0, 1]), probabilities)
     np.testing.assert_array_equal(found.groups, [0, 2, 3])
     np.testing.assert_array_equal(found.counts, [[1, 1, 0], [0, 1, 0], [1, 0, 2]])
     assert found.evidence[0, 2] == -np.inf
-    expected = log_evidence(np.array([1, 0, 2]), np.array(3), probabilities[1])
+    expected = log_evidence(np.array([1, 0, 2]), np.array(3), probabilities[3])
     np.testing.assert_allclose(found.evidence[2], expected)

@@ -1,1 +1,0 @@
-"""Whether the model that an environment brings is what it does."""

@@ -1,0 +1,225 @@
+"""Replay buffers and the statistics of VecNormalize, read from files of unknown origin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.running_mean_std import RunningMeanStd
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
+
+from safe_files.files import (
+    MAX_BUFFER_BYTES,
+    MAX_STATISTICS_BYTES,
+    Source,
+    UnsafeFileError,
+    content_of,
+)
+from safe_files.known_objects import MAX_ROWS, full_name, read_pickle
+from safe_files.pickles import Build, Made, fields, wrong
+
+# --- replay buffers -------------------------------------------------------------------------------
+
+_CLASSES = (ReplayBuffer, DictReplayBuffer, NStepReplayBuffer, HerReplayBuffer)
+_ARGUMENTS = ("buffer_size", "n_envs", "optimize_memory_usage", "handle_timeout_termination")
+_MORE_ARGUMENTS: Mapping[type, tuple[str, ...]] = {
+    NStepReplayBuffer: ("n_steps", "gamma"),
+    HerReplayBuffer: ("n_sampled_goal", "goal_selection_strategy", "copy_info_dict"),
+}
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """A buffer as the file says it: its class and its attributes."""
+
+    cls: type[ReplayBuffer]
+    state: Mapping[str, Any]
+
+
+def load_replay_buffer(
+    model: OffPolicyAlgorithm,
+    path: Source,
+    truncate_last_traj: bool = True,
+    *,
+    classes: Iterable[type[ReplayBuffer]] = (),
+) -> None:
+    """As ``model.load_replay_buffer``, without running anything that the file names.
+
+    Args:
+        model: the agent to give the buffer to.
+        path: the file, or a stream of its bytes.
+        truncate_last_traj: with `HerReplayBuffer`, end the episode under way in the buffer.
+        classes: of your own, made with the arguments of `ReplayBuffer`, that the file may hold.
+
+    Raises:
+        UnsafeFileError: if the file is no replay buffer, or does not fit the model.
+        OSError: if it cannot be read.
+    """
+    known: tuple[type[ReplayBuffer], ...] = (*_CLASSES, *classes)
+    makers = {full_name(cls): partial(_stored, cls) for cls in known}
+    found = read_pickle(content_of(path, MAX_BUFFER_BYTES), makers=makers)
+    if not isinstance(found, _Stored):
+        raise UnsafeFileError("holds no replay buffer")
+    for name in ("observation_space", "action_space"):
+        if found.state.get(name) != getattr(model, name):
+            raise UnsafeFileError(f"holds transitions of another {name} than the agent's")
+    buffer = _buffer(found, model.device)
+    if isinstance(buffer, HerReplayBuffer):
+        assert model.env is not None, "HerReplayBuffer needs an environment"
+        buffer.set_env(model.env)
+        if truncate_last_traj:
+            buffer.truncate_last_trajectory()
+    model.replay_buffer = buffer
+
+
+def _stored(cls: type[ReplayBuffer], made: Made, build: Build) -> _Stored:
+    state = fields(made, build)
+    rows = state.get("buffer_size")
+    if not (isinstance(rows, int) and 0 < rows <= MAX_ROWS):
+        raise wrong(made)
+    return _Stored(cls, state)
+
+
+def _buffer(found: _Stored, device: th.device) -> ReplayBuffer:
+    """A buffer made by its constructor, and filled."""
+    state = dict(found.state)
+    names = (*_ARGUMENTS, *_MORE_ARGUMENTS.get(found.cls, ()))
+    given: dict[str, Any] = {name: state[name] for name in names if name in state}
+    shape = (given["buffer_size"], given.get("n_envs", 1))
+    # Its buffers count per environment.
+    given["buffer_size"] *= given.get("n_envs", 1)
+    if found.cls is HerReplayBuffer:
+        given["env"] = None
+        # It makes a dictionary for each row: let there be as many in the file.
+        if not isinstance(state.get("infos"), np.ndarray) or state["infos"].shape != shape:
+            raise UnsafeFileError("holds a replay buffer with wrong infos")
+    try:
+        buffer = found.cls(
+            observation_space=state["observation_space"],
+            action_space=state["action_space"],
+            device=device,
+            **given,
+        )
+    except (LookupError, TypeError, ValueError, AssertionError, MemoryError) as error:
+        raise UnsafeFileError(f"holds a replay buffer that cannot be made: {error}") from error
+    state.pop("device", None)
+    for name, value in state.items():
+        _check_part(name, value, vars(buffer).get(name))
+        setattr(buffer, name, value)
+    return buffer
+
+
+def _check_part(name: str, value: Any, expected: Any) -> None:
+    """Make sure that an attribute of a buffer is such as an empty one has."""
+    if isinstance(expected, dict):
+        if not isinstance(value, dict) or value.keys() != expected.keys():
+            raise UnsafeFileError(f"holds a replay buffer with wrong {name}")
+        for key, part in value.items():
+            _check_part(name, part, expected[key])
+        return
+    fits = type(value) is type(expected)
+    if isinstance(expected, np.ndarray) and fits:
+        fits = value.shape == expected.shape and value.dtype == expected.dtype
+        fits = fits and (value.dtype.kind != "f" or bool(np.isfinite(value).all()))
+    if isinstance(expected, spaces.Space | int) and not isinstance(expected, bool) and fits:
+        fits = name == "pos" or value == expected
+    if not fits:
+        raise UnsafeFileError(f"holds a replay buffer with wrong {name}")
+
+
+# --- statistics -----------------------------------------------------------------------------------
+
+_VEC_NORMALIZE = "stable_baselines3.common.vec_env.vec_normalize.VecNormalize"
+_FLAGS = ("training", "norm_obs", "norm_reward")
+_NUMBERS = ("clip_obs", "clip_reward", "gamma", "epsilon")
+_REST = ("observation_space", "obs_rms", "ret_rms")
+
+
+@dataclass(frozen=True)
+class Normalization:
+    """What a file says of a `VecNormalize`."""
+
+    settings: dict[str, Any]  # its constructor's arguments
+    observation_space: spaces.Space[Any]
+    # A dictionary where observations are dictionaries, None where they are left as they are.
+    obs_rms: RunningMeanStd | dict[str, RunningMeanStd] | None
+    ret_rms: RunningMeanStd
+
+
+def load_vec_normalize(path: Source, venv: VecEnv) -> VecNormalize:
+    """As `VecNormalize.load`, without running anything that the file names.
+
+    Args:
+        path: the file, or a stream of its bytes.
+        venv: the environments to normalise.
+
+    Raises:
+        UnsafeFileError: if the file is no such statistics, or they do not fit the environments.
+        OSError: if it cannot be read.
+    """
+    found = read_normalization(content_of(path, MAX_STATISTICS_BYTES))
+    _check_fit(found, venv.observation_space)
+    normalized = VecNormalize(venv, **found.settings)
+    if found.obs_rms is not None:
+        normalized.obs_rms = cast(Any, found.obs_rms)
+    normalized.ret_rms = found.ret_rms
+    return normalized
+
+
+def read_normalization(pickled: bytes) -> Normalization:
+    """The statistics in a pickled `VecNormalize`."""
+    found = read_pickle(pickled, makers={_VEC_NORMALIZE: _normalization})
+    if not isinstance(found, Normalization):
+        raise UnsafeFileError("holds no statistics of VecNormalize")
+    return found
+
+
+def _normalization(made: Made, build: Build) -> Normalization:
+    # Its other attributes are not looked at.
+    trees = made.state if isinstance(made.state, dict) else {}
+    if not trees.keys() >= {*_FLAGS, *_NUMBERS, *_REST}:
+        raise wrong(made)
+    state = {name: build(trees[name]) for name in (*_FLAGS, *_NUMBERS, *_REST)}
+    settings = {name: state[name] for name in (*_FLAGS, *_NUMBERS)}
+    # Files from before there was a choice of keys do not say it.
+    keys = trees.get("norm_obs_keys")
+    settings["norm_obs_keys"] = build(keys) if isinstance(keys, list) else None
+    fits = (
+        all(isinstance(state[name], bool) for name in _FLAGS)
+        and all(_is_number(state[name]) for name in _NUMBERS)
+        and isinstance(state["observation_space"], spaces.Space)
+        and isinstance(state["ret_rms"], RunningMeanStd)
+        and all(isinstance(key, str) for key in settings["norm_obs_keys"] or ())
+    )
+    obs_rms = state["obs_rms"]
+    parts = obs_rms.values() if isinstance(obs_rms, dict) else [obs_rms]
+    if not fits or (state["norm_obs"] and not all(isinstance(p, RunningMeanStd) for p in parts)):
+        raise wrong(made)
+    return Normalization(settings, state["observation_space"], obs_rms, state["ret_rms"])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
+
+
+def _check_fit(found: Normalization, space: spaces.Space[Any]) -> None:
+    """Make sure that the statistics are of observations such as these."""
+    known = found.observation_space
+    if type(known) is not type(space) or known.shape != space.shape:
+        raise UnsafeFileError(f"holds statistics of {known}, not of {space}")
+    if found.obs_rms is None:
+        return
+    rms = found.obs_rms
+    parts: dict[Any, Any] = dict(rms) if isinstance(rms, dict) else {None: rms}
+    for key, statistics in parts.items():
+        part = space[key] if isinstance(space, spaces.Dict) and key in space.spaces else space
+        if np.shape(statistics.mean) != part.shape or np.shape(statistics.var) != part.shape:
+            raise UnsafeFileError(f"holds statistics of another shape than {part.shape}")
