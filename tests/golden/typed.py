@@ -311,26 +311,42 @@ def written(root: Path, path: Path) -> list[str]:
 
 
 class _Text(HTMLParser):
-    """Collects the texts of a page that a reader sees, and what is read out in their place."""
+    """Collects the texts of a page that a reader sees or hears, but for columns of times."""
 
     HIDDEN = ("script", "style", "svg")
+    TIMES = "CPU time"
 
     def __init__(self) -> None:
         super().__init__()
         self.lines: list[str] = []
         self._depth = 0
+        self._column = 0
+        self._times: set[int] = set()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self._depth += tag in self.HIDDEN
+        if tag == "table":
+            self._times.clear()
+        elif tag == "tr":
+            self._column = 0
+        elif tag in ("th", "td"):
+            self._column += 1
         read_out = (value for key, value in attrs if key in ("alt", "aria-label", "title"))
         self.lines.extend(f"{tag}: {value}" for value in read_out if value)
 
     def handle_endtag(self, tag: str) -> None:
         self._depth -= tag in self.HIDDEN
+        if tag == "table":
+            self._times.clear()
 
     def handle_data(self, data: str) -> None:
+        text = " ".join(data.split())
+        if text == self.TIMES:
+            self._times.add(self._column)
+        elif self._column in self._times:
+            return
         if not self._depth:
-            self.lines.append(" ".join(data.split()))
+            self.lines.append(text)
 
 
 def page(path: Path) -> list[str]:
