@@ -27,7 +27,7 @@ export OMP_NUM_THREADS ?= 1
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help train test peers lint style types types-elsewhere format bench mutants docs images wheel clean
+.PHONY: help train test golden size peers lint style types types-elsewhere format bench mutants docs images wheel clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/make \1|\2/p' $(firstword $(MAKEFILE_LIST)) | \
@@ -38,6 +38,12 @@ train: $(STAMP) ## Train PPO on the warehouse, or what ARGS="--env ... --algo ..
 
 test: peers ## Run the whole test suite; PYTEST_ARGS replaces its options
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+golden: $(STAMP) ## Tell what is produced differently than tests/golden/golden.json says; ARGS="--record"
+	$(BIN)/python tests/golden $(ARGS)
+
+size: $(STAMP) ## Count lines and files against the limits in CONTRIBUTING.md
+	@$(BIN)/python docs/scripts/sizes.py
 
 peers: $(STAMP) ## Set up rl_zoo3, which tests and a benchmark need, in .venv/peers
 	@$(BIN)/python tests/peers/peer_environment.py

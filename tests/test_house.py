@@ -174,6 +174,57 @@ def test_no_module_is_longer_than_900_lines() -> None:
     assert {name: length for name, length in lengths.items() if length > 900} == {}
 
 
+# Runs ``train.py`` as its command line says, and prints the files whose functions were called: by
+# whom, and in which thread, does not matter. What runs when a module is imported does not count.
+ENTERED = """
+import inspect, runpy, sys, threading
+
+def note(frame, event, argument):
+    if event == "call" and frame.f_code.co_flags & inspect.CO_OPTIMIZED:
+        entered.add(frame.f_code.co_filename)
+
+entered = set()
+script, *sys.argv[1:] = sys.argv[1:]
+sys.argv[0] = "train.py"
+threading.setprofile(note)
+sys.setprofile(note)
+try:
+    runpy.run_path(script, run_name="__main__")
+except SystemExit as stop:
+    assert stop.code == 0, stop.code
+finally:
+    sys.setprofile(None)
+print(*sorted(entered), sep="\\n", file=sys.stderr)
+"""
+# 145 where the machine code is there, 158 where it is compiled, which takes so long that states are
+# saved. To be lowered whenever it is fewer; a reader should not have to open more than 90.
+MOST_FILES_ENTERED = 158
+
+
+def files_entered(tmp_path: Path) -> list[str]:
+    """The files of ours that a run on a table enters functions of, without those of tests."""
+    command = ["--env", "FrozenLake-v1", "--algo", "qlearning", "-n", "1000", "--seed", "0"]
+    done = subprocess.run(
+        [sys.executable, "-c", ENTERED, ROOT / "train.py", *command],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    folders = {str(ROOT / package) for package in PACKAGES}
+    return [
+        line
+        for line in done.stderr.splitlines()
+        if any(line.startswith(f"{folder}/") for folder in folders)
+    ]
+
+
+def test_a_run_enters_no_more_files_than_it_did(tmp_path: Path) -> None:
+    """A ratchet: what one has to open to follow one run may become less, and never more."""
+    files = files_entered(tmp_path)
+    assert len(files) <= MOST_FILES_ENTERED, "\n".join(files)
+
+
 def test_no_file_names_a_path_of_somebodys_machine() -> None:
     here = {str(ROOT), str(Path.home()), tempfile.gettempdir()}
     others = ["/home", "/root", "/Users", r"[A-Z]:\\Users"]

@@ -1,0 +1,119 @@
+"""Counts lines and files against the limits in CONTRIBUTING.md: ``python docs/scripts/sizes.py``.
+
+The table there under "Size" is the only place where the limits stand. A row names folders, whose
+Python files count, or patterns, in code marks; the row "together" is the sum of those above it.
+Only files under version control count. With ``--check`` it fails where a limit is exceeded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "CONTRIBUTING.md"
+HEADING = "## Size\n"
+ROW = re.compile(r"^\| ([^|]+) \| ([\d,]+) \| ([\d,]*) ?\|$", re.MULTILINE)
+
+
+class Limit(NamedTuple):
+    """A row of the table; without patterns it is the sum of the rows before it."""
+
+    name: str
+    patterns: tuple[str, ...]
+    lines: int
+    files: int | None
+
+
+class Size(NamedTuple):
+    """What there is."""
+
+    lines: int
+    files: int
+
+
+def main() -> int:
+    """Print a table of all parts; with ``--check``, 1 if one is too large."""
+    parser = argparse.ArgumentParser(description="Count lines and files against their limits.")
+    parser.add_argument("--check", action="store_true", help="fail where a limit is exceeded")
+    arguments = parser.parse_args()
+    lengths = lengths_of_files(ROOT)
+    limits = read_limits(PAGE.read_text(encoding="utf-8"))
+    sizes = sizes_of(limits, lengths)
+    exceeded = 0
+    print(f"{'':42}{'lines':>8}{'limit':>8}{'':>7}{'files':>7}{'limit':>7}")
+    for limit, size in zip(limits, sizes, strict=True):
+        over = size.lines > limit.lines or (limit.files is not None and size.files > limit.files)
+        exceeded += over
+        print(
+            f"{limit.name.replace('`', ''):42}{size.lines:8,}{limit.lines:8,}"
+            f"{size.lines / limit.lines:7.0%}{size.files:7,}{limit.files or '':>7}"
+            f"{'  too large' if over else ''}".rstrip()
+        )
+    counted = [pattern for limit in limits for pattern in limit.patterns]
+    rest = [path for path in lengths if path.endswith(".py") and not matches(path, counted)]
+    print(f"{'Python in no row':42}{sum(lengths[path] for path in rest):8,}{'':15}{len(rest):7,}")
+    print(f"{exceeded} of {len(limits)} parts are too large")
+    return int(arguments.check and exceeded > 0)
+
+
+def lengths_of_files(root: Path) -> dict[str, int]:
+    """The lines of each file under version control that can be counted, by its path."""
+    listing = subprocess.run(
+        ["git", "ls-files", "-z", "*.py", "*.md", "*.toml"],
+        cwd=root,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    paths = [path for path in listing.stdout.split("\0") if (root / path).is_file()]
+    return {path: len((root / path).read_bytes().splitlines()) for path in paths}
+
+
+def read_limits(text: str) -> list[Limit]:
+    """The table of limits of the contributors' page."""
+    _, _, section = text.partition(HEADING)
+    section, _, _ = section.partition("\n## ")
+    rows = [Limit(*row) for row in map(_row, ROW.finditer(section))]
+    if not rows:
+        raise ValueError(f"there is no table under {HEADING.strip()!r} in {PAGE.name}")
+    return rows
+
+
+def _row(found: re.Match[str]) -> tuple[str, tuple[str, ...], int, int | None]:
+    name, lines, files = found.groups()
+    patterns = tuple(re.findall(r"`([^`]+)`", name))
+    return name, patterns, int(lines.replace(",", "")), int(files.replace(",", "") or 0) or None
+
+
+def sizes_of(limits: list[Limit], lengths: dict[str, int]) -> list[Size]:
+    """The size of each part."""
+    sizes: list[Size] = []
+    for limit in limits:
+        if limit.patterns:
+            found = [length for path, length in lengths.items() if matches(path, limit.patterns)]
+            sizes.append(Size(sum(found), len(found)))
+        else:
+            sizes.append(Size(sum(size.lines for size in sizes), sum(size.files for size in sizes)))
+    return sizes
+
+
+def matches(path: str, patterns: tuple[str, ...] | list[str]) -> bool:
+    """Whether a file is in a folder (``mdp/``), or is meant by a pattern (``*.py``)."""
+    for pattern in patterns:
+        if pattern.endswith("/"):
+            found = path.startswith(pattern) and path.endswith(".py")
+        else:
+            found = fnmatchcase(path, pattern) and ("/" in pattern or "/" not in path)
+        if found:
+            return True
+    return False
+
+
+if __name__ == "__main__":
+    sys.exit(main())

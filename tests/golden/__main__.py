@@ -1,0 +1,197 @@
+"""Records what the project produces, or tells what another checkout produces differently.
+
+    python tests/golden                     # this checkout against golden.json
+    python tests/golden --root ../other     # another checkout against it
+    python tests/golden --record            # write golden.json anew
+
+For changes that shall change nothing: whatever differs is told in one line, and the exit code is 1.
+All is done through command lines, the names in the registry and the formats of files. So the same
+program looks at commits before and after modules have moved. ``--only 'train Taxi*' 'help *'``
+looks at a part.
+
+What was changed on purpose is written into dropped.yml with its reason, until it is recorded anew;
+an entry there that has not changed is told too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import fnmatch
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
+GOLDEN, DROPPED = HERE / "golden.json", HERE / "dropped.yml"
+LIBRARIES = (
+    *("gymnasium", "mabwiser", "matplotlib", "numba", "numpy", "optuna", "sb3-contrib", "scipy"),
+    *("stable-baselines3", "torch"),
+)
+SHOWN = 160  # characters of a value in a difference
+
+
+def main() -> int:
+    """Record, or compare; the exit code."""
+    arguments = _parse()
+    found = look(arguments.root, arguments.only)
+    if arguments.seconds:
+        for name, spent in sorted(found.seconds.items(), key=lambda item: -item[1])[:30]:
+            print(f"{spent:7.2f} s  {name}")
+    print(f"{len(found.values)} entries, {sum(found.seconds.values()):.0f} s of processor time")
+    if arguments.record:
+        record(found, arguments.only)
+        return 0
+    recorded = json.loads(GOLDEN.read_text(encoding="utf-8"))
+    dropped = yaml.safe_load(DROPPED.read_text(encoding="utf-8")) or {}
+    lines = list(differences(recorded, found, dropped, arguments.only))
+    print(*lines or ["no difference"], sep="\n")
+    return int(any(not line.startswith(NOT_HERE) for line in lines))
+
+
+NOT_HERE = "not comparable here: "
+
+
+class Found:
+    """What was looked at: values, where they hold, and what it took, by names."""
+
+    def __init__(self, lines: list[str]) -> None:
+        rows = [json.loads(line) for line in lines]
+        self.values: dict[str, Any] = {name: value for name, _, value, _ in rows}
+        self.holds: dict[str, str] = {name: holds for name, holds, _, _ in rows}
+        self.seconds: dict[str, float] = {name: spent for name, _, _, spent in rows}
+
+
+def look(root: Path, patterns: list[str]) -> Found:
+    """Look at a checkout, in a new process that imports its packages and no others of that name."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / "found.jsonl"
+        threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
+        own = {"XDG_CONFIG_HOME": folder, "SDL_VIDEODRIVER": "dummy", "MPLBACKEND": "Agg"}
+        subprocess.run(
+            [sys.executable, HERE / "observe.py", root, out, *patterns],
+            env={**os.environ, **threads, **own, "PYTHONPATH": str(root.resolve())},
+            check=True,
+        )
+        return Found(out.read_text(encoding="utf-8").splitlines())
+
+
+def facts() -> dict[str, str]:
+    """What values depend on that do not hold anywhere."""
+    import torch as th
+
+    return {
+        "python": ".".join(platform.python_version_tuple()[:2]),
+        "machine": f"{platform.system()} {platform.machine()}",
+        "capability": th.backends.cpu.get_cpu_capability(),
+        **{name: installed(name) for name in LIBRARIES},
+    }
+
+
+def installed(library: str) -> str:
+    """The version of a library; ``none`` where it is not there."""
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return "none"
+
+
+def record(found: Found, patterns: list[str]) -> None:
+    """Write the file of results, a line for each entry or for each line of its text."""
+    holds, values = found.holds, found.values
+    if patterns != ["*"] and GOLDEN.exists():  # those that were not looked at stay
+        before = json.loads(GOLDEN.read_text(encoding="utf-8"))
+        for where, entries in before["entries"].items():
+            for name, value in entries.items():
+                if not matches(name, patterns):
+                    values[name], holds[name] = value, where
+    entries = {
+        where: {name: values[name] for name in sorted(values) if holds[name] == where}
+        for where in ("anywhere", "python", "here")
+    }
+    text = json.dumps({"facts": facts(), "entries": entries}, indent=0, ensure_ascii=False)
+    GOLDEN.write_text(f"{text}\n", encoding="utf-8")
+    print(f"{GOLDEN.name}: {len(text) / 1000:.0f} kB")
+
+
+def matches(name: str, patterns: list[str]) -> bool:
+    """Whether a name is one of those that are looked at."""
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)
+
+
+def differences(
+    recorded: dict[str, Any], found: Found, dropped: dict[str, str], patterns: list[str]
+) -> Iterator[str]:
+    """A line for each difference, and for each thing that cannot be compared here."""
+    here = facts()
+    changed_facts = [name for name, value in recorded["facts"].items() if here[name] != value]
+    blocked = {"anywhere": False, "python": "python" in changed_facts, "here": bool(changed_facts)}
+    left = dict(found.values)
+    for where, entries in recorded["entries"].items():
+        skipped = 0
+        for name, was in entries.items():
+            if not matches(name, patterns):
+                continue
+            lines = list(changes(name, was, left.pop(name, None)))
+            if blocked[where] and lines:
+                skipped += 1
+            elif name in dropped:
+                if not lines:
+                    yield f"{name}: is in {DROPPED.name}, and has not changed"
+            else:
+                yield from lines
+        if skipped:
+            names = ", ".join(f"{n} {recorded['facts'][n]}, here {here[n]}" for n in changed_facts)
+            yield f"{NOT_HERE}{skipped} entries that depend on {names}"
+    for name in sorted(left.keys() - dropped.keys()):
+        yield f"{name}: is new; {sys.executable} tests/golden --record --only {name!r}"
+    known = {name for entries in recorded["entries"].values() for name in entries} | left.keys()
+    for name in sorted(dropped.keys() - known):
+        yield f"{name}: is in {DROPPED.name}, and there is no such entry"
+
+
+def changes(name: str, was: Any, now: Any) -> Iterator[str]:
+    """What was and what is, in a line for each line that has changed."""
+    if was == now:
+        return
+    if now is None:
+        yield f"{name}: is gone"
+    elif isinstance(was, str) or isinstance(now, str):
+        yield f"{name}: was {shown(was)}, is {shown(now)}"
+    else:
+        matcher = difflib.SequenceMatcher(a=was, b=now, autojunk=False)
+        for kind, first, last, begin, end in matcher.get_opcodes():
+            if kind != "equal":
+                old, new = was[first:last], now[begin:end]
+                for i in range(max(len(old), len(new))):
+                    before, after = (shown(x[i]) if i < len(x) else "nothing" for x in (old, new))
+                    yield f"{name}: was {before}, is {after}"
+
+
+def shown(value: Any) -> str:
+    """A value, cut where it is long."""
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= SHOWN else f"{text[:SHOWN]}..."
+
+
+def _parse() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--root", type=Path, default=ROOT, help="another checkout than this one")
+    parser.add_argument("--record", action="store_true", help=f"write {GOLDEN.name}")
+    parser.add_argument("--only", nargs="+", default=["*"], metavar="NAME", help="patterns")
+    parser.add_argument("--seconds", action="store_true", help="what took longest")
+    return parser.parse_args()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
