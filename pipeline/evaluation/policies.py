@@ -104,7 +104,7 @@ class OfLastPolicy(Generic[Result]):
         self._last: tuple[NDArray[Any], Result] | None = None
 
     def __call__(self, policy: NDArray[Any]) -> Result:
-        """The result for a policy in one of the forms of `mdp.policies`."""
+        """The result for a policy in one of the forms of `mdp.evaluation`."""
         last = self._last
         if last is not None and last[0].dtype == policy.dtype and np.array_equal(last[0], policy):
             return last[1]
