@@ -4,13 +4,9 @@ Importing this package loads neither torch nor Stable-Baselines3: names can be l
 compared, before anything heavy is paid for.
 """
 
-from agents.algorithm_entries import AlgorithmEntry
-from agents.known_algorithms import ALGORITHMS
-from agents.old_names import install
-from agents.registry import fitting_algorithms, load_algorithm, register
+from agents.registry import ALGORITHMS, AlgorithmEntry, fitting_algorithms, load_algorithm, register
 from machine_code.sources import keep_machine_code
 
-install()
 keep_machine_code("agents", "mdp")
 
 __all__ = ["ALGORITHMS", "AlgorithmEntry", "fitting_algorithms", "load_algorithm", "register"]

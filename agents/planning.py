@@ -18,10 +18,10 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.common.observed_numbers import numbers_in
-from agents.common.online import OnlineAlgorithm
-from agents.common.signatures import CommonArguments
-from agents.common.table_policy import TablePolicy
+from agents.common.algorithm import OnlineAlgorithm
+from agents.common.masks import numbers_in
+from agents.common.model_files import TablePolicy
+from agents.common.settings import CommonArguments
 from envs.known_models import (
     action_masks_of_states,
     model_check,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
-from agents.common.online import OnlineAlgorithm
-from agents.common.signatures import CommonArguments
+from agents.common.algorithm import OnlineAlgorithm
+from agents.common.settings import CommonArguments
 
 POLE_ANGLE = 2
 LEFT, RIGHT = 0, 1

@@ -36,7 +36,7 @@ from stable_baselines3.common.monitor import Monitor
 
 import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
-from agents.bandits.batch import run_batch
+from agents.bandits.runs import run_batch
 
 PULLS = 1000
 BATCH = 200

@@ -26,7 +26,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import numpy as np
 
 from agents import load_algorithm
-from pipeline.auto_settings import resolved_spec
+from pipeline.agent_settings import resolved_spec
 from pipeline.environments import make_training_env
 from pipeline.evaluation.exact import ExactEvaluator, exact_evaluator
 from pipeline.preparation import algorithm_kwargs

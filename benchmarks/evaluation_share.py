@@ -46,7 +46,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback
+from agents.common.callbacks import BlockCallback
 from envs.wrappers import DiscretizeObservation
 
 ROOT = Path(__file__).resolve().parent.parent

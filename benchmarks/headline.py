@@ -24,9 +24,8 @@ from experiments.plan import plan
 from experiments.results import read_results
 from experiments.study import read_study
 from report.conclusions import conclusion
-from report.markdown import escaped, markdown_table, name_of
-from report.seed_sentence import spans
-from report.verdict_table import headline
+from report.documents import headline, markdown_table, markdown_text, name_of
+from report.words import spans
 
 ROOT = Path(__file__).resolve().parent.parent
 STUDY = ROOT / "studies" / "library-vs-hand-rolled.yml"
@@ -57,8 +56,8 @@ def verdicts(analysis: StudyAnalysis) -> str:
     parts = []
     for environment in analysis.environments:
         said = conclusion(analysis.study, environment).everything
-        parts.append(f"**{escaped(environment.environment)}**\n")
-        parts.append("\n".join(f"- {escaped(text)}" for text in said) + "\n")
+        parts.append(f"**{markdown_text(environment.environment)}**\n")
+        parts.append("\n".join(f"- {markdown_text(text)}" for text in said) + "\n")
     return "\n".join(parts)
 
 
@@ -103,7 +102,7 @@ def _changes(tuned: StudyAnalysis, held_out: StudyAnalysis) -> Iterator[str]:
             failed = [e.failures[agent.agent].n_failed for e in (environment, now)]
             if abs(medians[0] - medians[1]) > MATTERS or failed[0] != failed[1]:
                 yield (
-                    f"{name_of(agent.agent)} on {escaped(environment.environment)}: median "
+                    f"{name_of(agent.agent)} on {markdown_text(environment.environment)}: median "
                     f"{medians[0]:.3f} and {failed[0]} failed, "
                     f"then {medians[1]:.3f} and {failed[1]}"
                 )

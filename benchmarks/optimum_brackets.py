@@ -36,9 +36,9 @@ from _pushed_motion import (
     optimistic_costs,
 )
 
-from envs.brackets.known_brackets import DATA, constants_of
+from envs.brackets import DATA, constants_of
 from mdp.array_types import Floats
-from verdicts.mean_bounds import least_mean
+from verdicts.resampling import least_mean
 
 LEVEL = 0.001
 SEED = 0

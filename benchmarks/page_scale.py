@@ -29,9 +29,9 @@ from experiments.analysis import analyse
 from experiments.results import RUN_COLUMNS, StudyResults
 from experiments.run_files import CURVE_COLUMNS
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from report.figures.figure_files import write_figures
+from report.figures import write_figures
 from report.page import write_report
-from report.series.study_series import study_series
+from report.series import study_series
 
 N_STEPS = 100_000
 N_EVALUATIONS = 20

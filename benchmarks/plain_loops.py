@@ -29,7 +29,7 @@ from rich.table import Table
 from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
-from agents.tabular.q_learning import QLearning
+from agents.tabular.one_step import QLearning
 from envs.known_models import time_limit, transition_model
 from mdp import TransitionModel
 

@@ -62,7 +62,7 @@ def final_return(case: Case, seed: int) -> float:
     import torch as th
 
     from agents import load_algorithm
-    from pipeline.auto_settings import resolved_spec
+    from pipeline.agent_settings import resolved_spec
     from pipeline.environments import make_training_env
     from pipeline.evaluation.exact import exact_evaluator
     from pipeline.preparation import algorithm_kwargs

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pipeline import state_saver
-from pipeline.auto_settings import resolved_spec
+from pipeline.agent_settings import resolved_spec
 from pipeline.settings.hyperparams import override, read_hyperparams
 from pipeline.state_saver import StateSaver
 from pipeline.training import train

@@ -32,8 +32,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback, Horizon, calls_until_multiple
-from agents.tabular.q_learning import QLearning
+from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
+from agents.tabular.one_step import QLearning
 from envs.warehouse import DEFAULT_MAP
 from envs.wrappers import DiscretizeObservation
 

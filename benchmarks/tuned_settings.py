@@ -169,7 +169,7 @@ PLANNABLE = 0.95
 
 
 def _spec(member: Member, algo: str, seed: int) -> Any:
-    from pipeline.auto_settings import resolved_spec
+    from pipeline.agent_settings import resolved_spec
     from pipeline.settings.hyperparams import override, read_hyperparams
 
     raw = override(read_hyperparams(algo, member.env_id), {"env_kwargs": member.env_kwargs})

@@ -35,7 +35,7 @@ from commands.terminal import LiveProgress, say, table_console
 from pipeline.errors import UserError, unknown
 from pipeline.failures import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
-from pipeline.signs_of_life import doing, duration
+from pipeline.progress import doing, duration
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
@@ -51,8 +51,8 @@ if TYPE_CHECKING:
     from experiments.results import LeftOut, StudyResults
     from experiments.run_limits import RunLimits
     from experiments.study import StudySpec
-    from pipeline.signs_of_life import Activity
-    from report.page.sections import LearningPage
+    from pipeline.progress import Activity
+    from report.page.frame import LearningPage
 
 # --- flags ----------------------------------------------------------------------------------------
 
@@ -221,7 +221,7 @@ def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], 
             missing.setdefault((run.agent, run.environment), []).append(run)
     if not missing:  # without the libraries
         return "", {}
-    from agents.networks.engine_costs import machine_pace
+    from agents.networks.engine_setting import machine_pace
     from commands.terminal import seconds_of, study_line
     from experiments.launching import expected_seconds
     from pipeline.engine_outlook import planned_outlook
@@ -262,7 +262,7 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
     )
     from experiments.launching import EarlyResults
     from experiments.plan import plan
-    from report.wording import seeds
+    from report.words import seeds
 
     looks = settled_looks(study, context.root, args.max_seeds)
     counts = counts_of(study, looks)
@@ -306,7 +306,7 @@ def _grow_study(args: argparse.Namespace, study: StudySpec, context: RunContext)
 
 def _on_look(step: Step) -> str:
     """What a look has decided, and who gets more seeds."""
-    from report.wording import enumeration, seeds
+    from report.words import enumeration, seeds
 
     growth, sizes = step.growth, step.design.sizes
     text = f"{step.environment}, look {growth.n_looks} of {len(sizes)}: "
@@ -436,7 +436,7 @@ def _judge(
     with doing(console, "judging the agents") as activity:
         from experiments.analysis import analyse, with_advice
         from experiments.growing import take_looks
-        from report.terminal_tables import print_analysis, print_episodes_table
+        from report.terminal import print_analysis, print_episodes_table
 
         analysis = analyse(results, activity.at, take_looks(results) if looks is None else looks)
         activity.now("looking at runs that failed")
@@ -445,8 +445,8 @@ def _judge(
     width = results.study.episodes_table
     with doing(console, "writing the tables") as activity:
         from experiments.study import write_study
-        from report.result_files import write_tables, write_verdicts
-        from report.series.episode_blocks import episodes_table
+        from report.documents import write_tables, write_verdicts
+        from report.series import episodes_table
 
         files = [*write_tables(results), *write_verdicts(analysis, context.command)]
         write_study(results.root, results.study)
@@ -474,9 +474,9 @@ def _draw(
 ) -> list[Path]:
     """Figures and the page; the files."""
     activity.now("working out the curves")
-    from report.figures.figure_files import write_figures
+    from report.figures import write_figures
     from report.page import write_report
-    from report.series.study_series import study_series
+    from report.series import study_series
 
     page = analysis.results.root / "report.html"
     series = study_series(analysis, activity.at)
@@ -485,7 +485,7 @@ def _draw(
     learning: list[LearningPage] = []
     if analysis.study.learning_pages:
         activity.now("watching")
-        from report.learning_page.first_runs import write_first_pages
+        from report.page.learning import write_first_pages
 
         learning = write_first_pages(analysis, context.n_workers, activity.at)
     activity.now("writing the page")
@@ -700,7 +700,7 @@ def _conf_files(study: StudySpec, words: Sequence[str]) -> dict[str, Path]:
 def _with_settings(study: StudySpec, args: argparse.Namespace) -> StudySpec:
     """The study with the settings of the command line in every agent."""
     from experiments.study import AS_IT_COMES, layered
-    from pipeline.agent_checks import with_engine
+    from pipeline.agent_settings import with_engine
     from pipeline.settings.values import parse_assignments
 
     files = _conf_files(study, args.conf_file)
@@ -755,7 +755,7 @@ def _compare_on_log(args: argparse.Namespace) -> int:
         policies = [load_policy(policy, modules) for policy in found]
         activity.now("judging the policies")
         compared = compare_policies(data, policies)
-    from report.off_policy_table import print_comparison
+    from report.terminal import print_comparison
 
     print_comparison(console, compared)
     return 0

@@ -35,11 +35,10 @@ if TYPE_CHECKING:
     from rich.table import Table
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from pipeline.action_figures import ActionFigures
     from pipeline.models.choose import ChosenModel, ModelRequest
     from pipeline.models.find import Which
-    from pipeline.playing import FrameTaker, RenderMode, Repetition
-    from pipeline.signs_of_life import Activity
+    from pipeline.playing import ActionFigures, FrameTaker, RenderMode, Repetition
+    from pipeline.progress import Activity
     from pipeline.train_spec import TrainSpec
 
 # --- flags ----------------------------------------------------------------------------------------
@@ -129,8 +128,8 @@ def main() -> int:
     """Parse the arguments and play; the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
-        from pipeline.filming import check_film_path
-        from pipeline.packing.pack_files import unpacked
+        from pipeline.packs import unpacked
+        from pipeline.playing import check_film_path
 
         check_playing(args)
         if args.record is not None:
@@ -195,18 +194,13 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest) -> None:
         flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
         raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error
     from commands.terminal import TextConsole, say
-    from pipeline.signs_of_life import doing
+    from pipeline.progress import doing
 
     console = TextConsole(highlight=False, quiet=args.verbose < 1)
     place = args.model if wanted.zipped_in is not None else found.path
     say(console, f"{found.spec.algo} on {found.spec.env_id}: {place}")
     with doing(console, "loading the libraries"), loading_libraries():
         # All that plays, so that nothing is loaded in the middle of it.
-        import pipeline.action_figures
-        import pipeline.evaluation.exact
-        import pipeline.evaluation.policies
-        import pipeline.evaluation.sampled
-        import pipeline.models.load  # noqa: F401
 
         chosen = with_statistics(found, wanted.statistics)
     if args.record is not None or args.reward_log:
@@ -237,10 +231,9 @@ def play(console: Console, chosen: ChosenModel, args: argparse.Namespace) -> Non
 
     from envs.layout import action_names
     from pipeline.environments import lacking_packages_told
-    from pipeline.filming import write_film
     from pipeline.models.load import load_to_play, with_normalised_rewards
-    from pipeline.playing import FrameTaker, Repetition, play_episodes, playing_env
-    from pipeline.signs_of_life import Activity, can_move, doing
+    from pipeline.playing import FrameTaker, Repetition, play_episodes, playing_env, write_film
+    from pipeline.progress import Activity, can_move, doing
 
     if args.num_threads > 0:
         th.set_num_threads(args.num_threads)
@@ -314,7 +307,7 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
     from commands.terminal import describe, print_refusal
     from pipeline.evaluation.exact import exact_evaluator, model_refusal
     from pipeline.evaluation.policies import why_not_exact
-    from pipeline.signs_of_life import doing
+    from pipeline.progress import doing
 
     with doing(console, "working out what the policy is worth"):
         evaluator = exact_evaluator(spec)
@@ -437,7 +430,7 @@ class LiveShow:
         """Draw where the agent is, and what it is about to do."""
         import numpy as np
 
-        from pipeline.action_figures import action_figures
+        from pipeline.playing import action_figures
 
         frames = self.taker.take(done=False)
         if frames and self._repetition.goes_on(frames[-1]):

@@ -46,7 +46,7 @@ def pack() -> int:
     add("--check", action="store_true", help="compare every file of a pack with its digest instead")
     args = parser.parse_args()
     from commands.terminal import TextConsole, say
-    from pipeline.packing.pack_files import check_pack
+    from pipeline.packs import check_pack
     from pipeline.stopping import stops_noticed
 
     console, path = TextConsole(highlight=False), Path(args.run)
@@ -66,11 +66,10 @@ def pack() -> int:
 
 def _pack(path: Path, target: Path | None, tell: Callable[[str], None]) -> None:
     """Pack a run or a study, and say how it is played on any machine."""
+    from pipeline.model_card import to_type
     from pipeline.models.find import run_in
-    from pipeline.module_records import COPIES
-    from pipeline.packing.model_card import to_type
-    from pipeline.packing.pack_files import default_target, pack
-    from pipeline.packing.study_packs import is_study, pack_study
+    from pipeline.packs import default_target, is_study, pack, pack_study
+    from pipeline.user_modules import COPIES
 
     if is_study(path):
         target = target or Path(f"{path.resolve().name}.zip")

@@ -16,7 +16,7 @@ from rich.segment import Segment
 from rich.text import Text
 
 from pipeline.errors import visible
-from pipeline.signs_of_life import (
+from pipeline.progress import (
     SECONDS_BETWEEN_LINES,
     SECONDS_BETWEEN_LOOKS,
     Heartbeat,
@@ -246,8 +246,8 @@ def training_line(
     """The line of one training; empty where there is nothing to say of its engine."""
     from stable_baselines3.common.callbacks import CallbackList
 
-    from agents.common.callback_horizons import members, unknown_callbacks
-    from agents.networks.engine_costs import machine_pace
+    from agents.common.callbacks import members, unknown_callbacks
+    from agents.networks.engine_setting import machine_pace
 
     # Callbacks of the user's own that must be asked after each step.
     told = [each for each in members(callback) if not isinstance(each, CallbackList)]
@@ -289,7 +289,7 @@ def _takes(plan: EnginePlan, outlook: EngineOutlook, pace: float, unit: str) -> 
     work = outlook.work
     if work is None:
         return ""
-    from agents.networks.engine_costs import compiling_seconds
+    from agents.networks.engine_setting import compiling_seconds
 
     text = f", {about(seconds_of(plan, outlook) * pace)} {unit}".rstrip()
     compiling = compiling_seconds(work) * pace if plan.is_compiled else 0.0
@@ -310,7 +310,7 @@ def study_line(planned: Sequence[tuple[str, EngineOutlook, int]]) -> str:
 
     Planned are labels of agents, the outlooks of their runs, and how many runs each stands for.
     """
-    from agents.networks.engine_costs import machine_pace
+    from agents.networks.engine_setting import machine_pace
 
     pace, parts = machine_pace() if planned else 1.0, []
     for is_compiled in (False, True):
@@ -343,7 +343,7 @@ def search_line(algo: str, search: EngineOutlook | None, retest: EngineOutlook |
     """The line of a search and its re-test, of one run each; empty where both are the same."""
     if search is None or retest is None:
         return ""
-    from agents.networks.engine_costs import machine_pace
+    from agents.networks.engine_setting import machine_pace
 
     pace = machine_pace()
     searched = _words(search.plan, search, pace, "of processor time a run")

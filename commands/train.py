@@ -39,8 +39,8 @@ from pipeline.stopping import StopRequest, stops_noticed
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from pipeline.callbacks import PullSummary
     from pipeline.preparation import Training
-    from pipeline.pull_recording import PullSummary
     from pipeline.runs import Run
     from pipeline.train_spec import TrainSpec
     from pipeline.training import Outcome
@@ -187,7 +187,7 @@ def main() -> int:
 
 def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     from commands.terminal import TextConsole, print_refusal, say
-    from pipeline.signs_of_life import doing
+    from pipeline.progress import doing
 
     go_on_unread()
     console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
@@ -252,8 +252,8 @@ def _resumed(args: argparse.Namespace) -> tuple[Run, TrainSpec]:
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
     """Carry out the rest of a run, from its newest state on; the exit code."""
     from commands.terminal import TextConsole, say
+    from pipeline.progress import doing
     from pipeline.runs import at_work_on, check_left, remove_states
-    from pipeline.signs_of_life import doing
     from pipeline.unfinished_runs import go_on, is_finished, tell_changes
 
     spec = replace(spec, verbose=args.verbose, progress=args.progress)
@@ -301,8 +301,7 @@ def train_spec(args: argparse.Namespace) -> TrainSpec:
     """The spec that the arguments ask for."""
     from secrets import randbelow
 
-    from pipeline.agent_checks import check_algorithm, check_fit
-    from pipeline.auto_settings import resolved_spec
+    from pipeline.agent_settings import check_algorithm, check_fit, resolved_spec
     from pipeline.environments import check_env_id, with_logs_located, with_maps_read
     from pipeline.train_spec import TrainSpec
     from pipeline.user_modules import import_typed
@@ -366,8 +365,7 @@ def _page_path(args: argparse.Namespace) -> Path | None:
 
 def _raw_hyperparams(args: argparse.Namespace) -> tuple[dict[str, Any], dict[str, str] | None]:
     """The file's entry for the environment, changed as the command line says; and what gave way."""
-    from pipeline.agent_checks import with_engine
-    from pipeline.auto_settings import training_follows
+    from pipeline.agent_settings import training_follows, with_engine
     from pipeline.settings.hyperparams import NoEntryError, override, read_hyperparams
     from pipeline.settings.values import parse_assignments
 
@@ -514,7 +512,7 @@ def print_outcome(console: Console, spec: TrainSpec, outcome: Outcome) -> None:
 
 def describe_pulls(pulls: PullSummary) -> str:
     """The pulls of a training in a few words."""
-    from pipeline.pull_recording import LAST_PULLS
+    from pipeline.callbacks import LAST_PULLS
 
     if pulls.regret is not None:
         last = min(LAST_PULLS, pulls.n_pulls)
@@ -532,8 +530,8 @@ def describe_pulls(pulls: PullSummary) -> str:
 
 def watch_command(spec: TrainSpec, run: Run) -> str:
     """The command that plays the agent of a run, as it can be typed where the run was begun."""
-    from pipeline.module_records import as_flag
     from pipeline.runs import numbered_runs
+    from pipeline.user_modules import as_flag
 
     command: list[str] = []
     numbers = [number for number, _ in numbered_runs(run.path.parent, run.env_name)]
@@ -583,8 +581,8 @@ def _write_watched(console: Console, training: Training) -> None:
     if training.watch is None or path is None or not training.watch.has_begun:
         return
     from commands.terminal import say
-    from pipeline.signs_of_life import doing
-    from report.learning_page import write_learning_page
+    from pipeline.progress import doing
+    from report.page.learning import write_learning_page
 
     with doing(console, "writing the page that plays the training"):
         write_learning_page(training.spec, training.watch, path)
@@ -600,9 +598,9 @@ def print_lists() -> None:
     from rich.table import Table
 
     from agents import ALGORITHMS, fitting_algorithms
-    from agents.algorithm_entries import is_bandit
+    from agents.registry import is_bandit
     from commands.terminal import table_console
-    from envs.action_masks import has_masks
+    from envs.wrappers import has_masks
     from pipeline.environments import make_env
     from pipeline.settings.hyperparams import entry_names
 

@@ -34,7 +34,7 @@ from commands.compare import RunContext, conclude, do_missing, give_way, read, r
 from commands.terminal import LiveProgress, say, search_line, table_console
 from pipeline.errors import UserError, unknown
 from pipeline.failures import exits_as_mistakes
-from pipeline.signs_of_life import doing, duration
+from pipeline.progress import doing, duration
 from pipeline.stopping import stops_noticed
 from tuning.pruning import PRUNERS
 from tuning.tuning_spec import AUTO, FIGURES, OBJECTIVES, SAMPLERS, SHIPPED, TuningSpec
@@ -309,7 +309,7 @@ def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None
     files = [opened.root / RECORD]
     if context.with_page:
         with doing(context.console, "writing the page"):
-            from report.tuning_page import write_tuning_page
+            from report.page.tuning import write_tuning_page
 
             page, retest = opened.root / "report.html", f"{FOLDER}/report.html"
             write_tuning_page(record, page, retest if (opened.root / retest).exists() else "")
@@ -324,7 +324,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     """The tuning that the arguments mean."""
     from agents import ALGORITHMS
     from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, file_name, layered
-    from pipeline.agent_checks import with_engine
+    from pipeline.agent_settings import with_engine
     from pipeline.environments import check_env_id
     from pipeline.runs import environment_name
     from pipeline.settings.values import parse_assignments

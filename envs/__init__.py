@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 from gymnasium.envs.registration import WrapperSpec
 
-from envs.grid_map import MAX_STATES
+from envs.grid import MAX_STATES
 
 __all__ = ["ModelCheck", "check_transition_model"]  # loaded when asked for
 
@@ -17,7 +17,7 @@ BANDITS = {
     "BernoulliBandit-v0": "envs.bandits.clicks:BernoulliBandit",
     "GaussianBandit-v0": "envs.bandits.gaussian:GaussianBandit",
     "LinearBandit-v0": "envs.bandits.linear:LinearBandit",
-    "ReplayBandit-v0": "envs.bandits.replay:ReplayBandit",
+    "ReplayBandit-v0": "envs.bandits.logged:ReplayBandit",
     "SegmentBandit-v0": "envs.bandits.clicks:SegmentBandit",
 }
 DEFAULT_PULLS = 1000

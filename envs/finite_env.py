@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from gymnasium import spaces
 
-from envs.shown_env import ShownEnv
+from envs.drawing import ShownEnv
 from mdp.array_types import Bools, Floats
 
 if TYPE_CHECKING:

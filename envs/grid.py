@@ -1,27 +1,466 @@
-"""What every grid world shares: its arguments, stepping, the exact model, and rendering."""
+"""Worlds on a map: maps, moves, text, stepping and the exact model."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import sys
+from abc import abstractmethod
+from array import array
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
 from envs.argument_checks import check_flag, check_number
-from envs.finite_env import Outcome, as_dictionaries, summing_to_one
-from envs.grid_dynamics import MOVES, POSSIBLE_MOVES, GridDynamics, Tile
-from envs.grid_map import GOAL, Description, GridMap
-from envs.rendering import GridRenderer
-from envs.scene import Scene
-from envs.shown_env import ShownEnv
-from envs.text_rendering import render_text
+from envs.drawing import GridRenderer, Scene, ShownEnv
+from envs.finite_env import FiniteEnv, Outcome, as_dictionaries, summing_to_one
 from mdp.array_types import AnyInts, Bools, Floats, Ints
+from safe_files.files import UnsafeFileError, read_file
 
 if TYPE_CHECKING:
     from mdp.transition_model import TransitionModel
+
+
+# Maps of grid worlds: reading, checking, and how far each cell is from the goal.
+
+START = "S"
+GOAL = "G"
+# 4096 x 4096 cells: a Q-table of four actions then fills half a gigabyte.
+MAX_STATES = 2**24
+# A letter and maybe a line break for each cell.
+MAX_MAP_BYTES = 3 * MAX_STATES
+UNREACHED = -1
+
+Description = Sequence[str] | str | os.PathLike[str]
+
+
+@dataclass(frozen=True, eq=False)
+class GridMap:
+    """A rectangular map of letters; row 0 is at the top, cells are numbered row by row.
+
+    Attributes:
+        rows: the map as text.
+        codes: the letters' ASCII codes, one per cell.
+        start: the cell of the only ``S``.
+        distances: moves from each cell to the nearest goal, -1 where there is no way; int32 of
+            shape (cells,).
+    """
+
+    rows: tuple[str, ...]
+    codes: bytes
+    start: int
+    distances: NDArray[np.int32]
+
+    @classmethod
+    def read(cls, desc: Description, known: Collection[str], passable: Collection[str]) -> GridMap:
+        """Read and check a map.
+
+        Args:
+            desc: the rows; or the path to a text file that holds them; or that text itself,
+                which has at least one line break.
+            known: the letters that may occur.
+            passable: those of them that the way to the goal may lead over, ``S`` among them.
+
+        Raises:
+            ValueError: if the file cannot be read, rows differ in length, a letter is unknown,
+                there is not exactly one start or no goal, or no way between them. Where there
+                is a place to name, the message names row and column, counted from one.
+        """
+        rows, source = _read_rows(desc)
+        _check_shape(rows, source)
+        _check_letters(rows, source, known)
+        codes = "".join(rows).encode("ascii")
+        n_columns = len(rows[0])
+        start = _only_start(codes, n_columns, source)
+        goals = [cell for cell, code in enumerate(codes) if code == ord(GOAL)]
+        if not goals:
+            raise ValueError(f"{source} has no goal: mark it with the letter {GOAL}")
+        free = np.isin(np.frombuffer(codes, np.uint8), [ord(letter) for letter in passable])
+        distances = distances_to(goals, free.reshape(len(rows), n_columns)).ravel()
+        if distances[start] == UNREACHED:
+            raise ValueError(
+                f"{source}: the goal at {_place(goals[0], n_columns)} cannot be reached from the "
+                f"start at {_place(start, n_columns)}"
+            )
+        return cls(rows, codes, start, distances)
+
+    @property
+    def n_rows(self) -> int:
+        """Number of rows."""
+        return len(self.rows)
+
+    @property
+    def n_columns(self) -> int:
+        """Number of columns."""
+        return len(self.rows[0])
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return len(self.codes)
+
+
+def distances_to(targets: Iterable[int], free: Bools) -> NDArray[np.int32]:
+    """Moves from each cell to the nearest target over free cells, by breadth-first search.
+
+    Args:
+        targets: cells to reach, numbered row by row; they need not be free.
+        free: where the way may lead, bool of shape (rows, columns).
+
+    Returns:
+        int32 of the same shape, -1 where no way leads to a target.
+    """
+    n_rows, n_columns = free.shape
+    # A border all around saves the search from asking whether it left the map. Plain Python on
+    # bytes takes a third of a second for a million cells, without a library to import.
+    width = n_columns + 2
+    unvisited = bytearray(np.pad(free, 1).tobytes())
+    distances = array("i", [UNREACHED]) * len(unvisited)
+    frontier = [(cell // n_columns + 1) * width + cell % n_columns + 1 for cell in targets]
+    n_moves = 0
+    while frontier:
+        reached = []
+        for cell in frontier:
+            unvisited[cell] = False
+            distances[cell] = n_moves
+        for cell in frontier:
+            for beside in (cell - width, cell + width, cell - 1, cell + 1):
+                if unvisited[beside]:
+                    unvisited[beside] = False
+                    reached.append(beside)
+        frontier = reached
+        n_moves += 1
+    padded = np.frombuffer(distances, np.int32).reshape(n_rows + 2, width)
+    return padded[1:-1, 1:-1].copy()
+
+
+def read_rows(desc: Description) -> tuple[str, ...]:
+    """The rows of a map, not checked yet; see `GridMap.read`.
+
+    Raises:
+        ValueError: if there is no such file, or it is no text.
+    """
+    return _read_rows(desc)[0]
+
+
+def _read_rows(desc: object) -> tuple[tuple[str, ...], str]:
+    """The rows, and what to call the map in an error message."""
+    if isinstance(desc, str) and "\n" in desc:
+        return tuple(desc.strip("\r\n").splitlines()), "the map"
+    if isinstance(desc, str | os.PathLike):
+        return tuple(_read_file(Path(desc)).strip("\r\n").splitlines()), f"the map {desc}"
+    if isinstance(desc, Sequence) and all(isinstance(row, str) for row in desc):
+        return tuple(desc), "the map"
+    raise ValueError(
+        f"desc must be a list of rows, such as ['S.', '#G'], or the path to a text file, not "
+        f"{desc!r}"
+    )
+
+
+def _read_file(path: Path) -> str:
+    try:
+        return read_file(path, MAX_MAP_BYTES).decode("utf-8-sig")
+    except OSError as error:
+        reason = str(error.strerror)
+    except UnsafeFileError as error:
+        raise ValueError(f"desc: {error}") from error
+    except UnicodeDecodeError:
+        reason = "it is not a text file in UTF-8"
+    raise ValueError(f"desc: cannot read the map file {path}: {reason}")
+
+
+def _check_shape(rows: tuple[str, ...], source: str) -> None:
+    if not rows or not rows[0]:
+        raise ValueError(f"{source} is empty")
+    n_columns = len(rows[0])
+    if len(rows) * n_columns > MAX_STATES:
+        raise ValueError(
+            f"{source} has {len(rows)} rows of {n_columns} cells, more than {MAX_STATES:,} cells"
+        )
+    for row, cells in enumerate(rows, 1):
+        if len(cells) != n_columns:
+            where = min(len(cells), n_columns)
+            raise ValueError(
+                f"{source}: row {row} has {len(cells)} cells and row 1 has {n_columns}: they "
+                f"differ from column {where + 1} on"
+            )
+
+
+def _check_letters(rows: tuple[str, ...], source: str, known: Collection[str]) -> None:
+    for row, cells in enumerate(rows, 1):
+        if not set(cells) <= set(known):
+            column = next(column for column, letter in enumerate(cells) if letter not in known)
+            raise ValueError(
+                f"{source}: unknown letter {cells[column]!r} at row {row}, column {column + 1}; "
+                f"known are {' '.join(known)}"
+            )
+
+
+def _only_start(codes: bytes, n_columns: int, source: str) -> int:
+    first = codes.find(ord(START))
+    if first < 0:
+        raise ValueError(f"{source} has no start: mark it with the letter {START}")
+    second = codes.find(ord(START), first + 1)
+    if second >= 0:
+        raise ValueError(
+            f"{source} has two starts, at {_place(first, n_columns)} and at "
+            f"{_place(second, n_columns)}; there must be one"
+        )
+    return first
+
+
+def _place(cell: int, n_columns: int) -> str:
+    row, column = divmod(cell, n_columns)
+    return f"row {row + 1}, column {column + 1}"
+
+
+# What happens on a grid when a robot moves: one rule, for a single step and for all at once.
+
+MOVE_NAMES = ("up", "down", "left", "right")
+MOVES = ((-1, 0), (1, 0), (0, -1), (0, 1))
+# For each action the way it is meant to go, then the two ways it may slip.
+POSSIBLE_MOVES = ((0, 2, 3), (1, 2, 3), (2, 0, 1), (3, 0, 1))
+
+
+@dataclass(frozen=True)
+class Tile:
+    """What a robot meets that tries to move onto a cell.
+
+    Attributes:
+        reward: what the move earns.
+        blocked: the robot stays where it was.
+        terminated: the episode ends.
+        bonus: what is added the first time in an episode, None where there is nothing to collect.
+    """
+
+    reward: float
+    blocked: bool = False
+    terminated: bool = False
+    bonus: float | None = None
+
+
+class Move(NamedTuple):
+    """The outcome of one move."""
+
+    next_state: int
+    reward: float
+    terminated: bool
+    bumped: bool
+
+
+class GridDynamics:
+    """The rules of a grid world: a map, and what each of its letters means.
+
+    A state is a cell plus the number of cells times a bit mask: bit i is set when the i-th
+    collectable cell, row by row, has been visited in this episode. Without collectable cells
+    the states are the cells. A state in which no move can be made, because the episode has ended
+    there or no robot can be there, leads to itself and terminates, as in Gymnasium's toy_text.
+
+    Args:
+        grid_map: the map.
+        tiles: what each letter of the map means.
+        edge: what a robot meets that tries to leave the map.
+        slip: probability that a move goes sideways, half of it to each side.
+
+    Raises:
+        ValueError: if there are more than 2**24 states.
+    """
+
+    def __init__(
+        self, grid_map: GridMap, tiles: Mapping[str, Tile], edge: Tile, slip: float
+    ) -> None:
+        self.n_rows, self.n_columns = grid_map.n_rows, grid_map.n_columns
+        self.n_cells = grid_map.n_cells
+        self.codes = grid_map.codes
+        self.tiles = {ord(letter): tile for letter, tile in tiles.items()}
+        self.edge = edge
+        collectable = {code for code, tile in self.tiles.items() if tile.bonus is not None}
+        cells = [cell for cell, code in enumerate(self.codes) if code in collectable]
+        # Shifted no further than needed: a map can hold a million such cells.
+        if self.n_cells << min(len(cells), 64) > MAX_STATES:
+            raise ValueError(
+                f"the map has {self.n_cells} cells, {len(cells)} of them to collect: these make "
+                f"{self.n_cells} * 2**{len(cells)} states, more than {MAX_STATES:,}"
+            )
+        self.collectable_bits = {cell: 1 << i for i, cell in enumerate(cells)}
+        self.n_states = self.n_cells << len(cells)
+        self.outcome_prob = (1.0,) if slip == 0 else (1 - slip, slip / 2, slip / 2)
+
+    def move(self, state: int, direction: int) -> Move:
+        """Try to move one cell in a direction."""
+        collected, cell = divmod(state, self.n_cells)
+        here = self.tiles[self.codes[cell]]
+        if here.blocked or here.terminated:
+            return Move(state, 0.0, terminated=True, bumped=False)
+        row, column = divmod(cell, self.n_columns)
+        row += MOVES[direction][0]
+        column += MOVES[direction][1]
+        if not (0 <= row < self.n_rows and 0 <= column < self.n_columns):
+            return Move(state, self.edge.reward, self.edge.terminated, bumped=True)
+        target = row * self.n_columns + column
+        tile = self.tiles[self.codes[target]]
+        if tile.blocked:
+            return Move(state, tile.reward, tile.terminated, bumped=True)
+        reward = tile.reward
+        if tile.bonus is not None and not collected & self.collectable_bits[target]:
+            reward += tile.bonus
+            collected |= self.collectable_bits[target]
+        return Move(target + self.n_cells * collected, reward, tile.terminated, bumped=False)
+
+    def transition_model(self, initial: Floats) -> TransitionModel:
+        """Every move of every state as arrays.
+
+        Args:
+            initial: probabilities of the starting states, shape (S,).
+
+        Returns:
+            A model with 4 actions and one outcome, or three where moves may slip: as meant, then
+            to the two sides. Equal outcomes stay apart.
+        """
+        from mdp.transition_model import TransitionModel
+
+        chosen = np.array(POSSIBLE_MOVES)[:, : len(self.outcome_prob)]
+        next_state, reward, terminated = self._all_moves()
+        return TransitionModel(
+            prob=np.broadcast_to(self.outcome_prob, (self.n_states, *chosen.shape)),
+            next_state=next_state[:, chosen],
+            reward=reward[:, chosen],
+            terminated=terminated[:, chosen],
+            initial=initial,
+        )
+
+    def action_mask(self, state: int) -> Bools:
+        """The moves that neither a wall nor the edge stops, bool of shape (4,), never none."""
+        free = [not self.move(state, direction).bumped for direction in range(len(MOVES))]
+        return np.array(free) | (not any(free))
+
+    def action_masks(self) -> Bools:
+        """`action_mask` of all states, bool of shape (S, 4)."""
+        codes = np.frombuffer(self.codes, np.uint8)
+        blocked = self._per_code("blocked", np.bool_)
+        entered, _ = self._entered()
+        free = ~blocked[entered]
+        free |= (blocked | self._per_code("terminated", np.bool_))[codes][:, None]
+        free |= ~free.any(axis=1, keepdims=True)
+        return np.tile(free, (self.n_states // self.n_cells, 1))
+
+    def _all_moves(self) -> tuple[Ints, Floats, Bools]:
+        """`move` for all states and directions: next states, rewards, ends; each (S, 4)."""
+        codes = np.frombuffer(self.codes, np.uint8)
+        entered, target = self._entered()
+        stays = self._per_code("blocked", np.bool_)[entered]
+        cells = np.arange(self.n_cells)[:, None]
+        destination = np.where(stays, cells, target)
+
+        bits = np.zeros(self.n_cells, np.int64)
+        bits[list(self.collectable_bits)] = list(self.collectable_bits.values())
+        found = np.where(stays, 0, bits[destination])
+        collected = np.arange(self.n_states // self.n_cells)[:, None, None]
+        bonus = np.where(found & ~collected, self._per_code("bonus", np.float64)[entered], 0.0)
+
+        next_state = destination + self.n_cells * (collected | found)
+        reward = self._per_code("reward", np.float64)[entered] + bonus
+        terminated = np.broadcast_to(
+            self._per_code("terminated", np.bool_)[entered], next_state.shape
+        ).copy()
+
+        over = (self._per_code("blocked", np.bool_) | self._per_code("terminated", np.bool_))[codes]
+        states = np.arange(self.n_states).reshape(-1, self.n_cells)
+        next_state[:, over] = states[:, over, None]
+        reward[:, over] = 0.0
+        terminated[:, over] = True
+        shape = (self.n_states, len(MOVES))
+        return next_state.reshape(shape), reward.reshape(shape), terminated.reshape(shape)
+
+    def _entered(self) -> tuple[NDArray[np.uint8], Ints]:
+        """The code of what each move meets, and the cell it aims at; each (cells, 4)."""
+        codes = np.frombuffer(self.codes, np.uint8)
+        target, inside = self._targets()
+        # The edge takes the place of a letter: code 0, which no map holds.
+        return np.where(inside, codes[target], 0).astype(np.uint8), target
+
+    def _targets(self) -> tuple[Ints, Bools]:
+        """The cell each move aims at, and whether it lies on the map; each (cells, 4)."""
+        rows, columns = np.divmod(np.arange(self.n_cells)[:, None], self.n_columns)
+        steps = np.array(MOVES)
+        rows, columns = rows + steps[:, 0], columns + steps[:, 1]
+        inside = (rows >= 0) & (rows < self.n_rows) & (columns >= 0) & (columns < self.n_columns)
+        return np.where(inside, rows * self.n_columns + columns, 0), inside
+
+    def _per_code(self, name: str, dtype: type[Any]) -> NDArray[Any]:
+        """An attribute of the tiles as a table of ASCII codes, the edge's at 0, None as zero."""
+        table = np.zeros(128, dtype)
+        for code, tile in {0: self.edge, **self.tiles}.items():
+            table[code] = getattr(tile, name) or 0
+        return table
+
+
+# Grid worlds as text, in colour where the terminal has it.
+
+ROBOT = "R"
+TRAIL = "*"
+# What a terminal of common size shows; of larger maps the part around the robot is drawn.
+MAX_ROWS = 40
+MAX_COLUMNS = 100
+RESET = "\x1b[0m"
+# Select Graphic Rendition of ECMA-48: 1 bold, 2 faint, 3x colours, 44 on blue.
+STYLES = {
+    ROBOT: "\x1b[1;37;44m",
+    TRAIL: "\x1b[34m",
+    "#": "\x1b[2m",
+    "S": "\x1b[36m",
+    "G": "\x1b[1;32m",
+    "M": "\x1b[1;31m",
+    "P": "\x1b[1;33m",
+}
+
+
+def render_text(scene: Scene) -> str:
+    """The latest action on a line, then the map: ``R`` the robot, ``*`` where it has been."""
+    robot_row, robot_column = scene.place(scene.robot)
+    rows = _window(robot_row, len(scene.rows), MAX_ROWS)
+    columns = _window(robot_column, len(scene.rows[0]), MAX_COLUMNS)
+    trail = {scene.place(cell) for step in scene.steps for cell in step}
+    marks = {(row, column): TRAIL for row, column in trail if scene.rows[row][column] != START}
+    marks[robot_row, robot_column] = ROBOT
+    style = _coloured if terminal_has_colour() else str
+    lines = [_title(scene, rows, columns)]
+    for row in rows:
+        letters = (marks.get((row, column), scene.rows[row][column]) for column in columns)
+        lines.append("".join(map(style, letters)))
+    return "\n".join(lines) + "\n"
+
+
+def terminal_has_colour() -> bool:
+    """Whether standard output is a terminal that shows colours and the user has not opted out."""
+    opted_out = bool(os.environ.get("NO_COLOR")) or os.environ.get("TERM") == "dumb"
+    return sys.stdout.isatty() and not opted_out
+
+
+def _title(scene: Scene, rows: range, columns: range) -> str:
+    move = "start" if scene.last_action is None else MOVE_NAMES[scene.last_action]
+    title = f"({move if scene.title is None else scene.title})"
+    if len(rows) < len(scene.rows) or len(columns) < len(scene.rows[0]):
+        title += f" rows {rows[0]}-{rows[-1]}, columns {columns[0]}-{columns[-1]}"
+    return title
+
+
+def _window(centre: int, length: int, most: int) -> range:
+    """At most so many indices around one of them."""
+    first = max(0, min(centre - most // 2, length - most))
+    return range(first, min(first + most, length))
+
+
+def _coloured(letter: str) -> str:
+    return f"{STYLES[letter]}{letter}{RESET}" if letter in STYLES else letter
+
+
+# What every grid world shares: its arguments, stepping, the exact model, and rendering.
 
 Observation = int | NDArray[np.float32]
 
@@ -214,3 +653,51 @@ class GridWorld(ShownEnv):
 def _equal(n: int) -> Floats:
     """Equal probabilities."""
     return summing_to_one(np.full(n, 1 / n))
+
+
+# Finite environments whose states have places on a map, for looking at.
+
+# Chains that are longer are drawn in several rows, to be read as text is.
+LONGEST_ROW = 50
+
+
+class MapEnv(FiniteEnv):
+    """One whose states are shown on a map; its letters are those of `envs.drawing`.
+
+    Attributes:
+        rows: the map.
+        action_names: what its actions are called.
+    """
+
+    rows: tuple[str, ...]
+    action_names: ClassVar[tuple[str, ...]]
+
+    def cell_of(self, state: int) -> int:
+        """Where a state lies, cells counted row by row: by default states are cells."""
+        return state
+
+    def _text(self) -> str:
+        return render_text(self._picture())
+
+    def _picture(self) -> Scene:
+        name = "start" if self.last_action is None else self.action_names[self.last_action]
+        return Scene(self.rows, self.cell_of(self.s), (), (), None, title=name)
+
+    def _make_renderer(self, fps: int, title: str) -> GridRenderer:
+        return GridRenderer(self.rows, fps, title)
+
+
+class ChainEnv(MapEnv):
+    """One whose states lie side by side."""
+
+    @abstractmethod
+    def letters(self) -> str:
+        """The letter of each state, in order."""
+
+    @property
+    def rows(self) -> tuple[str, ...]:  # type: ignore[override]
+        """The chain, in rows of equal length."""
+        letters = self.letters()
+        length = min(len(letters), LONGEST_ROW)
+        starts = range(0, len(letters), length)
+        return tuple(letters[start : start + length].ljust(length, "#") for start in starts)

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from envs.checking import ModelCheck, checked
 from envs.finite_env import MaskedFiniteEnv
-from envs.grid import GridWorld
-from envs.grid_map import GOAL
+from envs.grid import GOAL, GridWorld
 from envs.model_claims import Claim, claim_of, is_trusted
 from envs.wrappers import (
     ActionMasks,
@@ -173,7 +172,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
     `IdleActionMasks`, under the wrappers that `transition_model` knows.
 
     Returns:
-        What `envs.action_masks.action_masks` says in each state, or None where that is not known.
+        What `envs.wrappers.action_masks` says in each state, or None where that is not known.
     """
     base, wrappers = _layers(env)
     if not all(_folds(wrapper) for wrapper in wrappers):

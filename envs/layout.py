@@ -15,8 +15,7 @@ import numpy as np
 from gymnasium.envs.toy_text.cliffwalking import CliffWalkingEnv
 from gymnasium.envs.toy_text.frozen_lake import FrozenLakeEnv
 
-from envs.grid import GridWorld
-from envs.grid_dynamics import MOVES, Tile
+from envs.grid import MOVES, GridWorld, Tile
 from envs.textbook.windy_gridworld import WindyGridworldEnv
 from mdp.array_types import Ints
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from envs.argument_checks import check_number
-from envs.grid import GridWorld
-from envs.grid_dynamics import Tile
-from envs.grid_map import Description
+from envs.grid import Description, GridWorld, Tile
 
 DEFAULT_MAP = (
     "S..M..",

@@ -33,7 +33,7 @@ from pipeline.runs import (
 from pipeline.train_spec import TrainSpec
 
 if TYPE_CHECKING:
-    from agents.bandits.batch_result import BatchResult
+    from agents.bandits.runs import BatchResult
 
 QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 FIRST_PULLS = 100  # kept one by one; of later ones fewer and fewer, `MAX_POINTS` in all
@@ -416,9 +416,8 @@ def do_batch(spec: TrainSpec, n_runs: int, run: Run, command: str) -> None:
 
 def _run(spec: TrainSpec, n_runs: int) -> tuple[BatchResult, str]:
     # Imported where runs are done: it takes seconds, and whoever reads results needs nothing of it.
-    from agents.bandits.batch import run_batch
-    from agents.bandits.one_by_one import run_one_by_one
-    from agents.compiled.compile_envs import NotCompilable
+    from agents.bandits.runs import run_batch, run_one_by_one
+    from agents.compiled.worlds import NotCompilable
     from pipeline.preparation import algorithm_kwargs
 
     arguments: tuple[Any, ...] = (

@@ -21,8 +21,7 @@ from experiments.study import (
     file_name,
     layered,
 )
-from pipeline.agent_checks import check_algorithm, check_fit
-from pipeline.auto_settings import resolved_spec, training_follows
+from pipeline.agent_settings import check_algorithm, check_fit, resolved_spec, training_follows
 from pipeline.digests import DamagedFileError
 from pipeline.environments import check_env_id, make_single_env, usual_kwargs, with_maps_read
 from pipeline.errors import UserError
@@ -324,8 +323,8 @@ def _is_batch(spec: TrainSpec) -> bool:
 
 def _is_compiled_bandit(algo: str) -> bool:
     """Whether an agent of the user's is of our bandit agents' kind."""
-    from agents.bandits.linear_bandits import LinearBanditAgent
-    from agents.bandits.table_bandit import TableBandit
+    from agents.bandits.linear import LinearBanditAgent
+    from agents.bandits.tables import TableBandit
 
     return issubclass(agent_class(algo), TableBandit | LinearBanditAgent)
 

@@ -1,23 +1,53 @@
-"""Callbacks beside evaluation: checkpoints, and exploration that decays by the update.
-
-A hyperparameter file may name `EpisodeCheckpoint` and `ExponentialExploration` under ``callback``.
-"""
+"""Callbacks of a training: evaluations, checkpoints, pulls, and what settings name."""
 
 from __future__ import annotations
 
+import math
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import asdict, dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import ConstantSchedule
+from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from agents.common.callback_horizons import BlockCallback, Horizon
+from agents.bandits.runs import PullLog
+from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon, calls_until_multiple
+from machine_code.work_time import WorkTime
+from pipeline.errors import UserError
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
+from pipeline.evaluation.value_maps import ValueMapRecorder
+from pipeline.files import replacing
+from pipeline.finite_numbers import (
+    NotFiniteError,
+    check_model,
+    check_numbers,
+    check_rows,
+    is_finite,
+)
 from pipeline.models.find import replay_buffer_path, statistics_path
 from pipeline.models.load import save_model, save_normalization, save_replay_buffer
+from pipeline.progress import ProgressDisplay
+from pipeline.runs import PULLS_FILE, Run
+from pipeline.settings import components
 from pipeline.stopping import current
+from pipeline.train_spec import TrainSpec
+
+# Callbacks beside evaluation: checkpoints, and exploration that decays by the update.
+#
+# A hyperparameter file may name `EpisodeCheckpoint` and `ExponentialExploration` under
+# ``callback``.
 
 
 class Checkpoint(BlockCallback):
@@ -148,3 +178,411 @@ class ExponentialExploration(BaseCallback):
 
     def _on_step(self) -> bool:
         return True
+
+
+# A callback that ends a training at the first number that is none.
+
+# Under these names the library's agents log what they minimise. Other entries may be nan, such as
+# the variance that is explained of nothing.
+LOSSES = (
+    "train/loss",
+    "train/actor_loss",
+    "train/critic_loss",
+    "train/ent_coef_loss",
+    "train/value_loss",
+)
+
+_NO_EPISODE: Mapping[str, float] = {"r": 0.0}
+
+
+class NumberWatch(BlockCallback):
+    """Looks at what each step brings: observations, rewards, actions, returns, and losses.
+
+    It comes before all other callbacks, so that nothing is kept of such a step. The compiled loop
+    shows it the last step of each block; the rewards that it trains on are those of a model, which
+    are finite.
+    """
+
+    takes_blocks = True
+
+    def update_locals(self, locals_: dict[str, Any]) -> None:
+        """Take what the training loop shows, without a copy: this is called at each step."""
+        self.locals = locals_
+
+    def _on_training_start(self) -> None:
+        when = f"at step {self.model.num_timesteps:,}"
+        if self.model._last_obs is not None:
+            check_rows(self.model._last_obs, "observation", when)
+
+    def _on_rollout_start(self) -> None:
+        log = self.model.logger.name_to_value
+        for name in LOSSES:
+            if name in log and not isfinite(log[name]):
+                raise NotFiniteError(f"{name} at step {self.model.num_timesteps:,}", log[name])
+
+    def _on_step(self) -> bool:
+        seen = self.locals
+        # Algorithms that play whole episodes, as ARS does, show another function's names.
+        new_obs = seen.get("new_obs", seen.get("new_observations"))
+        rewards, actions = seen.get("rewards"), seen.get("actions")
+        if not (is_finite(rewards) and is_finite(new_obs) and is_finite(actions)):
+            when = f"at step {self.num_timesteps:,}"
+            check_rows(rewards, "reward", when)
+            check_rows(new_obs, "observation", when)
+            check_rows(actions, "action", when)
+        dones = seen.get("dones")
+        if dones is not None and True in (ended := dones.tolist()):
+            self._check_ends(ended, seen["infos"])
+        return True
+
+    def _check_ends(self, dones: list[bool], infos: Any) -> None:
+        """Look at what was seen before resets, and at the returns that Monitor wrote down."""
+        for i, info in enumerate(infos):
+            if not dones[i]:
+                continue
+            last, total = info.get("terminal_observation"), info.get("episode", _NO_EPISODE)["r"]
+            if not (is_finite(last) and isfinite(total)):
+                where = f"of an episode of environment {i} at step {self.num_timesteps:,}"
+                check_numbers(last, "last observation", where)
+                check_numbers(total, "return", where)
+
+
+# The pulls of a training on a bandit: a file of its run folder, and figures on them.
+
+LAST_PULLS = 100
+
+
+@dataclass(frozen=True)
+class PullSummary:
+    """Figures on the pulls of a training.
+
+    Attributes:
+        n_pulls: how many there were, over all environments.
+        n_matched: how many of them a log held the arm of; all where there is no log.
+        reward: mean reward of the pulls that matched; None where none did.
+        regret: sum over the pulls of the best expected reward less that of the arm; None where
+            nobody knows what arms are worth, as with a log.
+        optimal: share of a best arm among the last pulls, likewise.
+    """
+
+    n_pulls: int
+    n_matched: int
+    reward: float | None
+    regret: float | None
+    optimal: float | None
+
+    def as_data(self) -> dict[str, Any]:
+        """The figures as JSON."""
+        return asdict(self)
+
+
+def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
+    """Sum up arrays as `PullLog.arrays` gives them."""
+    regrets, matched = pulls["regrets"], pulls["matched"]
+    is_known = not bool(np.isnan(regrets).any())
+    return PullSummary(
+        n_pulls=int(regrets.size),
+        n_matched=int(matched.sum()),
+        reward=float(pulls["rewards"][matched].mean(dtype=np.float64)) if matched.any() else None,
+        regret=float(regrets.sum()) if is_known else None,
+        optimal=float(pulls["optimal"][:, -LAST_PULLS:].mean()) if is_known else None,
+    )
+
+
+class PullRecorder(PullLog):
+    """Writes ``pulls.npz`` at the end of training; see `PullLog.arrays` for what is in it.
+
+    Args:
+        folder: where to.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__()
+        self.folder = folder
+
+    def _on_training_end(self) -> None:
+        self.write()
+
+    def write(self) -> None:
+        """Write the pulls so far."""
+        with replacing(self.folder / PULLS_FILE) as file:
+            np.savez(file, allow_pickle=False, **self.arrays())
+
+
+def are_bandits(env: VecEnv) -> bool:
+    """Whether the environments have arms whose pulls can be recorded."""
+    return env.has_attr("n_arms")
+
+
+# Evaluations during training: when they are due, and what is kept of them.
+
+SECONDS_BETWEEN_WRITES = 1.0
+
+
+class EvaluationCallback(EvalCallback):
+    """`EvalCallback` with the evaluation handed to it, and files that are never half-written.
+
+    It writes ``evaluations.npz`` and ``best_model.zip`` with its statistics of VecNormalize, and
+    feeds the same callbacks and log entries as its parent.
+
+    Args:
+        run: where the files go.
+        eval_env: the environment that the evaluation uses; its VecNormalize follows training's.
+        evaluator: evaluates an agent.
+        eval_freq: calls of `VecEnv.step` between two evaluations; 0 for none but those asked for
+            by `evaluate_now`.
+        eval_episode_freq: episodes between two evaluations, instead; 0 for none.
+        callback_after_eval: told after every evaluation.
+        value_maps: keeps the agent's policy at every evaluation, where that can be drawn.
+        during: shows what goes on while an evaluation runs.
+
+    Attributes:
+        taken: the time that evaluations have taken.
+        n_episodes: episodes of each evaluation, 0 of those that are exact.
+        best_episodes: of the best one.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        eval_env: VecEnv,
+        evaluator: Callable[[BaseAlgorithm], Evaluation],
+        eval_freq: int,
+        eval_episode_freq: int = 0,
+        callback_after_eval: BaseCallback | None = None,
+        value_maps: ValueMapRecorder | None = None,
+        during: Callable[[str], AbstractContextManager[object]] = nullcontext,
+    ) -> None:
+        super().__init__(
+            eval_env, callback_after_eval=callback_after_eval, eval_freq=eval_freq, verbose=0
+        )
+        self.run = run
+        self.evaluator = evaluator
+        self.eval_episode_freq = eval_episode_freq
+        self.value_maps = value_maps
+        self.during = during
+        self.episodes_seen = 0
+        self.last_evaluation: Evaluation | None = None
+        self.best_timesteps = 0
+        self.best_episodes = 0
+        self.taken = WorkTime()
+        self.n_episodes: list[int] = []
+        self._is_written = True
+        self._written_at = -np.inf
+
+    def horizon(self) -> Horizon:
+        """When the next evaluation is due."""
+        return Horizon(
+            calls_until_multiple(self.n_calls, self.eval_freq),
+            calls_until_multiple(self.episodes_seen, self.eval_episode_freq),
+        )
+
+    def pass_over(self, n_calls: int, n_episodes: int) -> None:
+        """Take note of calls that were left out."""
+        self.n_calls += n_calls
+        self.episodes_seen += n_episodes
+
+    @property
+    def is_asked_for(self) -> bool:
+        """Whether there are to be evaluations during training."""
+        return self.eval_freq > 0 or self.eval_episode_freq > 0
+
+    def _init_callback(self) -> None:
+        """Training and evaluation environments may be of different kinds here."""
+
+    def _on_step(self) -> bool:
+        before = self.episodes_seen
+        self.episodes_seen += int(np.sum(self.locals["dones"]))
+        is_due = self.eval_freq > 0 and self.n_calls % self.eval_freq == 0
+        if self.eval_episode_freq > 0:
+            is_due |= (
+                self.episodes_seen // self.eval_episode_freq > before // self.eval_episode_freq
+            )
+        return self.evaluate_now() if is_due and self._can_afford() else True
+
+    def _can_afford(self) -> bool:
+        sampled = self.evaluator if isinstance(self.evaluator, SampledEvaluator) else None
+        return sampled is None or sampled.can_afford(self.model, self.episodes_seen)
+
+    def _on_training_end(self) -> None:
+        self.write()
+
+    @contextmanager
+    def timed(self) -> Iterator[None]:
+        """Count what is done within among the time that evaluation takes."""
+        begun = WorkTime.now()
+        try:
+            yield
+        finally:
+            self.taken += WorkTime.now() - begun
+
+    def evaluate_now(self) -> bool:
+        """Evaluate the agent as it is; False where a callback asks to stop the training.
+
+        Raises:
+            NotFiniteError: if the agent, or what it meets, is not finite.
+        """
+        check_model(self.model)
+        self.take_statistics()
+        with self.during("evaluating"), self.timed():
+            evaluation = self.evaluator(self.model)
+        self.last_evaluation = evaluation
+        self.last_mean_reward = evaluation.mean_return
+        self._append(evaluation)
+        if self.value_maps is not None:
+            self.value_maps.record(self.model, self.num_timesteps)
+        self._log(evaluation)
+        if evaluation.mean_return > self.best_mean_reward:
+            self.best_mean_reward = evaluation.mean_return
+            self.best_timesteps = self.num_timesteps
+            self.best_episodes = self.n_episodes[-1]
+            best = self.run.best_model_path
+            with current().held():
+                save_model(self.model, best)
+                save_normalization(self.model, statistics_path(best))
+        return self._on_event() if self.callback is not None else True
+
+    def take_statistics(self) -> None:
+        """Let evaluation normalise by the statistics that training has now."""
+        if self.model.get_vec_normalize_env() is not None:
+            sync_envs_normalization(self.training_env, self.eval_env)
+
+    def _append(self, evaluation: Evaluation) -> None:
+        self.evaluations_timesteps.append(self.num_timesteps)
+        self.evaluations_results.append(evaluation.returns.tolist())
+        self.evaluations_length.append(evaluation.lengths.tolist())
+        if evaluation.successes is not None:
+            self.evaluations_successes.append(evaluation.successes.tolist())
+        self.n_episodes.append(0 if evaluation.is_exact else len(evaluation.returns))
+        self._is_written = False
+        # To replace a file takes longer than an exact evaluation.
+        if not 0 <= time.monotonic() - self._written_at < SECONDS_BETWEEN_WRITES:
+            self.write()
+
+    def write(self) -> None:
+        """Write the evaluations, unless they are written already."""
+        if self._is_written:
+            return
+        arrays: dict[str, Any] = {
+            "timesteps": self.evaluations_timesteps,
+            "results": _table(self.evaluations_results),
+            "ep_lengths": _table(self.evaluations_length),
+        }
+        if self.evaluations_successes:
+            arrays["successes"] = _table(self.evaluations_successes)
+        if len(set(self.n_episodes)) > 1:
+            arrays["n_episodes"] = self.n_episodes
+        with replacing(self.run.evaluations_path) as file:
+            np.savez(file, **arrays)
+        self._is_written, self._written_at = True, time.monotonic()
+
+    def _log(self, evaluation: Evaluation) -> None:
+        self.logger.record("eval/mean_reward", evaluation.mean_return)
+        self.logger.record("eval/mean_ep_length", float(evaluation.lengths.mean()))
+        if evaluation.success_rate is not None:
+            self.logger.record("eval/success_rate", evaluation.success_rate)
+        if evaluation.yardstick is not None:
+            self.logger.record("eval/gap", evaluation.yardstick.gap(evaluation.mean_return))
+            self.logger.record("eval/score", evaluation.yardstick.score(evaluation.mean_return))
+        self.logger.record("time/total_timesteps", self.num_timesteps, exclude="tensorboard")
+        self.logger.dump(self.num_timesteps)
+
+
+def _table(rows: list[list[Any]]) -> NDArray[Any]:
+    """Rows as one array; the shorter ones are repeated, which leaves mean and spread as they are.
+
+    A single figure, as of an exact evaluation, stands twice: the plot commands of rl_zoo3 take rows
+    of one for runs that are too short.
+    """
+    width = max(math.lcm(*map(len, rows)), 2)
+    return np.array([row * (width // len(row)) for row in rows])
+
+
+# What is told of a training's steps: evaluations, checkpoints, pulls, and what settings name.
+
+EVALUATIONS_PER_RUN = 20
+
+
+def all_callbacks(
+    spec: TrainSpec, callbacks: list[BaseCallback], display: ProgressDisplay
+) -> CallbackList:
+    """All callbacks: those that are there in any case, the budget, and what shows the progress."""
+    if spec.hyperparams.n_episodes is not None:
+        callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
+    if spec.verbose > 0:
+        callbacks.append(display)
+    return CallbackList(callbacks)
+
+
+def evaluation_callback(
+    spec: TrainSpec,
+    run: Run,
+    eval_env: VecEnv,
+    n_envs: int,
+    is_bandit: bool,
+    exact: ExactEvaluator | None,
+    display: ProgressDisplay,
+) -> EvaluationCallback:
+    """The evaluations during training: exact ones where they can be."""
+    return EvaluationCallback(
+        run,
+        eval_env,
+        exact or SampledEvaluator(spec, eval_env),
+        *_evaluation_intervals(spec, n_envs, is_judged_by_regret=exact is None and is_bandit),
+        value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
+        during=display.doing,
+    )
+
+
+def named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[BaseCallback]:
+    """The callbacks that the hyperparameters name, and the checkpoints that are asked for."""
+    callbacks: list[BaseCallback] = components.callbacks(
+        spec.hyperparams.callback, spec.gym_packages, run.path
+    )
+    _check_callbacks(spec, model, callbacks)
+    if spec.save_freq > 0:
+        callbacks.append(StepCheckpoint(spec.save_freq, run.path, spec.save_replay_buffer))
+    if spec.save_every_n_episodes > 0:
+        every = spec.save_every_n_episodes
+        callbacks.append(EpisodeCheckpoint(every, run.path, spec.save_replay_buffer))
+    return callbacks
+
+
+def pull_recorder(model: BaseAlgorithm, run: Run, console: Console) -> PullRecorder | None:
+    """What keeps every pull, unless a compiled loop was asked for, which does not stop at each."""
+    if getattr(model, "engine", None) == "compiled":
+        console.print("engine: compiled keeps no pulls, so that regret is not known", style="dim")
+        return None
+    return PullRecorder(run.path)
+
+
+def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
+    """Refuse now what would end the training half-way."""
+    for callback in callbacks:
+        if isinstance(callback, ExponentialExploration):
+            callback.check_model(model)
+    by_episodes = spec.hyperparams.n_episodes is not None
+    if by_episodes and isinstance(model, OnPolicyAlgorithm) and _has_moving_schedule(model):
+        raise UserError(
+            f"the schedules of {spec.algo} run by steps: give n_timesteps instead of n_episodes, "
+            "or constant values"
+        )
+
+
+def _has_moving_schedule(model: BaseAlgorithm) -> bool:
+    schedules = [getattr(model, name, None) for name in ("lr_schedule", "clip_range")]
+    return any(callable(s) and s(1.0) != s(0.0) for s in schedules)
+
+
+def _evaluation_intervals(
+    spec: TrainSpec, n_envs: int, is_judged_by_regret: bool
+) -> tuple[int, int]:
+    """Calls of `VecEnv.step`, and episodes, between two evaluations; 0 for none."""
+    if spec.eval_freq is not None:
+        return (max(spec.eval_freq // n_envs, 1), 0) if spec.eval_freq > 0 else (0, 0)
+    if is_judged_by_regret:
+        # An episode to evaluate on may have other arms, and says less than the pulls of training.
+        return 0, 0
+    if spec.hyperparams.n_timesteps is not None:
+        return max(spec.hyperparams.n_timesteps // EVALUATIONS_PER_RUN // n_envs, 1), 0
+    return 0, -(-(spec.hyperparams.n_episodes or 1) // EVALUATIONS_PER_RUN)

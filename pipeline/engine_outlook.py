@@ -10,11 +10,10 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.common.callback_horizons import EpisodeBudget
-from agents.compiled.compile_envs import NotCompilable
-from agents.networks.engine_costs import Work
-from agents.networks.engine_setting import CompiledNetworks, EnginePlan
-from agents.networks.network_worlds import network_world
+from agents.common.callbacks import EpisodeBudget
+from agents.compiled.worlds import NotCompilable
+from agents.networks.engine_setting import CompiledNetworks, EnginePlan, Work
+from agents.networks.observations import network_world
 from pipeline.environments import make_training_env
 from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.settings import components

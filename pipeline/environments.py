@@ -15,16 +15,14 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 
 from agents import ALGORITHMS
-from envs.action_masks import has_masks
-from envs.bandits.replay import ReplayBandit
-from envs.grid import GridWorld
-from envs.grid_map import read_rows
-from envs.wrappers import ActionMasks
+from envs.bandits.logged import ReplayBandit
+from envs.grid import GridWorld, read_rows
+from envs.wrappers import ActionMasks, has_masks
 from pipeline.errors import UserError, one_line, shown, unknown
 from pipeline.memory_limits import check_environments, check_frame_stack
+from pipeline.stopping import shield_workers
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
-from pipeline.worker_processes import shield_workers
 
 # Where neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
 # policy that runs in a circle would never end.
@@ -160,7 +158,7 @@ def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> 
     if spec.hyperparams.algorithm.get("mask_actions", False):
         wraps.append(_with_masks)
     elif spec.algo in ALGORITHMS and ALGORITHMS[spec.algo].needs_masks:
-        # Where there are none, `pipeline.agent_checks` names the agents that would fit.
+        # Where there are none, `pipeline.agent_settings` names the agents that would fit.
         wraps.append(lambda env: ActionMasks(env) if has_masks(env) else env)
     if not wraps:
         return None

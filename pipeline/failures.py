@@ -123,7 +123,7 @@ def blame_settings(algo: str, model: Any, error: Exception) -> None:
 @exits_as_mistakes()
 def close(training: Training) -> None:
     """Close what is open, each part also where another cannot be closed."""
-    from pipeline.worker_processes import close_environments
+    from pipeline.stopping import close_environments
 
     model = training.model
     with ExitStack() as stack:

@@ -15,7 +15,7 @@ import torch as th
 from numpy import vdot
 from numpy.typing import NDArray
 
-from agents.bandits.score_policy import BanditPolicy
+from agents.bandits.tables import BanditPolicy
 from pipeline.errors import UserError
 
 # Single and double precision, whose scalar products are worked out by BLAS.

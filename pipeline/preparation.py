@@ -16,6 +16,16 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
+from pipeline.callbacks import (
+    EvaluationCallback,
+    NumberWatch,
+    PullRecorder,
+    all_callbacks,
+    are_bandits,
+    evaluation_callback,
+    named_callbacks,
+    pull_recorder,
+)
 from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
@@ -27,7 +37,6 @@ from pipeline.evaluation.exact import ExactEvaluator, discount_note, evaluator_o
 from pipeline.evaluation.policies import why_not_exact
 from pipeline.evaluation.sampled import n_environments, takes_batches
 from pipeline.evaluation.value_maps import map_refusal
-from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.memory_limits import check_agent, check_environments, takes_buffers
 from pipeline.models.choose import (
     continuing,
@@ -36,9 +45,7 @@ from pipeline.models.choose import (
     statistics_to_continue,
 )
 from pipeline.models.load import ModelFile, agent_class, take_over, telling_masks
-from pipeline.number_watch import NumberWatch
-from pipeline.progress import ProgressDisplay
-from pipeline.pull_recording import PullRecorder, are_bandits
+from pipeline.progress import ProgressDisplay, can_move
 from pipeline.runs import Run, environment_name
 from pipeline.settings.components import (
     action_noise,
@@ -48,19 +55,11 @@ from pipeline.settings.components import (
     needs_policy,
 )
 from pipeline.settings.values import algorithm_parameters
-from pipeline.signs_of_life import can_move
 from pipeline.state_saver import StateSaver, resumed_logger
+from pipeline.stopping import close_environments, end_workers_after_stop
 from pipeline.train_spec import TrainSpec
-from pipeline.training_callbacks import (
-    all_callbacks,
-    evaluation_callback,
-    named_callbacks,
-    pull_recorder,
-)
 from pipeline.unfinished_runs import StateKeeping
-from pipeline.watching.map_recorder import EvaluationMaps
-from pipeline.watching.watch_choice import Watch, watch_of
-from pipeline.worker_processes import close_environments, end_workers_after_stop
+from pipeline.watching import EvaluationMaps, Watch, watch_of
 
 
 @dataclass(frozen=True)

@@ -47,7 +47,7 @@ from pipeline.files import (
     write_text,
 )
 from pipeline.locks import folder_lock, is_alive, mark
-from pipeline.module_records import COPIES, keep_copies
+from pipeline.user_modules import COPIES, keep_copies
 from safe_files.files import hold, take_up
 
 if TYPE_CHECKING:

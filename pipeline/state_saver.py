@@ -23,7 +23,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from agents.common.callback_horizons import BlockCallback, Horizon
+from agents.common.callbacks import BlockCallback, Horizon
 from machine_code.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator

@@ -14,9 +14,12 @@ from rich.console import Console
 
 from machine_code.compiling import compile_timer
 from machine_code.work_time import WorkTime
+from pipeline.callbacks import PullSummary, summarise_pulls
+from pipeline.curve_pictures import draw_learning_curve, draw_pulls
 from pipeline.digests import VERSION, VERSION_FIELD
 from pipeline.errors import UserError, one_line
-from pipeline.evaluation.sampled import Evaluation
+from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
+from pipeline.evaluation.value_maps import value_map
 from pipeline.failures import (
     blame_settings,
     blame_weights,
@@ -26,10 +29,12 @@ from pipeline.failures import (
     has_begun,
 )
 from pipeline.files import naming
-from pipeline.finishing import draw, judge, save
-from pipeline.library_loading import load_for_optimizer
+from pipeline.library_loading import load_for_optimizer, loading_libraries
+from pipeline.map_pictures import draw_value_map
+from pipeline.models.find import final_replay_buffer_path
+from pipeline.models.load import save_model, save_normalization, save_replay_buffer
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
-from pipeline.pull_recording import PullSummary
+from pipeline.progress import Activity, doing
 from pipeline.runs import (
     FINISHED,
     INTERRUPTED,
@@ -43,12 +48,80 @@ from pipeline.runs import (
     write_arguments,
     write_settings,
 )
-from pipeline.signs_of_life import Activity, doing
 from pipeline.state_saver import IterationInterval, iterations_before
-from pipeline.stopping import current
+from pipeline.stopping import current, deaths_told
 from pipeline.train_spec import TrainSpec
 from pipeline.unfinished_runs import StateKeeping
-from pipeline.worker_processes import deaths_told
+
+# What is done with a training that has come to its end: saved, judged, drawn.
+
+
+def save(training: Training, state: str) -> PullSummary | None:
+    """Save what was learnt, and what was pulled; the figures on the latter."""
+    run, model, recorder = training.run, training.model, training.pulls
+    save_model(model, run.model_path)
+    save_normalization(model, run.vecnormalize_path)
+    if training.spec.save_replay_buffer and not current().is_urgent:
+        save_replay_buffer(model, final_replay_buffer_path(run.path))
+    if recorder is None or not recorder.n_calls:
+        return None
+    if state == INTERRUPTED:
+        recorder.write()  # as it does by itself where the training was not interrupted
+    return summarise_pulls(recorder.arrays())
+
+
+def judge(training: Training, state: str) -> Evaluation | None:
+    """Evaluate what is not evaluated yet; the final evaluation, where the training was not cut off.
+
+    It is exact, or by episodes that were used for nothing else.
+    """
+    evaluation, model = training.evaluation, training.model
+    if not evaluation.is_asked_for:
+        return None
+    if not evaluation.evaluations_timesteps:
+        # The run was shorter than the time to its first evaluation, or called no callback.
+        evaluation.init_callback(model)
+        evaluation.evaluate_now()
+    evaluation.write()
+    if evaluation.value_maps is not None:
+        evaluation.value_maps.finish(model, model.num_timesteps)
+    return _final_evaluation(training) if state == FINISHED else None
+
+
+def draw(training: Training, final: Evaluation | None) -> None:
+    """Draw the pulls, the learning curve and the map of the final policy, where there are such."""
+    if training.spec.pictures:
+        with loading_libraries():  # Matplotlib
+            _draw(training, final)
+
+
+def _draw(training: Training, final: Evaluation | None) -> None:
+    run, spec, recorder = training.run, training.spec, training.pulls
+    title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
+    has_pulls = recorder is not None and recorder.n_calls > 0
+    if recorder is not None and has_pulls:
+        draw_pulls(run.pulls_picture_path, title, recorder.arrays())
+    if not has_pulls or training.evaluation.evaluations_timesteps:
+        yardstick = None if final is None else final.yardstick
+        first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant
+        draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
+    maps = training.evaluation.value_maps
+    if maps is not None and training.evaluation.is_asked_for:
+        found = value_map(maps.evaluator, training.model)
+        if found is not None:
+            draw_value_map(run.value_map_path, title, found)
+
+
+def _final_evaluation(training: Training) -> Evaluation:
+    evaluation, model = training.evaluation, training.model
+    evaluation.take_statistics()
+    with evaluation.timed():
+        if isinstance(evaluation.evaluator, SampledEvaluator):
+            return evaluation.evaluator.at_the_end(model)
+        return evaluation.evaluator(model)
+
+
+# From a spec to a finished run folder: `prepare` makes all parts, `carry_out` trains.
 
 # A budget in episodes has no number of steps; this one is never reached.
 UNBOUNDED_TIMESTEPS = 10**12

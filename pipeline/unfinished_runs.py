@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 from pipeline.digests import STATE_FOLDER, DamagedFileError, digest_of
 from pipeline.errors import UserError
 from pipeline.files import replacing
-from pipeline.module_records import changed_since
 from pipeline.runs import (
     FINISHED,
     TRAINED_AGENT,
@@ -29,7 +28,7 @@ from pipeline.runs import (
     remove_states,
 )
 from pipeline.train_spec import TrainSpec, completed
-from pipeline.user_modules import UserModule
+from pipeline.user_modules import UserModule, changed_since
 from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 
 if TYPE_CHECKING:

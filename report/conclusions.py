@@ -1,4 +1,4 @@
-"""What a study has shown on an environment: in a line, pair by pair, and what else there is."""
+"""What a study has shown, in sentences: in a line, pair by pair, and how soon."""
 
 from __future__ import annotations
 
@@ -14,17 +14,230 @@ from experiments.analysis import (
     StudyAnalysis,
 )
 from experiments.study import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
-from report.pair_sentences import (
-    failed_runs,
-    on_unreliable,
-    oriented_pairs,
-    pair_sentences,
-    seeds_of,
-    too_few_seeds,
-)
-from report.speed_sentences import speed_sentences
-from report.wording import enumeration, interval, number, optimum_words, ordinal
-from verdicts import Estimate
+from report.words import enumeration, interval, number, optimum_words, ordinal, seeds
+from verdicts import Estimate, PairComparison
+
+# Sentences on pairs of agents: verdicts, and who fails more often.
+
+
+def oriented_pairs(environment: EnvironmentAnalysis) -> list[PairComparison]:
+    """The pairs, each seen from the agent that is better, where one is."""
+    return [pair.swapped() if pair.verdict == "worse" else pair for pair in environment.pairs]
+
+
+def pair_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[str]:
+    """The verdicts, those with the same first agent and the same verdict in one sentence."""
+    too_few = study.n_seeds < environment.fewest
+    texts = [f"{_on_equivalent(environment, g)}." for g in _equivalent_groups(environment)]
+    oriented = oriented_pairs(environment)
+    for name in (agent.agent for agent in environment.agents):
+        pairs = [pair for pair in oriented if pair.first == name]
+        better = [pair for pair in pairs if pair.verdict == "better"]
+        open_ = [pair for pair in pairs if pair.verdict == "undecided"]
+        if better:
+            texts.append(f"{name} is better than {_by_how_much(environment, better)}.")
+        if open_ and not too_few:
+            texts.append(f"{name} is undecided against {_how_open(environment, open_)}.")
+    if too_few and texts and any(pair.verdict == "undecided" for pair in oriented):
+        texts.append(f"All other pairs are undecided: {too_few_seeds(study, environment)}.")
+    return texts
+
+
+def seeds_of(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    """How many seeds the agents were to have."""
+    return seeds(*(environment.seeds.values() or [study.n_seeds]))
+
+
+def too_few_seeds(study: StudySpec, environment: EnvironmentAnalysis) -> str:
+    """That so few seeds cannot decide, and how many could."""
+    return (
+        f"{seeds_of(study, environment)} cannot tell {len(environment.agents)} agents apart, "
+        f"whatever they score; it takes {environment.fewest} or more"
+    )
+
+
+def _on_equivalent(environment: EnvironmentAnalysis, group: Sequence[str]) -> str:
+    """Who is equivalent, in what, and what so few runs leave open."""
+    within = f" within {number(environment.margin)}" if environment.margin > 0 else ""
+    pairs = [p for p in environment.pairs if p.first in group and p.second in group]
+    if all(pair.certain for pair in pairs):
+        return f"{enumeration(group)} are equivalent{within}"
+    text = f"{enumeration(group)} are equivalent in the typical run{within}"
+    text += _shown_with(environment, pairs)
+    counts = {name: environment.failures[name] for name in group if name in environment.failures}
+    if not counts:
+        n = min(pair.difference.n for pair in pairs)
+        rare = 1 - 0.05 ** (1 / n)
+        return f"{text}; what fewer than {rare:.0%} of runs do, {seeds(n)} may not show"
+    if len({(count.n_failed, count.n) for count in counts.values()}) == 1:
+        count = next(iter(counts.values()))
+        each = " each" if len(counts) > 1 else f" of {next(iter(counts))}"
+        return (
+            f"{text}; {count.n_failed} of {count.n} runs{each} failed, up to {count.most:.0%} could"
+        )
+    told = [
+        f"{count.n_failed} of {count.n} runs of {name} failed (up to {count.most:.0%} could)"
+        for name, count in counts.items()
+    ]
+    return f"{text}; {enumeration(told)}"
+
+
+def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
+    """Agents of which every two are equivalent, in groups that hold all such pairs."""
+    names = [agent.agent for agent in environment.agents]
+    pairs = [(p.first, p.second) for p in environment.pairs if p.verdict == "equivalent"]
+    groups: list[list[str]] = []
+    for first, second in pairs:
+        if any(first in group and second in group for group in groups):
+            continue
+        group = [first, second]
+        for name in names:
+            if name not in group and all(
+                (name, member) in pairs or (member, name) in pairs for member in group
+            ):
+                group.append(name)
+        groups.append(sorted(group, key=names.index))
+    return groups
+
+
+def _by_how_much(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
+    return enumeration(
+        [
+            f"{pair.second} (by {interval(pair.difference)}{_shown_with(environment, [pair])}"
+            f"{_failed_more(environment, pair)})"
+            for pair in pairs
+        ]
+    )
+
+
+def _shown_with(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
+    """With how many seeds pairs were judged, where a study has grown until they were decided."""
+    if environment.look.design is None:
+        return ""
+    return f", with {seeds(*(pair.n_seeds for pair in pairs))}"
+
+
+def _failed_more(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
+    """The failures of two agents, but of an agent most of whose runs failed."""
+    counts = {name: environment.failures.get(name) for name in (pair.first, pair.second)}
+    few = [name for name, count in counts.items() if count and 2 * count.n_failed <= count.n]
+    told = failed_runs(environment, few)
+    return f"; {told}" if told else ""
+
+
+def failed_runs(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
+    """Of agents, those of which runs failed, and how many; empty where none did."""
+    counts = {name: environment.failures.get(name) for name in names}
+    return enumeration(
+        [
+            f"{count.n_failed} of {count.n} runs of {name} failed"
+            for name, count in counts.items()
+            if count is not None and count.n_failed
+        ]
+    )
+
+
+def on_unreliable(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """Who fails more often, but for agents that are worse anyhow."""
+    worse = {(p.second, p.first) for p in oriented_pairs(environment) if p.verdict == "better"}
+    for names in environment.unreliable:
+        if names not in worse:
+            more, less = (environment.failures[name] for name in names)
+            yield (
+                f"{names[0]} fails more often than {names[1]} ({more.n_failed} of {more.n} runs "
+                f"against {less.n_failed} of {less.n})."
+            )
+
+
+def _how_open(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
+    """By how much the agents differ, and how many seeds it would take."""
+    return enumeration(
+        [f"{pair.second} ({_difference_so_far(environment, pair)})" for pair in pairs]
+    )
+
+
+def _difference_so_far(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
+    text = f"difference {interval(pair.difference)}{_shown_with(environment, [pair])}"
+    if pair.seeds_needed is None:
+        return text
+    return f"{text}; about {seeds(pair.seeds_needed)} are needed to decide"
+
+
+# Sentences on how soon agents stay above the threshold.
+
+
+def speed_sentences(environment: EnvironmentAnalysis) -> Iterable[str]:
+    """How many runs come to stay above the threshold, from when on, and who does so sooner."""
+    told = [
+        agent
+        for agent in environment.agents
+        if agent.steps_to_stay is not None and agent.steps_to_stay.share_reached.n
+    ]
+    arrived = [agent for agent in told if _n_stayed(agent)]
+    if len(told) < 2 or not arrived:
+        return
+    arrived.sort(key=_median_steps)
+    goal = f"{_goal(environment)} and keeps it to the end"
+    first, *others = [_on_arrival(agent) for agent in arrived]
+    never = [agent.agent for agent in told if not _n_stayed(agent)]
+    parts = [f"{arrived[0].agent} reaches {goal} in {first}"]
+    parts += [f"{agent.agent} in {text}" for agent, text in zip(arrived[1:], others, strict=True)]
+    if never:
+        parts.append(f"{enumeration(never)} in none")
+    yield f"{'; '.join(parts)}."
+    yield from _on_ratios(environment, arrived[0].agent)
+
+
+def _on_ratios(environment: EnvironmentAnalysis, fastest: str) -> Iterable[str]:
+    """Who needs how many times the steps of the fastest, where that is shown."""
+    slower = []
+    for pair in environment.speeds:
+        if pair.sooner != fastest:
+            continue
+        forward = pair.first == fastest
+        low, high = pair.ratio.low, pair.ratio.high
+        low, high = (low, high) if forward else (_inverse(high), _inverse(low))
+        name = pair.second if forward else pair.first
+        most = f"at least {number(low)}" if math.isinf(high) else f"{number(low)} to {number(high)}"
+        slower.append(f"{name} needs {most} times as many")
+    if slower:
+        yield f"{fastest} arrives in fewer steps: {enumeration(slower)}."
+
+
+def _inverse(ratio: float) -> float:
+    return math.inf if ratio == 0 else 1 / ratio
+
+
+def _n_stayed(agent: AgentAnalysis) -> int:
+    assert agent.steps_to_stay is not None
+    share = agent.steps_to_stay.share_reached
+    return round(share.point * share.n)
+
+
+def _median_steps(agent: AgentAnalysis) -> float:
+    assert agent.steps_to_stay is not None
+    return agent.steps_to_stay.median.point
+
+
+def _on_arrival(agent: AgentAnalysis) -> str:
+    assert agent.steps_to_stay is not None
+    n, steps = agent.steps_to_stay.share_reached.n, _median_steps(agent)
+    text = f"{_n_stayed(agent)} of {n} runs"
+    return text if math.isinf(steps) else f"{text}, the median one from step {steps:,.0f} on"
+
+
+def _goal(environment: EnvironmentAnalysis) -> str:
+    threshold, optimum, baseline = environment.threshold, environment.optimum, environment.baseline
+    if threshold is not None and optimum is not None and baseline is not None:
+        share = (
+            (threshold - baseline) / (optimum - baseline) if optimum > baseline else float("nan")
+        )
+        if math.isclose(share, 0.95):
+            return "a score of 0.95"
+    return f"a return of {number(threshold)}"
+
+
+# What a study has shown on an environment: in a line, pair by pair, and what else there is.
 
 MOST_FIGURES = 3  # agents whose figures stand in a line
 

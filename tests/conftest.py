@@ -200,8 +200,8 @@ def report_study(tmp_path_factory):
     from experiments.run_folders import draft_path
     from experiments.run_in_child import do_run
     from report import films
-    from report.page import film_section, write_report
-    from report.series.study_series import study_series
+    from report.page import world_sections, write_report
+    from report.series import study_series
 
     study, root = small_study(), tmp_path_factory.mktemp("study")
     planned = plan(study, root)
@@ -214,7 +214,7 @@ def report_study(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(films, "MAX_STEPS", 20)  # longer films take ten seconds to draw
         # In this process, where that holds, also if there is one that runs are forked from.
-        patch.setattr(film_section, "do_aside", lambda function, *args: function(*args))
+        patch.setattr(world_sections, "do_aside", lambda function, *args: function(*args))
         write_report(study_series(analysis), page, "python compare.py 'a & b.yml'")
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page

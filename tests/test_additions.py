@@ -20,9 +20,9 @@ import numpy as np
 
 import agents
 from agents.common.exploration import highest_value
-from agents.common.setting_checks import check_share, settings_of
-from agents.tabular.tabular_algorithm import TabularAlgorithm
-from agents.tabular.temporal_difference import TabularAgent
+from agents.common.settings import check_share, settings_of
+from agents.tabular.algorithm import TabularAlgorithm
+from agents.tabular.updates import TabularAgent
 from mdp.machine_code import inlined
 
 agents.register("cautious", "cautious:Cautious", observations="Discrete", actions="Discrete")
@@ -62,7 +62,7 @@ from __future__ import annotations
 import math
 
 import agents
-from agents.bandits.score_agent import ScoreAgent
+from agents.bandits.choosing import ScoreAgent
 from agents.bandits.upper_bounds import UpperBoundBandit
 from mdp.machine_code import inlined
 
@@ -87,7 +87,7 @@ GRID = '''
 import gymnasium as gym
 
 from envs.grid import GridWorld
-from envs.grid_dynamics import Tile
+from envs.grid import Tile
 
 gym.register("my/Pond-v0", "pond:Pond", max_episode_steps=50)
 

@@ -210,7 +210,7 @@ def test_imports_lead_through_names_that_a_package_loads_on_first_use(drawing):
     distances = imports.distances("mdp/evaluation.py")
     assert distances["mdp/evaluation.py"] == 0
     assert distances["tests/mdp/test_evaluation.py"] == 1
-    assert "verdicts/scores.py" not in distances
+    assert "verdicts/resampling.py" not in distances
     beneath = imports.beneath_machine_code()
     assert {"machine_code/compiling.py", "mdp/planning.py"} <= beneath
-    assert "verdicts/scores.py" not in beneath
+    assert "verdicts/resampling.py" not in beneath

@@ -20,7 +20,7 @@ from rich.table import Table
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback, EpisodeBudget, Horizon
+from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon
 from mdp.array_types import Bools, Floats
 
 mpl.use("Agg")

@@ -15,7 +15,7 @@ from _figures import Statement, arguments, finish, learn_episodes
 from matplotlib.figure import Figure
 from stable_baselines3.common.env_util import make_vec_env
 
-from agents.linear.semi_gradient_sarsa import SemiGradientSARSA
+from agents.linear.action_values import SemiGradientSARSA
 from mdp.array_types import Floats
 
 MOMENTS = (12, 104, 1000, 9000)  # episodes

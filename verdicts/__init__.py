@@ -14,33 +14,53 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from verdicts.comparisons import PairComparison, compare_pairs, describe_pairs
-    from verdicts.error_levels import level_of_look
-    from verdicts.estimates import Estimate, Statistic, Summary, estimate, summarise
-    from verdicts.failures import FailureCount, count_failures, fail_more_often, failure_threshold
-    from verdicts.growth import Growth, grow, look_sizes
-    from verdicts.improvement import probability_of_improvement
-    from verdicts.judgement import FEWEST_SEEDS, Verdict, judge_pairs
-    from verdicts.learning_curves import (
+    from verdicts.curves import (
         Band,
+        SpeedComparison,
         ThresholdSummary,
         area_under_curve,
         best_score,
+        compare_speed,
         curve_band,
         final_score,
         on_grid,
+        performance_profile,
         shared_grid,
         steps_to_stay,
         steps_to_threshold,
         summarise_steps,
     )
-    from verdicts.paired import holm, paired_difference
-    from verdicts.power import fewest_seeds, seeds_needed
-    from verdicts.profiles import performance_profile
-    from verdicts.rank_tests import ahead_p_value, apart_p_value, equivalent_p_value
-    from verdicts.scores import gap_to_optimum, optimum_score
-    from verdicts.speed import SpeedComparison, compare_speed
-    from verdicts.typical import typical_difference
+    from verdicts.failures import FailureCount, count_failures, fail_more_often, failure_threshold
+    from verdicts.growth import Growth, grow, look_sizes
+    from verdicts.pairs import (
+        FEWEST_SEEDS,
+        PairComparison,
+        Verdict,
+        compare_pairs,
+        describe_pairs,
+        fewest_seeds,
+        judge_pairs,
+        level_of_look,
+        probability_of_improvement,
+        seeds_needed,
+    )
+    from verdicts.rank_tests import (
+        ahead_p_value,
+        apart_p_value,
+        equivalent_p_value,
+        holm,
+        paired_difference,
+        typical_difference,
+    )
+    from verdicts.resampling import (
+        Estimate,
+        Statistic,
+        Summary,
+        estimate,
+        gap_to_optimum,
+        optimum_score,
+        summarise,
+    )
 
 __all__ = [
     "FEWEST_SEEDS",
@@ -90,15 +110,15 @@ __all__ = [
 ]
 
 _HOMES = {
-    "PairComparison": "verdicts.comparisons",
-    "compare_pairs": "verdicts.comparisons",
-    "describe_pairs": "verdicts.comparisons",
-    "level_of_look": "verdicts.error_levels",
-    "Estimate": "verdicts.estimates",
-    "Statistic": "verdicts.estimates",
-    "Summary": "verdicts.estimates",
-    "estimate": "verdicts.estimates",
-    "summarise": "verdicts.estimates",
+    "PairComparison": "verdicts.pairs",
+    "compare_pairs": "verdicts.pairs",
+    "describe_pairs": "verdicts.pairs",
+    "level_of_look": "verdicts.pairs",
+    "Estimate": "verdicts.resampling",
+    "Statistic": "verdicts.resampling",
+    "Summary": "verdicts.resampling",
+    "estimate": "verdicts.resampling",
+    "summarise": "verdicts.resampling",
     "FailureCount": "verdicts.failures",
     "count_failures": "verdicts.failures",
     "fail_more_often": "verdicts.failures",
@@ -106,34 +126,34 @@ _HOMES = {
     "Growth": "verdicts.growth",
     "grow": "verdicts.growth",
     "look_sizes": "verdicts.growth",
-    "probability_of_improvement": "verdicts.improvement",
-    "FEWEST_SEEDS": "verdicts.judgement",
-    "Verdict": "verdicts.judgement",
-    "judge_pairs": "verdicts.judgement",
-    "Band": "verdicts.learning_curves",
-    "ThresholdSummary": "verdicts.learning_curves",
-    "area_under_curve": "verdicts.learning_curves",
-    "best_score": "verdicts.learning_curves",
-    "curve_band": "verdicts.learning_curves",
-    "final_score": "verdicts.learning_curves",
-    "on_grid": "verdicts.learning_curves",
-    "shared_grid": "verdicts.learning_curves",
-    "steps_to_stay": "verdicts.learning_curves",
-    "steps_to_threshold": "verdicts.learning_curves",
-    "summarise_steps": "verdicts.learning_curves",
-    "holm": "verdicts.paired",
-    "paired_difference": "verdicts.paired",
-    "fewest_seeds": "verdicts.power",
-    "seeds_needed": "verdicts.power",
-    "performance_profile": "verdicts.profiles",
+    "probability_of_improvement": "verdicts.pairs",
+    "FEWEST_SEEDS": "verdicts.pairs",
+    "Verdict": "verdicts.pairs",
+    "judge_pairs": "verdicts.pairs",
+    "Band": "verdicts.curves",
+    "ThresholdSummary": "verdicts.curves",
+    "area_under_curve": "verdicts.curves",
+    "best_score": "verdicts.curves",
+    "curve_band": "verdicts.curves",
+    "final_score": "verdicts.curves",
+    "on_grid": "verdicts.curves",
+    "shared_grid": "verdicts.curves",
+    "steps_to_stay": "verdicts.curves",
+    "steps_to_threshold": "verdicts.curves",
+    "summarise_steps": "verdicts.curves",
+    "holm": "verdicts.rank_tests",
+    "paired_difference": "verdicts.rank_tests",
+    "fewest_seeds": "verdicts.pairs",
+    "seeds_needed": "verdicts.pairs",
+    "performance_profile": "verdicts.curves",
     "ahead_p_value": "verdicts.rank_tests",
     "apart_p_value": "verdicts.rank_tests",
     "equivalent_p_value": "verdicts.rank_tests",
-    "gap_to_optimum": "verdicts.scores",
-    "optimum_score": "verdicts.scores",
-    "SpeedComparison": "verdicts.speed",
-    "compare_speed": "verdicts.speed",
-    "typical_difference": "verdicts.typical",
+    "gap_to_optimum": "verdicts.resampling",
+    "optimum_score": "verdicts.resampling",
+    "SpeedComparison": "verdicts.curves",
+    "compare_speed": "verdicts.curves",
+    "typical_difference": "verdicts.rank_tests",
 }
 
 

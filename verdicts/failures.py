@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from verdicts.paired import holm
+from verdicts.rank_tests import holm
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from verdicts.error_levels import level_of_look
-from verdicts.judgement import FEWEST_SEEDS, Judgement, judge_pairs
-from verdicts.power import fewest_seeds
-from verdicts.score_arrays import Floats
+from verdicts.pairs import FEWEST_SEEDS, Judgement, fewest_seeds, judge_pairs, level_of_look
+from verdicts.resampling import Floats
 
 # How many times the seeds of a look the next one has, about.
 STEP = 1.5

@@ -1,15 +1,24 @@
-"""What agents share whose scores are preferences or log-weights, and no estimates of rewards."""
+"""Agents that draw arms by preferences: the gradient bandit and Exp3."""
 
 from __future__ import annotations
 
 import math
+from typing import Any, Unpack
 
-from agents.bandits.score_agent import ScoreTables
-from agents.bandits.score_policy import mean_rewards
-from agents.bandits.table_bandit import TableBandit
-from agents.common.exploration import highest_value
+import numpy as np
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from agents.bandits import algorithm
+from agents.bandits.choosing import ScoreAgent, ScoreTables, mean_reward, total_count
+from agents.bandits.tables import TableArguments, TableBandit, mean_rewards
+from agents.common.exploration import boltzmann_action, highest_value
+from agents.common.settings import check_above_zero, check_share, settings_of
+from agents.compiled.generators import generator_of
 from machine_code.compiling import inlined
 from mdp.array_types import Floats
+
+# What agents share whose scores are preferences or log-weights, and no estimates of rewards.
 
 
 @inlined
@@ -32,3 +41,149 @@ class PreferenceBandit(TableBandit):
     def estimates(self, tables: ScoreTables) -> Floats:
         """Average rewards, nan where there is none, shapes (..., contexts, arms)."""
         return mean_rewards(tables.sums, tables.counts)
+
+
+# Agents that draw arms by preferences, which are no estimates of rewards: gradient ascent.
+
+
+@inlined
+def choose_by_preference(agent: ScoreAgent, row: int, progress: Any) -> int:
+    """An arm with probability proportional to exp(preference)."""
+    agent.draws[0] = generator_of(agent.rng).random()
+    for arm in range(len(agent.arms)):
+        agent.arms[arm] = agent.tables.scores[row, arm]
+    return boltzmann_action(agent.arms, 1.0, agent.draws)
+
+
+@inlined
+def gradient_step(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """Move the preferences (Sutton and Barto, section 2.8).
+
+    The baseline is the average of the rewards before this one, and this one at the very first.
+    """
+    tables = agent.tables
+    baseline = 0.0
+    if agent.settings.baseline:
+        first = total_count(tables, pull.row) == 0
+        baseline = pull.reward if first else mean_reward(tables, pull.row)
+    softmax(tables, pull.row, agent.arms)
+    for arm in range(len(agent.arms)):
+        chosen = 1.0 if arm == pull.arm else 0.0
+        advantage = progress.learning_rate * (pull.reward - baseline)
+        tables.scores[pull.row, arm] += advantage * (chosen - agent.arms[arm])
+
+
+@inlined
+def nothing_after(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """The preferences have moved already."""
+
+
+class GradientBandit(PreferenceBandit):
+    """Gradient ascent on preferences (Sutton and Barto, section 2.8).
+
+    Args:
+        policy: ``"BanditPolicy"``.
+        env: as in `TableBandit`.
+        learning_rate: step size, constant or scheduled.
+        baseline: compare a reward with the average of those before it, as the book's second edition
+            has it (its drafts included the reward itself); else with 0.
+        kwargs: as in `TableBandit`.
+    """
+
+    parameters = {"baseline": np.bool_}  # noqa: RUF012
+    choose_arm = choose_by_preference
+    before_counting = gradient_step
+    learn_from_pull = nothing_after
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "BanditPolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: float | Schedule = 0.1,
+        baseline: bool = True,
+        **kwargs: Unpack[TableArguments],
+    ) -> None:
+        self.baseline = baseline
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+
+# Exponential weights against an adversary.
+
+
+@inlined
+def exp3_probabilities(agent: ScoreAgent, row: int) -> None:
+    """Fill in softmax mixed with uniform, the probability of each arm."""
+    softmax(agent.tables, row, agent.arms)
+    mixing, n_arms = agent.settings.mixing, len(agent.arms)
+    for arm in range(n_arms):
+        agent.arms[arm] = (1.0 - mixing) * agent.arms[arm] + mixing / n_arms
+
+
+@inlined
+def drawn_arm(probabilities: Floats, uniform: float) -> int:
+    """The arm on which ``uniform``, in [0, 1), falls."""
+    for arm in range(len(probabilities) - 1):
+        uniform -= probabilities[arm]
+        if uniform < 0.0:
+            return arm
+    return len(probabilities) - 1
+
+
+@inlined
+def draw_by_weight(agent: ScoreAgent, row: int, progress: Any) -> int:
+    """An arm by its probability."""
+    uniform = generator_of(agent.rng).random()
+    exp3_probabilities(agent, row)
+    return drawn_arm(agent.arms, uniform)
+
+
+@inlined
+def probability_of(agent: ScoreAgent, row: int, arm: int) -> float:
+    """How likely the choice of ``arm`` is."""
+    exp3_probabilities(agent, row)
+    return float(agent.arms[arm])
+
+
+@inlined
+def raise_weight(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """Add the reward to the log-weight, the more the less likely its arm was."""
+    share = agent.settings.mixing * pull.reward
+    agent.tables.scores[pull.row, pull.arm] += share / (pull.probability * len(agent.arms))
+
+
+class Exp3(PreferenceBandit):
+    """Exponential weights for rewards that an adversary may choose (Auer et al., 2002).
+
+    Rewards lie between 0 and 1.
+
+    Args:
+        policy: ``"BanditPolicy"``.
+        env: as in `TableBandit`.
+        mixing: share of uniformly random pulls, in (0, 1]; the paper's gamma.
+        kwargs: as in `TableBandit`.
+    """
+
+    parameters = {"mixing": np.float64}  # noqa: RUF012
+    choose_arm = draw_by_weight
+    choice_probability = probability_of
+    learn_from_pull = raise_weight
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "BanditPolicy",
+        env: GymEnv | str | None = None,
+        mixing: float = 0.1,
+        **kwargs: Unpack[TableArguments],
+    ) -> None:
+        self.mixing = mixing
+        super().__init__(policy, env, **kwargs)
+
+    @property
+    def rewards_known(self) -> str:
+        """Those of the paper."""
+        return algorithm.UNIT
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_share(settings_of(self, "mixing"))
+        check_above_zero(settings_of(self, "mixing"))

@@ -9,16 +9,11 @@ import numpy as np
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv
 
-from agents.bandits import reward_checks
-from agents.bandits.score_agent import ScoreAgent, ScoreTables
-from agents.bandits.table_bandit import TableArguments, TableBandit
+from agents.bandits import algorithm
+from agents.bandits.choosing import ScoreAgent, ScoreTables
+from agents.bandits.tables import TableArguments, TableBandit
 from agents.common.exploration import greedy_action
-from agents.common.setting_checks import (
-    check_above_zero,
-    check_finite,
-    check_option,
-    settings_of,
-)
+from agents.common.settings import check_above_zero, check_finite, check_option, settings_of
 from agents.compiled.generators import generator_of
 from machine_code.compiling import inlined
 from mdp.array_types import Floats
@@ -115,7 +110,7 @@ class Thompson(TableBandit):
     @property
     def rewards_known(self) -> str:
         """Those of a coin, unless they have normal noise."""
-        return reward_checks.ANY if self.is_gaussian else reward_checks.BINARY
+        return algorithm.ANY if self.is_gaussian else algorithm.BINARY
 
     @property
     def initial_score(self) -> float:

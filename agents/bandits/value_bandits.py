@@ -8,13 +8,17 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule
 
-from agents.bandits.score_agent import ScoreAgent
-from agents.bandits.table_bandit import TableArguments, TableBandit
+from agents.bandits.choosing import ScoreAgent
+from agents.bandits.tables import TableArguments, TableBandit
 from agents.common.exploration import BOLTZMANN, EPSILON_GREEDY, choose_action
 from agents.common.schedules import epsilon_schedule
-from agents.common.setting_checks import check_above_zero, check_epsilons, settings_of
-from agents.common.signatures import ExplorationDecay
-from agents.common.step_sizes import step_size
+from agents.common.settings import (
+    ExplorationDecay,
+    check_above_zero,
+    check_epsilons,
+    settings_of,
+    step_size,
+)
 from agents.compiled.generators import generator_of
 from agents.compiled.learning_algorithm import StepSize
 from machine_code.compiling import inlined

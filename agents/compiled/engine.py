@@ -1,38 +1,108 @@
-"""Drives the compiled loop, and keeps the rest of the training from noticing."""
+"""The compiled engine: when it is used, and how it drives the loop."""
 
 from __future__ import annotations
 
+import signal
+import threading
 import time
-from typing import Any, cast
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+from typing import Any, Literal, cast
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from agents.common.callback_horizons import (
+from agents.common.algorithm import is_read
+from agents.common.callbacks import (
     NEVER,
     EpisodeBudget,
     horizon,
     members,
     pass_over,
+    unknown_callbacks,
     wants_position,
 )
-from agents.common.online import is_read
-from agents.compiled.compile_envs import World, compile_envs
-from agents.compiled.env_state import COMPENSATED_SUM, EnvStates
-from agents.compiled.episodes import Episodes, record_in_monitors
 from agents.compiled.generators import handles_of
-from agents.compiled.greedy_play import CompiledEvaluations, Playground
-from agents.compiled.interrupts import interrupts_held
-from agents.compiled.learning_algorithm import compiled_schedule
-from agents.compiled.log_records import (
+from agents.compiled.greedy_play import COMPENSATED_SUM, CompiledEvaluations, EnvStates, Playground
+from agents.compiled.learning_algorithm import LearningAlgorithm, compiled_schedule
+from agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
+from agents.compiled.records import (
+    Episodes,
     Statistics,
     keeps_records,
+    record_in_monitors,
     time_columns,
     write_records,
 )
-from agents.compiled.loop import EpisodeLog, learn_from_last_step, run_block
-from agents.compiled.training_records import EPISODE, PROGRESS, RECORD
+from agents.compiled.worlds import (
+    EPISODE,
+    PROGRESS,
+    RECORD,
+    NotCompilable,
+    World,
+    compile_envs,
+    draws_alike,
+)
+
+# Ctrl-C, and what else ends a process, at a moment that leaves nothing half done.
+
+Handler = Callable[[int, FrameType | None], object]
+
+# Windows has no SIGHUP.
+_SIGNALS = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")]
+
+
+class _Hold:
+    """What the handler of the first signal raised, until it is time for it."""
+
+    def __init__(self) -> None:
+        self.n_signals = 0
+        self.waiting: BaseException | None = None
+
+    def around(self, handler: Handler) -> Handler:
+        """The handler, of which the first exception waits."""
+
+        def hold(number: int, frame: FrameType | None) -> None:
+            self.n_signals += 1
+            try:
+                handler(number, frame)
+            except BaseException as error:
+                if self.n_signals > 1:
+                    raise
+                self.waiting = error
+
+        return hold
+
+
+@contextmanager
+def interrupts_held() -> Iterator[Callable[[], bool]]:
+    """Let what the first signal raises wait until the ``with`` statement is left; a second not.
+
+    That is KeyboardInterrupt on Ctrl-C, and whatever the handlers raise that a program has set for
+    SIGINT, SIGTERM and SIGHUP; they are called at once. Outside the main thread, where Python
+    delivers no signals, nothing is held.
+
+    Yields:
+        A function that tells whether an exception is waiting.
+    """
+    hold = _Hold()
+    try:
+        with ExitStack() as restoring:
+            if threading.current_thread() is threading.main_thread():
+                for number in filter(None, _SIGNALS):
+                    handler = signal.getsignal(number)
+                    if callable(handler):
+                        restoring.callback(signal.signal, number, handler)
+                        signal.signal(number, hold.around(handler))
+            yield lambda: hold.waiting is not None
+    finally:
+        if hold.waiting is not None:
+            raise hold.waiting
+
+
+# Drives the compiled loop, and keeps the rest of the training from noticing.
 
 # Some hundredths of a second: what a signal waits for.
 MAX_BLOCK_STEPS = 262_144
@@ -297,3 +367,109 @@ class CompiledEngine:
         agent.hand_over(self.envs, self.progress)
         self.states.read()
         self.states.take_observations(agent._last_obs)
+
+
+# Whether a training runs compiled or interpreted.
+
+EngineChoice = Literal["auto", "compiled", "interpreted"]
+
+# What a class may say anew in Python: all of it ends up in the settings, schedules, tables and the
+# memory that compiled functions are handed.
+SETTINGS = (
+    "__dict__",
+    "__init__",
+    "__weakref__",
+    "_check_arguments",
+    "_make_exploration_schedule",
+    "_make_memory",
+    "_make_policy",
+    "_memory_in_use",
+    "strategy",
+    "tie_scale",
+    "averages_samples",
+)
+
+
+def choose_engine(
+    agent: Any,
+    callback: BaseCallback,
+    log_interval: int | None,
+    make_world: Callable[[VecEnv], Any] = compile_envs,
+    engine: type[CompiledEngine] = CompiledEngine,
+) -> CompiledEngine | None:
+    """The compiled engine where the agent wants it and it can be had; None for interpreting.
+
+    An environment that draws in its own way is equal to its compiled copy in distribution alone:
+    such a copy has to be asked for, so that results do not hang on what else kept an agent from
+    compiling. The choice and its reason are left in ``agent.engine_in_use``.
+
+    Args:
+        agent: the algorithm.
+        callback: as in `CompiledEngine`.
+        log_interval: likewise.
+        make_world: from its environments to what the engine is handed as the world.
+        engine: the class of the engine.
+
+    Raises:
+        ValueError: if the agent insists on compiled and it cannot be had.
+    """
+    if agent.engine == "interpreted":
+        agent.engine_in_use = "interpreted: asked for"
+        return None
+    try:
+        world = _world_for(agent, callback, make_world)
+    except NotCompilable as reason:
+        if agent.engine == "compiled":
+            raise ValueError(f"engine: compiled is not possible: {reason}") from None
+        agent.engine_in_use = f"interpreted: {reason}"
+        return None
+    agent.engine_in_use = "compiled"
+    if not draws_alike(agent.env):
+        if agent.engine == "auto":
+            agent.engine_in_use = (
+                "interpreted: the environment draws in its own way, so that compiled training "
+                "is equal in distribution only (engine: compiled takes that)"
+            )
+            return None
+        agent.engine_in_use = "compiled, not bit for bit: the environment draws in its own way"
+    return engine(agent, world, callback, log_interval)
+
+
+def _world_for(
+    agent: LearningAlgorithm, callback: BaseCallback, make_world: Callable[[VecEnv], Any]
+) -> Any:
+    check_class(type(agent))
+    for name in vars(agent):
+        if callable(vars(agent)[name]) and callable(getattr(type(agent), name, None)):
+            raise NotCompilable(f"this agent has a {name} of its own in Python")
+    unknown = unknown_callbacks(callback)
+    if unknown:
+        raise NotCompilable(f"{', '.join(unknown)} must be asked after each step")
+    agent.check_compilable()
+    for schedule in agent.schedules().values():
+        compiled_schedule(schedule)
+    assert agent.env is not None
+    return make_world(agent.env)
+
+
+def check_class(algorithm: type) -> None:
+    """Make sure that compiled functions do all that the algorithm does at a step.
+
+    Raises:
+        NotCompilable: naming what a class of its own does in Python instead.
+    """
+    order = algorithm.__mro__
+    for place, cls in enumerate(order[: order.index(LearningAlgorithm)]):
+        if cls.__module__.startswith("agents."):
+            continue
+        above = [vars(base) for base in order[place + 1 :] if base is not object]
+        for name, value in vars(cls).items():
+            in_python = hasattr(value, "__get__") and not hasattr(value, "py_func")
+            replaces = any(name in names for names in above) or name in _settings(algorithm)
+            if in_python and replaces and name not in SETTINGS:
+                raise NotCompilable(f"{algorithm.__name__} has a {name} of its own in Python")
+
+
+def _settings(algorithm: Any) -> tuple[str, ...]:
+    """Names of what compiled functions are told of an agent."""
+    return tuple(algorithm.settings_type.names)

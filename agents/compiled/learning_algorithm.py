@@ -13,15 +13,18 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, is_vectorized_observation
 
+from agents.common.algorithm import OnlineAlgorithm
 from agents.common.exploration import EPSILON_GREEDY
-from agents.common.online import OnlineAlgorithm
 from agents.common.schedules import ScheduleRow, schedule_row
-from agents.common.setting_checks import check_learning_rate, check_option
-from agents.common.signatures import CommonArguments, TieBreaking
-from agents.common.step_sizes import SAMPLE_AVERAGE
-from agents.compiled.compile_envs import NotCompilable
-from agents.compiled.dispatch import CompiledClass, check_functions, settings_dtype
-from agents.compiled.training_records import PROGRESS, UNDECIDED
+from agents.common.settings import (
+    SAMPLE_AVERAGE,
+    CommonArguments,
+    TieBreaking,
+    check_learning_rate,
+    check_option,
+)
+from agents.compiled.loop import CompiledClass, check_functions, settings_dtype
+from agents.compiled.worlds import PROGRESS, UNDECIDED, NotCompilable
 from mdp.array_types import Ints
 
 # Training, and exploring by another generator for a few numbers of observations.

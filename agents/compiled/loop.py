@@ -1,21 +1,158 @@
-"""The compiled training loop: many steps of acting and learning in one call.
-
-It does what the interpreted loop of `OnlineAlgorithm` does, in the same order, with the same
-functions and the same random numbers, so that both end in the same bits. What depends on the agent,
-the environment or the log is looked up by type (`agents.compiled.dispatch`).
-"""
+"""The compiled training loop, and how it finds the functions that it calls."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
 
+import numpy as np
+from numba.core import types
+from numba.extending import overload
 from numpy.typing import NDArray
 
 from agents.common.schedules import schedule_value
-from agents.compiled.dispatch import by_type
-from agents.compiled.env_steps import begin_episode, end_step
-from machine_code.compiling import inlined, kernel
+from agents.common.settings import CheckedConstructor
+from machine_code.cache import RULE_PREFIX
+from machine_code.compiling import (
+    INLINED_OPTIONS,
+    WITHOUT_WRAPPERS,
+    PartCompiler,
+    inlined,
+    is_interpreted,
+    kernel,
+)
 from mdp.array_types import Floats
+
+# Which function a compiled loop calls: decided by type, while the loop is compiled.
+#
+# A loop calls ``act(agent, ...)`` or ``step(world, ...)``. Of an environment, the function is the
+# attribute of that name of the world's class. Of an agent, it is that of the algorithm's class,
+# which
+# the record of its settings names. So each environment and each algorithm has a loop of its own, in
+# which nothing is looked up any more, and a new one is a class in a file of its own.
+
+Function = TypeVar("Function", bound=Callable[..., object])
+
+_ALGORITHMS: dict[str, type] = {}
+_DEFINITIONS: Counter[str] = Counter()
+_NAMES: set[str] = set()
+
+
+class CompiledOnlyError(TypeError):
+    """A function of `by_type` was called from Python, where nothing stands behind it."""
+
+
+def by_type(stub: Function) -> Function:
+    """Make a compiled function that calls its first argument's own function of that name."""
+    if is_interpreted():
+        raise RuntimeError("agents need Numba's compiler: unset NUMBA_DISABLE_JIT")
+    name = stub.__name__
+    _NAMES.add(name)
+
+    def choose(thing: Any, *others: Any) -> Any:
+        return getattr(getattr(_class_of(thing), name, None), "py_func", None)
+
+    options: Any = {**INLINED_OPTIONS, **WITHOUT_WRAPPERS, "pipeline_class": PartCompiler}
+    overload(stub, strict=False, jit_options=options)(choose)
+    return stub
+
+
+def _class_of(argument: Any) -> type | None:
+    """The world's class, or the algorithm's that the agent's settings name."""
+    # A reference has that of what it refers to.
+    argument = getattr(argument, "content", argument)
+    if not isinstance(argument, types.BaseNamedTuple):
+        return None
+    kind: Any = argument
+    if "settings" in kind.fields:
+        record = kind.types[kind.fields.index("settings")]
+        return next((_ALGORITHMS[name] for name in record.fields if name in _ALGORITHMS), None)
+    chosen: type = kind.instance_class
+    return chosen
+
+
+class CompiledClass(CheckedConstructor):
+    """The class of algorithms; what their loops are compiled from cannot be exchanged."""
+
+    def __setattr__(cls, name: str, value: object) -> None:  # noqa: N805  # of a metaclass
+        if name in _NAMES:
+            raise AttributeError(
+                f"{cls.__name__}.{name} is compiled into its loop: define a subclass with another"
+            )
+        super().__setattr__(name, value)
+
+
+def check_functions(algorithm: type) -> None:
+    """Make sure that what the compiled loop calls of an algorithm is compiled.
+
+    Raises:
+        TypeError: naming the function that is not, and what to do.
+    """
+    for name in _NAMES & vars(algorithm).keys():
+        if not hasattr(vars(algorithm)[name], "py_func"):
+            raise TypeError(
+                f"{algorithm.__name__}.{name} is called by compiled code: put @inlined of "
+                "machine_code.compiling on the function"
+            )
+
+
+def settings_dtype(algorithm: type, fields: Mapping[str, Any]) -> np.dtype[np.void]:
+    """The type of the record that holds an algorithm's settings.
+
+    Args:
+        algorithm: the class.
+        fields: types of the settings by their names, which are those of the agent's attributes.
+    """
+    name = f"{RULE_PREFIX}{algorithm.__module__} {algorithm.__qualname__}"
+    _DEFINITIONS[name] += 1
+    if _DEFINITIONS[name] > 1:
+        # Defined anew, as in a notebook: what was compiled for the old one must not run.
+        name = f"{name} {_DEFINITIONS[name]}"
+    _ALGORITHMS[name] = algorithm
+    return np.dtype([(name, np.uint8), *fields.items()], align=True)
+
+
+# What every compiled environment does around its own step: sums, time limit, episodes.
+
+
+@inlined
+def add_to_return(env: Any, reward: float, compensated: bool) -> None:
+    """Add as Python's `sum` does: since 3.12 it keeps track of what rounding takes."""
+    total = env.episode_return
+    new_total = total + reward
+    if compensated:
+        if abs(total) >= abs(reward):
+            env.compensation += (total - new_total) + reward
+        else:
+            env.compensation += (reward - new_total) + total
+    env.episode_return = new_total
+
+
+@inlined
+def begin_episode(env: Any) -> None:
+    """Start counting anew."""
+    env.elapsed = 0
+    env.episode_return = 0.0
+    env.compensation = 0.0
+
+
+@inlined
+def end_step(env: Any, time_limit: int, compensated: bool) -> None:
+    """Sum up the rewards, and see whether the episode is over; a limit of 0 is none."""
+    add_to_return(env, env.monitor_reward, compensated)
+    env.elapsed += 1
+    # A step that terminates and runs out of time counts as terminated, as DummyVecEnv has it.
+    env.done = env.terminated or (time_limit > 0 and env.elapsed >= time_limit)
+    env.new_obs = env.next_obs
+
+
+# The compiled training loop: many steps of acting and learning in one call.
+#
+# It does what the interpreted loop of `OnlineAlgorithm` does, in the same order, with the same
+# functions and the same random numbers, so that both end in the same bits. What depends on the
+# agent,
+# the environment or the log is looked up by type (`agents.compiled.loop`).
 
 
 @by_type

@@ -1,39 +1,248 @@
-"""The argument ``engine`` of the library's agents, and what it does to their training."""
+"""The argument ``engine`` of the library's agents: what it covers, costs and does."""
 
 from __future__ import annotations
 
 import inspect
+import statistics
 import sys
+import time
 from abc import abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim
-from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import FlattenExtractor
+from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
+from stable_baselines3.dqn.policies import DQNPolicy
+from torch import nn
 from torch.optim import Optimizer
 
-from agents.common.callback_horizons import EpisodeBudget, members, unknown_callbacks
-from agents.common.setting_checks import check_option
-from agents.compiled.compile_envs import NotCompilable
+from agents.common.callbacks import EpisodeBudget, members, unknown_callbacks
+from agents.common.settings import check_option
 from agents.compiled.learning_algorithm import compiled_schedule
-from agents.networks.engine_costs import STEPS_OF_EPISODE, Work
-from agents.networks.library_networks import Network
-from agents.networks.matrix_products import one_thread
-from agents.networks.network_engine import NetworkEngine
-from agents.networks.network_playing import NetworkPlayer, network_player
-from agents.networks.network_training import NetworkTraining
-from agents.networks.network_worlds import network_world
-from agents.networks.observations import Numbers, OwnVectors
-from agents.networks.perceptron import Inputs
-from agents.networks.rollout_events import RolloutEvents
-from agents.networks.shared_tensors import in_rows
+from agents.compiled.worlds import NotCompilable
+from agents.networks.engine import NetworkEngine, NetworkTraining, RolloutEvents
+from agents.networks.observations import Numbers, OwnVectors, network_world
+from agents.networks.perceptron import Inputs, one_thread
+from agents.networks.playing import NetworkPlayer, network_player
+from agents.networks.torch_bridge import Network, in_rows
+from machine_code.cache import is_compiled_before
+
+# Which trainings of the library's agents have a compiled counterpart.
+
+
+def check_agent(agent: Any) -> None:
+    """Make sure that compiled functions do all that an agent of the library does.
+
+    Raises:
+        NotCompilable: naming what they do not.
+    """
+    if not type(agent).__module__.startswith("agents."):
+        raise NotCompilable(f"{type(agent).__name__} may do things in Python of its own")
+    _check_spaces(agent)
+    if agent.device.type != "cpu":
+        raise NotCompilable(f"its networks live on {agent.device}")
+    kind = type(agent.policy)
+    if kind not in {ActorCriticPolicy, DQNPolicy}:
+        raise NotCompilable(f"its policy is {kind.__name__}, not a multilayer perceptron")
+    extractor = agent.policy.features_extractor_class
+    if extractor is not FlattenExtractor:
+        raise NotCompilable(f"observations go through {extractor.__name__}")
+
+
+def _check_spaces(agent: Any) -> None:
+    actions, observations = agent.action_space, agent.observation_space
+    if not isinstance(actions, spaces.Discrete):
+        raise NotCompilable(f"actions are {type(actions).__name__}, not Discrete")
+    for space in (actions, observations):
+        if isinstance(space, spaces.Discrete) and space.start != 0:
+            raise NotCompilable(f"{space} does not begin with 0")
+    if isinstance(observations, spaces.Discrete):
+        return
+    if not isinstance(observations, spaces.Box):
+        raise NotCompilable(f"observations are {type(observations).__name__}, not Box or Discrete")
+    if is_image_space(observations) or observations.dtype not in (np.float32, np.float64):
+        raise NotCompilable(f"observations are of {observations.dtype}")
+
+
+def check_q_agent(agent: Any) -> None:
+    """As `check_agent`, for DQN and its kin.
+
+    Raises:
+        NotCompilable: naming what has no compiled counterpart.
+    """
+    check_agent(agent)
+    if getattr(agent, "mask_actions", False):
+        raise NotCompilable("it masks actions")
+    buffer = agent.replay_buffer
+    if type(buffer) not in {ReplayBuffer, NStepReplayBuffer} or buffer.optimize_memory_usage:
+        raise NotCompilable("its replay buffer is of another kind")
+    if agent.n_envs > 1 and agent.train_freq.unit == TrainFrequencyUnit.EPISODE:
+        raise NotCompilable("train_freq counts the episodes of several environments")
+
+
+def check_policy_agent(agent: Any) -> None:
+    """As `check_agent`, for PPO and A2C.
+
+    Raises:
+        NotCompilable: naming what has no compiled counterpart.
+    """
+    check_agent(agent)
+    if agent.use_sde:
+        raise NotCompilable("it explores by the state (use_sde)")
+    if type(agent.rollout_buffer) is not RolloutBuffer:
+        raise NotCompilable("its rollout buffer is of another kind")
+
+
+# What a training of networks takes, in the library's loop and in compiled code.
+#
+# For ``engine: auto`` this decides which of them runs. It goes by the settings alone, never by the
+# machine or by what has been compiled before: the two draw other random numbers, so the same
+# settings
+# and the same seed must always choose the same one.
+
+# Processor seconds, measured on one core with one thread; `machine_pace` compares other machines.
+# Of the library's loop:
+CALL = 0.3e-3  # choosing actions for all environments, and keeping what comes of them
+ENV_STEP = 0.05e-3  # a step of one environment in Python, Monitor on
+UPDATE = {"q": 0.8e-3, "policy": 1.0e-3}  # learning from a minibatch: so much in any case,
+UPDATE_LAYER = {"q": 0.3e-3, "policy": 0.7e-3}  # for each layer,
+UPDATE_WEIGHT = 2.2e-10  # and for each weight and row of the minibatch
+# Of compiled code, the environment too:
+COMPILED_STEP = 1.5e-6
+COMPILED_ROW = 0.15e-6  # a row of a minibatch: so much in any case,
+COMPILED_WEIGHT = 1.2e-10  # and for each weight, but those of one-hot observations
+# Of compiled code with the environment in Python, for each call of it and in the environment:
+BRIDGE_CALL = 0.05e-3
+# Of compiling, once on a machine for all trainings of a kind.
+COMPILING = 9.0
+
+# What compiling must save, against the library's loop: as much as half of what it takes. Whoever
+# trains a second time has it back then.
+WORTH_COMPILING = 5.0
+# Where a budget counts episodes, their length is guessed.
+STEPS_OF_EPISODE = 100
+
+PACE_AT_HOME = 3.9e-3  # of `machine_pace`'s work, where the others were measured
+
+
+@dataclass(frozen=True)
+class Work:
+    """What a training does.
+
+    Attributes:
+        kind: ``"q"`` or ``"policy"``, which is a network of values too.
+        n_steps: environment steps, over all environments.
+        n_envs: environments at once.
+        n_updates: minibatches that are learnt from.
+        batch_size: rows of a minibatch.
+        n_layers: of one network.
+        n_weights: of all networks that learn.
+        n_dense_weights: of them, those that are multiplied where observations are one-hot.
+    """
+
+    kind: Literal["q", "policy"]
+    n_steps: float
+    n_envs: int
+    n_updates: float
+    batch_size: float
+    n_layers: int
+    n_weights: int
+    n_dense_weights: int
+
+    @property
+    def library_seconds(self) -> float:
+        """Processor seconds in the library's loop."""
+        update = UPDATE[self.kind] + UPDATE_LAYER[self.kind] * self.n_layers
+        update += UPDATE_WEIGHT * self.batch_size * self.n_weights
+        return self._n_calls * CALL + self.n_steps * ENV_STEP + self.n_updates * update
+
+    @property
+    def compiled_seconds(self) -> float:
+        """The same in compiled code, without compiling."""
+        row = COMPILED_ROW + COMPILED_WEIGHT * self.n_dense_weights
+        step = COMPILED_STEP + COMPILED_WEIGHT * self.n_dense_weights
+        return self.n_steps * step + self.n_updates * self.batch_size * row
+
+    @property
+    def bridged_seconds(self) -> float:
+        """The same with the environment in Python."""
+        in_python = self._n_calls * BRIDGE_CALL + self.n_steps * ENV_STEP
+        return self.compiled_seconds + in_python
+
+    @property
+    def is_worth_compiling(self) -> bool:
+        """Whether ``auto`` compiles it."""
+        return self.library_seconds - self.compiled_seconds >= WORTH_COMPILING
+
+    @property
+    def _n_calls(self) -> float:
+        return self.n_steps / self.n_envs
+
+
+def work_of(
+    kind: Literal["q", "policy"],
+    networks: Sequence[nn.Module],
+    observations: spaces.Space[Any],
+    n_steps: float,
+    n_envs: int,
+    n_updates: float,
+    batch_size: float,
+) -> Work:
+    """The work of perceptrons; other arguments are attributes of `Work`.
+
+    Args:
+        kind: of the agent.
+        networks: that learn.
+        observations: what they see.
+        n_steps: likewise.
+        n_envs: likewise.
+        n_updates: likewise.
+        batch_size: likewise.
+    """
+    linears = [[m for m in net.modules() if isinstance(m, nn.Linear)] for net in networks]
+    n_weights = sum(layer.weight.numel() for layers in linears for layer in layers)
+    is_one_hot = isinstance(observations, spaces.Discrete)
+    by_number = sum(layers[0].weight.numel() for layers in linears if is_one_hot and layers)
+    n_layers = max(len(layers) for layers in linears)
+    return Work(
+        kind, n_steps, n_envs, n_updates, batch_size, n_layers, n_weights, n_weights - by_number
+    )
+
+
+# The function whose machine code is there once a training of the kind has been compiled.
+_LAST_COMPILED = {"q": "learn_from_minibatch", "policy": "learn_from_rollout_minibatch"}
+
+
+def compiling_seconds(work: Work) -> float:
+    """What compiling is still to take on this machine: nothing where its result is on the disk."""
+    return 0.0 if is_compiled_before(_LAST_COMPILED[work.kind]) else COMPILING
+
+
+def machine_pace() -> float:
+    """How long this machine takes for what takes 1 where the constants were measured."""
+    rows, weights = th.ones(64, 64), th.full((64, 64), 1 / 64)
+    taken = []
+    with th.no_grad():
+        for _ in range(7):
+            began = time.process_time()
+            for _ in range(150):
+                rows = th.tanh(rows @ weights) + 0.1
+            taken.append(time.process_time() - began)
+    return statistics.median(taken) / PACE_AT_HOME
+
+
+# The argument ``engine`` of the library's agents, and what it does to their training.
 
 NetworkEngineChoice = Literal["library", "compiled", "auto"]
 TOO_SHORT = "so short a training is not worth compiling"
@@ -94,7 +303,7 @@ class CompiledNetworks(BaseAlgorithm):
         engine: ``"library"`` trains in the library's own loop; ``"compiled"`` in compiled code, the
             environment too where its model is known, to the same results but for rounding and
             random numbers, and is refused where that cannot be; ``"auto"`` compiles where it can
-            and the training is long enough, by `agents.networks.engine_costs.Work`, which goes by
+            and the training is long enough, by `agents.networks.engine_setting.Work`, which goes by
             settings and budget alone.
         args: the library's arguments.
         kwargs: likewise.

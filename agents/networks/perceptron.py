@@ -1,37 +1,355 @@
-"""A multilayer perceptron and its gradient, with all parameters in one flat vector.
-
-Weights of a layer lie as (inputs, outputs), the transpose of PyTorch's: of an input that is one-hot
-a row is all that has to be read. What layers put out lies in one array as well, a layer after the
-other, so that nothing is allocated while training; behind it what activation functions were given,
-where their derivatives ask for that.
-
-Source: Goodfellow, Bengio and Courville, Deep Learning (2016), algorithms 6.3 and 6.4.
-"""
+"""A multilayer perceptron, its gradient and its optimizers, on flat vectors in single precision."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from contextlib import AbstractContextManager
+from functools import cache
+from typing import Any, NamedTuple
 
 import numpy as np
+from numba.core import cgutils, types
+from numba.extending import get_cython_function_address, intrinsic
+from numpy.typing import NDArray
+from threadpoolctl import ThreadpoolController
 
-from agents.networks.activations import (
-    FIRST_BY_INPUT,
-    IDENTITY,
-    activate,
-    activate_kept,
-    pull_back,
-    pull_back_kept,
-)
-from agents.networks.matrix_products import (
-    Singles,
-    multiply,
-    multiply_transposed_left,
-    multiply_transposed_right,
-    sgemm_address,
-)
-from machine_code.compiling import vectorised, view
+from machine_code.compiling import called, internal, vectorised, view
 from mdp.array_types import Ints
+
+# Products of matrices in single precision, by the BLAS that SciPy brings.
+#
+# Numba's own `numpy.dot` wants to count references, which compiled loops here do without. BLAS
+# counts
+# by columns, so that it is handed the transposed problem: the rows of one matrix are its columns.
+
+Singles = NDArray[np.float32]
+
+ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
+
+AS_IT_IS = ord("N")
+TRANSPOSED = ord("T")
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    # SciPy's BLAS is there by now: it has been asked for its address.
+    return ThreadpoolController()
+
+
+def one_thread() -> AbstractContextManager[Any]:
+    """Let BLAS work in one thread for a while.
+
+    Matrices are too small for more to pay, and with several the last bits depend on their number.
+    """
+    sgemm_address()
+    limited: AbstractContextManager[Any] = _controller().limit(limits=1, user_api="blas")
+    return limited
+
+
+def sgemm_address() -> np.uintp:
+    """Where BLAS's routine lies in this process, for compiled functions to call."""
+    return np.uintp(get_cython_function_address("scipy.linalg.cython_blas", "sgemm"))
+
+
+@intrinsic
+def _sgemm(
+    typing_context: Any,
+    address: Any,
+    first_kind: Any,
+    second_kind: Any,
+    m: Any,
+    n: Any,
+    k: Any,
+    first: Any,
+    first_stride: Any,
+    second: Any,
+    second_stride: Any,
+    product: Any,
+    product_stride: Any,
+) -> Any:
+    """BLAS's ``sgemm``, without the factors: all it is given are addresses of numbers."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        address, first_kind, second_kind, *numbers = arguments
+        m, n, k, first, first_stride, second, second_stride, product, product_stride = numbers
+        place: Any = cgutils.alloca_once_value
+        single, integer, character = ir.FloatType(), ir.IntType(32), ir.IntType(8)
+
+        def kept(value: Any, kind: Any) -> Any:
+            return place(builder, builder.trunc(value, kind))
+
+        def matrix(value: Any) -> Any:
+            return builder.inttoptr(value, single.as_pointer())
+
+        one, zero = (place(builder, ir.Constant(single, factor)) for factor in (1.0, 0.0))
+        passed = [
+            kept(first_kind, character),
+            kept(second_kind, character),
+            *(kept(size, integer) for size in (m, n, k)),
+            one,
+            matrix(first),
+            kept(first_stride, integer),
+            matrix(second),
+            kept(second_stride, integer),
+            zero,
+            matrix(product),
+            kept(product_stride, integer),
+        ]
+        kind = ir.FunctionType(ir.VoidType(), [value.type for value in passed])
+        builder.call(builder.inttoptr(address, kind.as_pointer()), passed)
+        return context.get_dummy_value()
+
+    size, place = types.int64, types.uintp
+    return (
+        types.void(place, size, size, size, size, size, place, size, place, size, place, size),
+        build,
+    )
+
+
+# Numba takes the first argument away, which type checkers cannot see.
+_call: Any = _sgemm
+
+
+@internal
+def _multiply(
+    sgemm: Any, left: Singles, left_kind: int, right: Singles, right_kind: int, product: Singles
+) -> None:
+    """The product of two matrices, each as it is or transposed."""
+    m, n = product.shape
+    inner = left.shape[1] if left_kind == AS_IT_IS else left.shape[0]
+    _call(
+        sgemm,
+        right_kind,
+        left_kind,
+        n,
+        m,
+        inner,
+        right.ctypes.data,
+        right.shape[1],
+        left.ctypes.data,
+        left.shape[1],
+        product.ctypes.data,
+        n,
+    )
+
+
+@internal
+def multiply(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
+    """``product = left @ right``, of shapes (m, k), (k, n) and (m, n)."""
+    _multiply(sgemm, left, AS_IT_IS, right, AS_IT_IS, product)
+
+
+@internal
+def multiply_transposed_left(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
+    """``product = left.T @ right``, of shapes (k, m), (k, n) and (m, n)."""
+    _multiply(sgemm, left, TRANSPOSED, right, AS_IT_IS, product)
+
+
+@internal
+def multiply_transposed_right(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
+    """``product = left @ right.T``, of shapes (m, k), (n, k) and (m, n)."""
+    _multiply(sgemm, left, AS_IT_IS, right, TRANSPOSED, product)
+
+
+# Activation functions in single precision, and their derivatives.
+#
+# Those of the first can be told from the output alone. Of the others inputs are kept.
+#
+# Sources: Clevert, Unterthiner and Hochreiter (2016) for ELU, Klambauer et al. (2017) for SELU,
+# Hendrycks and Gimpel (2016) for GELU and SiLU, Misra (2020) for Mish.
+
+IDENTITY, RELU, TANH, ELU, LEAKY_RELU, SIGMOID = range(6)
+SELU, SOFTPLUS, SILU, GELU, FAST_GELU, MISH = range(6, 12)
+
+# From here on inputs are kept for the derivative.
+FIRST_BY_INPUT = SELU
+
+# Coefficients of a rational function of x squared, from the highest power on, as Eigen's
+# `generic_fast_tanh_float` has them: within a few units in the last place, and without a call, so
+# that many numbers are worked out at once.
+_NUMERATOR = (
+    np.float32(-2.76076847742355e-16),
+    np.float32(2.00018790482477e-13),
+    np.float32(-8.60467152213735e-11),
+    np.float32(5.12229709037114e-08),
+    np.float32(1.48572235717979e-05),
+    np.float32(6.37261928875436e-04),
+    np.float32(4.89352455891786e-03),
+)
+_DENOMINATOR = (
+    np.float32(1.19825839466702e-06),
+    np.float32(1.18534705686654e-04),
+    np.float32(2.26843463243900e-03),
+    np.float32(4.89352518554385e-03),
+)
+# From here on the hyperbolic tangent is 1 in single precision.
+_BOUND = np.float32(7.90531110763549805)
+_ZERO, _ONE = np.float32(0), np.float32(1)
+
+_SELU_SCALE, _SELU_ALPHA = 1.0507009873554805, 1.6732632423543772
+_SQRT_HALF, _SQRT_PI = math.sqrt(0.5), math.sqrt(math.pi)
+# Of GELU's approximation, 0.5 (1 + tanh(u)) being sigmoid(2 u).
+_GELU_SCALE, _GELU_CUBE = math.sqrt(2 / math.pi), 0.044715
+
+
+@internal
+def tanh(x: Any) -> Any:
+    """The hyperbolic tangent of a single-precision number."""
+    # What is not a number stays that.
+    x = _BOUND if x > _BOUND else x
+    x = -_BOUND if x < -_BOUND else x
+    square = x * x
+    top, bottom = _NUMERATOR[0], _DENOMINATOR[0]
+    for coefficient in _NUMERATOR[1:]:
+        top = top * square + coefficient
+    for coefficient in _DENOMINATOR[1:]:
+        bottom = bottom * square + coefficient
+    return x * top / bottom
+
+
+@vectorised
+def activate(rows: Singles, bias: Singles, kind: int, slope: Any) -> None:
+    """Add the bias to each row, shape (n, d), and apply the function of that kind."""
+    for i in range(len(rows)):
+        row = rows[i]
+        if kind == RELU:
+            for j in range(len(row)):
+                x = row[j] + bias[j]
+                row[j] = _ZERO if x < _ZERO else x
+        elif kind == TANH:
+            for j in range(len(row)):
+                row[j] = tanh(row[j] + bias[j])
+        else:
+            for j in range(len(row)):
+                row[j] = _one_by_one(row[j] + bias[j], kind, slope)
+
+
+@internal
+def _one_by_one(x: Any, kind: int, slope: Any) -> Any:
+    if kind == ELU:
+        return x if x > _ZERO else slope * np.float32(math.expm1(x))
+    if kind == LEAKY_RELU:
+        return x if x > _ZERO else slope * x
+    if kind == SIGMOID:
+        return np.float32(1 / (1 + math.exp(-x)))
+    return x
+
+
+# Those of the other kinds are rare: by functions of their own, which are called for each number,
+# they add little to what has to be compiled.
+
+
+@called
+def activate_kept(
+    inputs: Singles, bias: Singles, outputs: Singles, kind: int, slope: float
+) -> None:
+    """As `activate`, of a function from `FIRST_BY_INPUT` on; ``inputs`` keep what it is given."""
+    for i in range(len(inputs)):
+        row, to = inputs[i], outputs[i]
+        for j in range(len(row)):
+            row[j] += bias[j]
+            to[j] = np.float32(_by_input(float(row[j]), kind, slope))
+
+
+@called
+def _by_input(x: float, kind: int, slope: float) -> float:
+    if kind == SELU:
+        return _SELU_SCALE * (x if x > 0 else _SELU_ALPHA * math.expm1(x))
+    if kind == SOFTPLUS:
+        return _softplus(x * slope) / slope
+    if kind == SILU:
+        return x * _sigmoid(x)
+    if kind == GELU:
+        return x * _normal_probability(x)
+    if kind == FAST_GELU:
+        return x * _sigmoid(2 * _GELU_SCALE * (x + _GELU_CUBE * x**3))
+    return x * math.tanh(_softplus(x))
+
+
+@internal
+def _sigmoid(x: float) -> float:
+    return 1 / (1 + math.exp(-x))
+
+
+@internal
+def _softplus(x: float) -> float:
+    """Logarithm of 1 + exp(x), without running over."""
+    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
+
+
+@internal
+def _normal_probability(x: float) -> float:
+    """That a standard normal number is below."""
+    return 0.5 * math.erfc(-x * _SQRT_HALF)
+
+
+@vectorised
+def pull_back(errors: Singles, outputs: Singles, kind: int, slope: Any) -> None:
+    """Turn derivatives by the outputs into those by the inputs, in place; both of shape (n, d)."""
+    for i in range(len(errors)):
+        error, output = errors[i], outputs[i]
+        if kind == RELU:
+            for j in range(len(error)):
+                error[j] = error[j] if output[j] > _ZERO else _ZERO
+        elif kind == TANH:
+            for j in range(len(error)):
+                error[j] *= _ONE - output[j] * output[j]
+        else:
+            for j in range(len(error)):
+                error[j] *= _derivative(output[j], kind, slope)
+
+
+@internal
+def _derivative(output: Any, kind: int, slope: Any) -> Any:
+    if kind == ELU:
+        return _ONE if output > _ZERO else output + slope
+    if kind == LEAKY_RELU:
+        return _ONE if output > _ZERO else slope
+    if kind == SIGMOID:
+        return output * (_ONE - output)
+    return _ONE
+
+
+@called
+def pull_back_kept(errors: Singles, inputs: Singles, kind: int, slope: float) -> None:
+    """As `pull_back`, of a function from `FIRST_BY_INPUT` on."""
+    for i in range(len(errors)):
+        error, row = errors[i], inputs[i]
+        for j in range(len(error)):
+            error[j] *= np.float32(_derivative_by_input(float(row[j]), kind, slope))
+
+
+@called
+def _derivative_by_input(x: float, kind: int, slope: float) -> float:
+    if kind == SELU:
+        return _SELU_SCALE * (1.0 if x > 0 else _SELU_ALPHA * math.exp(x))
+    if kind == SOFTPLUS:
+        return _sigmoid(x * slope)
+    if kind == SILU:
+        share = _sigmoid(x)
+        return share * (1 + x * (1 - share))
+    if kind == GELU:
+        density = math.exp(-0.5 * x * x) * _SQRT_HALF / _SQRT_PI
+        return _normal_probability(x) + x * density
+    if kind == FAST_GELU:
+        share = _sigmoid(2 * _GELU_SCALE * (x + _GELU_CUBE * x**3))
+        inner = 2 * _GELU_SCALE * (1 + 3 * _GELU_CUBE * x * x)
+        return share * (1 + x * (1 - share) * inner)
+    gate = math.tanh(_softplus(x))
+    return gate + x * (1 - gate * gate) * _sigmoid(x)
+
+
+# A multilayer perceptron and its gradient, with all parameters in one flat vector.
+#
+# Weights of a layer lie as (inputs, outputs), the transpose of PyTorch's: of an input that is
+# one-hot
+# a row is all that has to be read. What layers put out lies in one array as well, a layer after the
+# other, so that nothing is allocated while training; behind it what activation functions were
+# given,
+# where their derivatives ask for that.
+#
+# Source: Goodfellow, Bengio and Courville, Deep Learning (2016), algorithms 6.3 and 6.4.
 
 
 class Layers(NamedTuple):
@@ -42,7 +360,7 @@ class Layers(NamedTuple):
         weights_at: where the weights of each layer begin in the flat vector, shape (L,).
         biases_at: where its biases do, shape (L,).
         outputs_at: where its outputs begin in an array of outputs, for each row, shape (L,).
-        activation: what follows each layer but the last, of `agents.networks.activations`.
+        activation: what follows each layer but the last, of `agents.networks.perceptron`.
         slope: the one parameter of that function, where it has one.
         one_hot: 1 where inputs are numbers that stand for one-hot vectors.
         sgemm: the address of BLAS's routine.
@@ -232,3 +550,113 @@ def _add_rows(rows: Singles, indices: Ints, totals: Singles) -> None:
         row, total = rows[i], totals[indices[i]]
         for j in range(len(row)):
             total[j] += row[j]
+
+
+# Steps of gradient descent as PyTorch's optimizers take them, on flat vectors.
+#
+# Sources: Kingma and Ba (2015) for Adam, Loshchilov and Hutter (2019) for AdamW; Tieleman and
+# Hinton
+# (2012) for RMSprop, with TensorFlow's place of epsilon as Stable-Baselines3 has it; Pascanu,
+# Mikolov
+# and Bengio (2013) for clipping.
+
+ADAM, ADAMW, RMSPROP, RMSPROP_TENSORFLOW = range(4)
+
+# Moments of units that are dead would come so close to zero that processors take a hundred cycles
+# for each operation on them. What lies below counts as zero; what is not a number stays that.
+_TINY, _TINY_SQUARE = np.float32(1e-17), np.float32(1e-36)
+
+
+class Optimizer(NamedTuple):
+    """An optimizer and what it remembers.
+
+    Attributes:
+        kind: `ADAM`, `ADAMW`, `RMSPROP` or `RMSPROP_TENSORFLOW`.
+        momentum: Adam's beta_1.
+        smoothing: Adam's beta_2, RMSprop's alpha.
+        epsilon: keeps divisors from zero.
+        weight_decay: how much parameters are drawn to zero: by a part of the gradient, or with
+            `ADAMW` beside it.
+        mean: running mean of gradients, as long as the parameters.
+        mean_square: of their squares.
+        n_steps: steps taken so far, alone in an array, in single precision as PyTorch has it.
+    """
+
+    kind: int
+    momentum: float
+    smoothing: float
+    epsilon: float
+    weight_decay: float
+    mean: Singles
+    mean_square: Singles
+    n_steps: Singles
+
+
+@vectorised
+def descend(
+    optimizer: Optimizer,
+    flat: Singles,
+    gradient: Singles,
+    learning_rate: float,
+    max_grad_norm: float,
+) -> None:
+    """Take one step against the gradient, whose norm is clipped first."""
+    scale = _clipping(gradient, max_grad_norm)
+    optimizer.n_steps[0] += np.float32(1)
+    if optimizer.kind <= ADAMW:
+        _adam(optimizer, flat, gradient, scale, learning_rate)
+    else:
+        _rmsprop(optimizer, flat, gradient, scale, learning_rate)
+
+
+@vectorised
+def _clipping(gradient: Singles, max_grad_norm: float) -> Any:
+    """What gradients are multiplied by, as ``torch.nn.utils.clip_grad_norm_`` has it."""
+    total = _ZERO
+    for i in range(len(gradient)):
+        total += gradient[i] * gradient[i]
+    scale = max_grad_norm / (math.sqrt(total) + 1e-6)
+    return _ONE if scale >= 1.0 else np.float32(scale)
+
+
+@vectorised
+def _adam(
+    optimizer: Optimizer, flat: Singles, gradient: Singles, scale: Any, learning_rate: float
+) -> None:
+    n_steps = float(optimizer.n_steps[0])
+    rate = np.float32(1 - optimizer.momentum)
+    kept, square_rate = np.float32(optimizer.smoothing), np.float32(1 - optimizer.smoothing)
+    step_size = np.float32(learning_rate / (1 - optimizer.momentum**n_steps))
+    correction = np.float32(1 / math.sqrt(1 - optimizer.smoothing**n_steps))
+    epsilon = np.float32(optimizer.epsilon)
+    decay = np.float32(optimizer.weight_decay if optimizer.kind == ADAM else 0.0)
+    beside = learning_rate * optimizer.weight_decay if optimizer.kind == ADAMW else 0.0
+    left = np.float32(1 - beside)
+    mean, mean_square = optimizer.mean, optimizer.mean_square
+    for i in range(len(flat)):
+        slope = gradient[i] * scale + decay * flat[i]
+        slope = _ZERO if abs(slope) <= _TINY else slope
+        first = mean[i] + (slope - mean[i]) * rate
+        first = _ZERO if abs(first) <= _TINY else first
+        second = mean_square[i] * kept + slope * slope * square_rate
+        second = _ZERO if second <= _TINY_SQUARE else second
+        mean[i], mean_square[i] = first, second
+        flat[i] = left * flat[i] - step_size * first / (np.sqrt(second) * correction + epsilon)
+
+
+@vectorised
+def _rmsprop(
+    optimizer: Optimizer, flat: Singles, gradient: Singles, scale: Any, learning_rate: float
+) -> None:
+    kept, square_rate = np.float32(optimizer.smoothing), np.float32(1 - optimizer.smoothing)
+    inside = np.float32(optimizer.epsilon if optimizer.kind == RMSPROP_TENSORFLOW else 0.0)
+    outside = np.float32(0.0 if optimizer.kind == RMSPROP_TENSORFLOW else optimizer.epsilon)
+    step_size, decay = np.float32(learning_rate), np.float32(optimizer.weight_decay)
+    mean_square = optimizer.mean_square
+    for i in range(len(flat)):
+        slope = gradient[i] * scale + decay * flat[i]
+        slope = _ZERO if abs(slope) <= _TINY else slope
+        second = mean_square[i] * kept + slope * slope * square_rate
+        second = _ZERO if second <= _TINY_SQUARE else second
+        mean_square[i] = second
+        flat[i] -= step_size * slope / (np.sqrt(second + inside) + outside)

@@ -1,7 +1,8 @@
-"""Policy optimisation as the compiled loop runs it, in the order of events of Stable-Baselines3."""
+"""Policy optimisation as the compiled loop runs it: rollouts, updates, order of events."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,17 +10,339 @@ from numpy.typing import NDArray
 
 from agents.common.schedules import schedule_value
 from agents.compiled.generators import next_uniform
-from agents.compiled.training_records import SCHEDULE
-from agents.networks.categorical import draw, log_probability
-from agents.networks.matrix_products import Singles
+from agents.compiled.worlds import SCHEDULE
 from agents.networks.observations import AFTER, BEFORE, look, move_on, observe, show
-from agents.networks.optimizers import Optimizer
-from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
-from agents.networks.policy_updates import RolloutMinibatch
-from agents.networks.references import call
-from agents.networks.rollouts import Rollout, explained_variance, shuffle
-from machine_code.compiling import inlined, kernel
+from agents.networks.perceptron import (
+    Inputs,
+    Layers,
+    Optimizer,
+    Singles,
+    backward,
+    descend,
+    forward,
+    last_outputs,
+)
+from agents.networks.torch_bridge import call
+from machine_code.compiling import called, inlined, kernel
 from mdp.array_types import Ints
+
+# The softmax distribution over actions that a network's outputs stand for.
+
+
+@inlined
+def log_normalizer(logits: Singles) -> float:
+    """Logarithm of the sum of exponentials, shape (n,) in."""
+    top = logits[0]
+    for k in range(1, len(logits)):
+        top = max(top, logits[k])
+    total = 0.0
+    for k in range(len(logits)):
+        total += math.exp(float(logits[k] - top))
+    return float(top) + math.log(total)
+
+
+@inlined
+def draw(logits: Singles, uniform: float) -> int:
+    """The action that a number in [0, 1) picks."""
+    normalizer, cumulative = log_normalizer(logits), 0.0
+    for k in range(len(logits) - 1):
+        cumulative += math.exp(float(logits[k]) - normalizer)
+        if uniform < cumulative:
+            return k
+    return len(logits) - 1
+
+
+@inlined
+def log_probability(logits: Singles, action: int) -> float:
+    """Of an action."""
+    return float(logits[action]) - log_normalizer(logits)
+
+
+@inlined
+def fill_probabilities(logits: Singles, normalizer: float, probabilities: Any) -> float:
+    """Work out all probabilities, shape (n,); the entropy in nats is returned."""
+    entropy = 0.0
+    for k in range(len(logits)):
+        logarithm = float(logits[k]) - normalizer
+        probability = math.exp(logarithm)
+        entropy -= probability * logarithm
+        probabilities[k] = np.float32(probability)
+    return entropy
+
+
+@inlined
+def turn_into_slopes(
+    probabilities: Any,
+    logits: Singles,
+    normalizer: float,
+    entropy: float,
+    action: int,
+    by_log: float,
+    by_entropy: float,
+) -> None:
+    """Derivatives by the logits of what depends on them in two ways, in place of probabilities.
+
+    Args:
+        probabilities: what `fill_probabilities` has left, shape (n,).
+        logits: the outputs of the network.
+        normalizer: their `log_normalizer`.
+        entropy: of the distribution.
+        action: the action taken.
+        by_log: derivative by the logarithm of its probability.
+        by_entropy: derivative by the entropy.
+    """
+    for k in range(len(logits)):
+        probability = float(probabilities[k])
+        surplus = float(logits[k]) - normalizer + entropy
+        slope = -probability * (by_log + by_entropy * surplus)
+        probabilities[k] = np.float32(slope + by_log if k == action else slope)
+
+
+# The library's rollout buffer, whose own arrays are used: advantages, and minibatches of it.
+
+
+class Rollout(NamedTuple):
+    """The library's rollout buffer but for observations: T steps of E environments.
+
+    Attributes:
+        actions: shape (T, E, 1).
+        rewards: shape (T, E).
+        episode_starts: 1 where an episode began with the observation, shape (T, E).
+        values: of the observations, shape (T, E).
+        log_probs: of the actions, shape (T, E).
+        advantages: shape (T, E).
+        returns: what the values are to be, shape (T, E).
+    """
+
+    actions: Ints
+    rewards: Singles
+    episode_starts: Singles
+    values: Singles
+    log_probs: Singles
+    advantages: Singles
+    returns: Singles
+
+
+class RolloutMemory(NamedTuple):
+    """What minibatches are taken from, by reference.
+
+    Attributes:
+        observations: shape (T, E, d); numbers of states have d = 1.
+        rollout: the rest of the buffer.
+        order: numbers of the rollout's steps, shuffled, shape (T * E,).
+        batch: what is filled, a `RolloutMinibatch`.
+        one_hot: whether observations are numbers of states.
+    """
+
+    observations: Any
+    rollout: Rollout
+    order: Ints
+    batch: Any
+    one_hot: int
+
+
+@kernel
+def estimate_advantages(learner: Any, _: float, __: float) -> int:
+    """Generalised advantage estimation (Schulman et al., 2016), from the last step backwards."""
+    rollout, rules = learner.rollout, learner.rules[0]
+    n_steps, n_envs = rollout.rewards.shape
+    gamma = rules.buffer_gamma
+    for i in range(n_envs):
+        advantage, next_value = 0.0, float(learner.last_values[i])
+        goes_on = 1.0 - learner.starts[i]
+        for step in range(n_steps - 1, -1, -1):
+            value = float(rollout.values[step, i])
+            error = rollout.rewards[step, i] + gamma * next_value * goes_on - value
+            advantage = error + gamma * rules.gae_lambda * goes_on * advantage
+            rollout.advantages[step, i] = np.float32(advantage)
+            rollout.returns[step, i] = np.float32(advantage + value)
+            next_value, goes_on = value, 1.0 - rollout.episode_starts[step, i]
+    return 0
+
+
+@called
+def explained_variance(rollout: Rollout) -> float:
+    """1 - Var(returns - values) / Var(returns), as in the library's log; nan for equal returns."""
+    n_steps, n_envs = rollout.returns.shape
+    n, mean, mean_error = n_steps * n_envs, 0.0, 0.0
+    for step in range(n_steps):
+        for i in range(n_envs):
+            mean += rollout.returns[step, i] / n
+            mean_error += (rollout.returns[step, i] - rollout.values[step, i]) / n
+    variance = unexplained = 0.0
+    for step in range(n_steps):
+        for i in range(n_envs):
+            error = rollout.returns[step, i] - rollout.values[step, i]
+            variance += (rollout.returns[step, i] - mean) ** 2
+            unexplained += (error - mean_error) ** 2
+    return 1.0 - unexplained / variance if variance > 0 else math.nan
+
+
+@inlined
+def shuffle(numbers: Ints, handle: Any) -> None:
+    """Put 0, 1, ... into a random order (Fisher and Yates)."""
+    for i in range(len(numbers)):
+        numbers[i] = i
+    for i in range(len(numbers) - 1, 0, -1):
+        j = int(next_uniform(handle) * (i + 1))
+        numbers[i], numbers[j] = numbers[j], numbers[i]
+
+
+@kernel
+def pick_steps(memory: Any, begin: float, n: float) -> int:
+    """Copy ``n`` steps of the rollout into the minibatch, in its order from ``begin`` on."""
+    rollout, batch, first = memory.rollout, memory.batch, int(begin)
+    n_envs = rollout.rewards.shape[1]
+    for k in range(int(n)):
+        number = memory.order[first + k]
+        step, i = number // n_envs, number % n_envs
+        show(batch.states, k, memory.observations[step, i], memory.one_hot)
+        batch.actions[k] = int(rollout.actions[step, i, 0])
+        batch.log_probs[k] = rollout.log_probs[step, i]
+        batch.advantages[k] = rollout.advantages[step, i]
+        batch.returns[k] = rollout.returns[step, i]
+        batch.values[k] = rollout.values[step, i]
+    return int(n)
+
+
+# One step of proximal policy optimisation on a minibatch.
+#
+# A2C is the same with one minibatch of the whole rollout and nothing clipped (Huang et al., 2022):
+# the ratio of probabilities is 1 then.
+#
+# Source: Schulman et al. (2017), in the form of Stable-Baselines3.
+
+# What the library's log has of a minibatch.
+LOSSES = np.dtype(
+    [
+        ("policy_gradient", np.float64),
+        ("likelihood", np.float64),  # minus the mean of advantage times log-probability
+        ("value", np.float64),
+        ("entropy", np.float64),
+        ("total", np.float64),
+        ("kl", np.float64),  # Schulman's estimate
+        ("clipped", np.float64),  # share of the ratios
+    ],
+    align=True,
+)
+
+
+class RolloutMinibatch(NamedTuple):
+    """Steps that are learnt from at once.
+
+    Attributes:
+        states: observations, of B rows.
+        actions: shape (B,).
+        log_probs: of the actions when they were taken, shape (B,).
+        advantages: shape (B,).
+        returns: what the values are to be, shape (B,).
+        values: what they were, shape (B,).
+    """
+
+    states: Inputs
+    actions: Ints
+    log_probs: Singles
+    advantages: Singles
+    returns: Singles
+    values: Singles
+
+
+@kernel
+def learn_from_rollout_minibatch(learner: Any, n_rows: float, learning_rate: float) -> int:
+    """Take one step of gradient descent on the first ``n_rows`` rows of `learner.batch`.
+
+    Args:
+        learner: both networks, the optimizer and the minibatch.
+        n_rows: number of rows.
+        learning_rate: of the optimizer.
+
+    Returns:
+        0 where the policy has moved too far already, and nothing was done; otherwise 1.
+    """
+    batch, rules, losses = learner.batch, learner.rules[0], learner.losses[0]
+    n = int(n_rows)
+    if rules.normalize_advantage and n > 1:
+        standardize(batch.advantages[:n])
+    states = batch.states
+    forward(learner.policy, learner.flat, states, n, learner.policy_outputs)
+    forward(learner.value, learner.flat, states, n, learner.value_outputs)
+    _policy_errors(learner, n, learner.place[0].clip_range)
+    _value_errors(learner, n, learner.place[0].clip_range_vf)
+    losses.total = (
+        losses.policy_gradient + rules.ent_coef * losses.entropy + rules.vf_coef * losses.value
+    )
+    if losses.kl > 1.5 * rules.target_kl:
+        return 0
+    for layers, outputs, errors in (
+        (learner.policy, learner.policy_outputs, learner.policy_errors),
+        (learner.value, learner.value_outputs, learner.value_errors),
+    ):
+        backward(layers, learner.flat, states, n, outputs, errors, learner.gradient)
+    descend(learner.optimizer, learner.flat, learner.gradient, learning_rate, rules.max_grad_norm)
+    return 1
+
+
+@called
+def standardize(numbers: Singles) -> None:
+    """Give them mean 0 and standard deviation 1, as far as they have one."""
+    n = len(numbers)
+    mean = squares = 0.0
+    for i in range(n):
+        mean += numbers[i]
+    mean /= n
+    for i in range(n):
+        squares += (numbers[i] - mean) ** 2
+    scale = 1.0 / (math.sqrt(squares / (n - 1)) + 1e-8)
+    for i in range(n):
+        numbers[i] = np.float32((numbers[i] - mean) * scale)
+
+
+@called
+def _policy_errors(learner: Any, n: int, clip_range: float) -> None:
+    """Write the loss's derivatives by the logits, and note what the policy adds to it."""
+    batch, losses = learner.batch, learner.losses[0]
+    logits = last_outputs(learner.policy, learner.policy_outputs, n)
+    slopes = last_outputs(learner.policy, learner.policy_errors, n)
+    losses.policy_gradient = losses.likelihood = losses.entropy = 0.0
+    losses.kl = losses.clipped = 0.0
+    by_entropy = -learner.rules[0].ent_coef / n
+    for i in range(n):
+        row, action, advantage = logits[i], batch.actions[i], float(batch.advantages[i])
+        normalizer = log_normalizer(row)
+        log_prob = float(row[action]) - normalizer
+        log_ratio = log_prob - batch.log_probs[i]
+        ratio = math.exp(log_ratio)
+        bounded = min(max(ratio, 1 - clip_range), 1 + clip_range)
+        gain = min(advantage * ratio, advantage * bounded)
+        # Past its bound a ratio counts no further, unless it has to come back.
+        moves = ratio == bounded or advantage * ratio < advantage * bounded
+        by_log = -advantage * ratio / n if moves else 0.0
+        entropy = fill_probabilities(row, normalizer, slopes[i])
+        turn_into_slopes(slopes[i], row, normalizer, entropy, action, by_log, by_entropy)
+        losses.policy_gradient -= gain / n
+        losses.likelihood -= advantage * log_prob / n
+        losses.entropy -= entropy / n
+        losses.kl += (ratio - 1 - log_ratio) / n
+        losses.clipped += (1.0 / n) if abs(ratio - 1) > clip_range else 0.0
+
+
+@called
+def _value_errors(learner: Any, n: int, clip_range_vf: float) -> None:
+    """Write the loss's derivatives by the values, and note what these add to it."""
+    batch, losses = learner.batch, learner.losses[0]
+    values = last_outputs(learner.value, learner.value_outputs, n)
+    slopes = last_outputs(learner.value, learner.value_errors, n)
+    losses.value = 0.0
+    factor = 2 * learner.rules[0].vf_coef / n
+    for i in range(n):
+        moved = float(values[i, 0]) - batch.values[i]
+        predicted = batch.values[i] + min(max(moved, -clip_range_vf), clip_range_vf)
+        error = predicted - batch.returns[i]
+        slopes[i, 0] = np.float32(factor * error) if abs(moved) <= clip_range_vf else np.float32(0)
+        losses.value += error * error / n
+
+
+# Policy optimisation as the compiled loop runs it, in the order of events of Stable-Baselines3.
 
 # Settings, under the library's names where it has one.
 RULES = np.dtype(

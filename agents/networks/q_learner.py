@@ -1,4 +1,4 @@
-"""Deep Q-learning as the compiled loop runs it, in the order of events of Stable-Baselines3."""
+"""Deep Q-learning as the compiled loop runs it: minibatches, updates, order of events."""
 
 from __future__ import annotations
 
@@ -8,15 +8,232 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agents.compiled.generators import next_uniform
-from agents.networks.matrix_products import Singles
 from agents.networks.observations import AFTER, BEFORE, look, move_on, observe, show
-from agents.networks.optimizers import Optimizer
-from agents.networks.perceptron import Inputs, Layers, forward, last_outputs
-from agents.networks.q_updates import best_of, follow
-from agents.networks.references import call
-from agents.networks.replay_batches import Minibatch
-from machine_code.compiling import inlined, kernel
-from mdp.array_types import Ints
+from agents.networks.perceptron import (
+    Inputs,
+    Layers,
+    Optimizer,
+    Singles,
+    backward,
+    descend,
+    forward,
+    last_outputs,
+)
+from agents.networks.torch_bridge import call
+from machine_code.compiling import called, inlined, kernel
+from mdp.array_types import Floats, Ints
+
+# Minibatches out of the library's replay buffer, in whose own arrays transitions lie.
+#
+# With n-step returns as in `stable_baselines3.common.buffers.NStepReplayBuffer`: rewards are summed
+# until the episode ends, or the newest transition is reached. What VecNormalize shows otherwise
+# lies
+# there as it was, and is shown by the statistics of the moment, as in the library.
+
+
+class Replay(NamedTuple):
+    """Transitions of E environments in rings of N places.
+
+    Attributes:
+        observations: shape (N, E, d); numbers of states have d = 1.
+        next_observations: what followed, before any reset, likewise.
+        actions: shape (N, E, 1).
+        rewards: shape (N, E).
+        dones: 1 where the episode ended, shape (N, E).
+        timeouts: 1 where it ended by its time limit alone, shape (N, E).
+    """
+
+    observations: Any
+    next_observations: Any
+    actions: Ints
+    rewards: Singles
+    dones: Singles
+    timeouts: Singles
+
+
+class Minibatch(NamedTuple):
+    """Transitions that are learnt from at once.
+
+    Attributes:
+        states: observations, of B rows.
+        next_states: what followed.
+        actions: shape (B,).
+        rewards: discounted sums of the rewards in between, shape (B,).
+        discounts: factor of the value of what followed, 0 where nothing does, shape (B,).
+    """
+
+    states: Inputs
+    next_states: Inputs
+    actions: Ints
+    rewards: Singles
+    discounts: Singles
+
+
+class Memory(NamedTuple):
+    """What minibatches are drawn from, by reference.
+
+    Attributes:
+        replay: the transitions.
+        batch: what is filled.
+        place: says where the next transition will lie, and whether the ring is full.
+        rules: with the discount factor, the number of steps and what VecNormalize does.
+        centre: what it takes from observations, shape (d,).
+        spread: what it divides them by, shape (d,).
+        rng: a handle of the agent's generator, alone in an array.
+        one_hot: whether observations are numbers of states.
+    """
+
+    replay: Replay
+    batch: Minibatch
+    place: NDArray[np.void]
+    rules: NDArray[np.void]
+    centre: Floats
+    spread: Floats
+    rng: NDArray[np.void]
+    one_hot: int
+
+
+@inlined
+def clipped(number: float, bound: float) -> float:
+    """As it is within the bound; what is not a number stays that."""
+    if number > bound:
+        return bound
+    return -bound if number < -bound else number
+
+
+@inlined
+def show_normalised(memory: Memory, inputs: Inputs, i: int, row: Any) -> None:
+    """As `show`, the way VecNormalize shows it now."""
+    rules = memory.rules[0]
+    if not rules.normalises_observations:
+        show(inputs, i, row, memory.one_hot)
+        return
+    for j in range(len(row)):
+        moved = (row[j] - memory.centre[j]) / memory.spread[j]
+        inputs.vectors[i, j] = np.float32(clipped(moved, rules.clip_obs))
+
+
+@inlined
+def reward_of(memory: Memory, at: int, env: int) -> Any:
+    """A reward, the way VecNormalize gives it now."""
+    reward, rules = memory.replay.rewards[at, env], memory.rules[0]
+    if not rules.normalises_rewards:
+        return reward
+    return np.float32(clipped(reward / rules.reward_spread, rules.clip_reward))
+
+
+@kernel
+def draw_minibatch(memory: Any, _: float, __: float) -> int:
+    """Fill the minibatch with transitions drawn with replacement; their number is returned."""
+    replay, batch, place = memory.replay, memory.batch, memory.place[0]
+    rules, rng = memory.rules[0], memory.rng[0]
+    n_places, n_envs = replay.rewards.shape
+    filled = n_places if place.full else place.position
+    newest = (place.position - 1) % n_places
+    for i in range(len(batch.actions)):
+        begin = int(next_uniform(rng) * filled)
+        env = int(next_uniform(rng) * n_envs)
+        at, discount, total = begin, np.float32(rules.gamma), reward_of(memory, begin, env)
+        for _ in range(rules.n_steps - 1):
+            if replay.dones[at, env] or replay.timeouts[at, env] or at == newest:
+                break
+            at = (at + 1) % n_places
+            total += discount * reward_of(memory, at, env)
+            discount *= np.float32(rules.gamma)
+        if replay.dones[at, env] and not replay.timeouts[at, env]:
+            discount = np.float32(0)
+        show_normalised(memory, batch.states, i, replay.observations[begin, env])
+        show_normalised(memory, batch.next_states, i, replay.next_observations[at, env])
+        batch.actions[i] = replay.actions[begin, env, 0]
+        batch.rewards[i] = total
+        batch.discounts[i] = discount
+    return len(batch.actions)
+
+
+# One step of deep Q-learning on a minibatch.
+#
+# Sources: Mnih et al. (2013 and 2015), van Hasselt, Guez and Silver (2016).
+
+# What the value of the next state is taken from.
+TARGET_NETWORK, DOUBLE, ONLINE_NETWORK = range(3)
+
+
+@inlined
+def best_of(values: Any) -> int:
+    """The first of the largest."""
+    best = 0
+    for k in range(1, len(values)):
+        if values[k] > values[best]:
+            best = k
+    return best
+
+
+@kernel
+def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
+    """Take one step of gradient descent on `learner.batch`.
+
+    The loss before it is added to ``place.losses``: Huber's, or half the squared error.
+
+    Args:
+        learner: both networks, the optimizer and the minibatch.
+        learning_rate: of the optimizer.
+        _: nothing; what is called by its address takes two numbers, whoever learns.
+
+    Returns:
+        The number of rows.
+    """
+    layers, batch, rules = learner.layers, learner.batch, learner.rules[0]
+    n = len(batch.actions)
+    lagging = learner.flat if rules.target_kind == ONLINE_NETWORK else learner.target
+    forward(layers, lagging, batch.next_states, n, learner.next_outputs)
+    next_values = last_outputs(layers, learner.next_outputs, n)
+    preferred = next_values
+    if rules.target_kind == DOUBLE:
+        # Overwritten below, once the choice has been made.
+        forward(layers, learner.flat, batch.next_states, n, learner.outputs)
+        preferred = last_outputs(layers, learner.outputs, n)
+    for i in range(n):
+        batch.rewards[i] += batch.discounts[i] * next_values[i, best_of(preferred[i])]
+    forward(layers, learner.flat, batch.states, n, learner.outputs)
+    learner.place[0].losses += _errors(learner, n, rules.largest_error)
+    backward(
+        layers,
+        learner.flat,
+        batch.states,
+        n,
+        learner.outputs,
+        learner.errors,
+        learner.gradient,
+    )
+    descend(learner.optimizer, learner.flat, learner.gradient, learning_rate, rules.max_grad_norm)
+    return n
+
+
+@called
+def _errors(learner: Any, n: int, largest: float) -> float:
+    """Write the loss's derivatives by the values, given targets in ``batch.rewards``."""
+    batch = learner.batch
+    values = last_outputs(learner.layers, learner.outputs, n)
+    errors = last_outputs(learner.layers, learner.errors, n)
+    errors[:] = 0
+    loss = 0.0
+    for i in range(n):
+        error = float(values[i, batch.actions[i]] - batch.rewards[i])
+        slope = min(max(error, -largest), largest)
+        errors[i, batch.actions[i]] = np.float32(slope / n)
+        # Half the square up to the largest slope, and a straight line from there on.
+        loss += slope * (error - slope / 2)
+    return loss / n
+
+
+@called
+def follow(target: Singles, flat: Singles, tau: float) -> None:
+    """Move the target network towards the one that learns, by the share ``tau``."""
+    for i in range(len(flat)):
+        target[i] = target[i] * np.float32(1 - tau) + np.float32(tau) * flat[i]
+
+
+# Deep Q-learning as the compiled loop runs it, in the order of events of Stable-Baselines3.
 
 # Settings, under the library's names where it has one.
 RULES = np.dtype(

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import envs  # noqa: F401  # registers the bandits
-from agents.bandits.batch import run_batch
+from agents.bandits.runs import run_batch
 from envs.bandits import log_uniformly, read_log
 from experiments.off_policy.estimators import cross_fit, evaluate_policy, mean_reward
-from report.series.agent_marks import COLOURS
+from report.series import COLOURS
 
 FOLDER = Path(__file__).parent
 PULLS, RUNS = 10_000, 400

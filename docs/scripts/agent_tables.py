@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 from gymnasium import spaces
 
-from agents.known_algorithms import ALGORITHMS
-from agents.registry import fitting_algorithms
+from agents.registry import ALGORITHMS, fitting_algorithms
 
 PAGES = Path(__file__).resolve().parents[1] / "algorithms"
 BOX = spaces.Box(-1, 1, (3,), np.float32)

@@ -13,7 +13,7 @@ import numpy as np
 from gymnasium.envs.registration import load_env_creator
 
 import envs  # noqa: F401  # registers the environments
-from agents.known_algorithms import ALGORITHMS
+from agents.registry import ALGORITHMS
 from envs.known_models import success_outcomes, time_limit, transition_model
 from mdp import TransitionModel, baseline_policies, finite_horizon_optimum, policy_return
 from mdp.evaluation import PolicyReturn

@@ -3,7 +3,7 @@
 What stands between a pair of comments is replaced, so that nothing of it is typed, and pages can be
 read on a code host too::
 
-    <!-- code: agents/tabular/q_learning.py best_next_value QLearning -->
+    <!-- code: agents/tabular/one_step.py best_next_value QLearning -->
     <!-- end -->
 
 There are blocks of these kinds: ``code``, with a file and names in it; ``environment``, with an id

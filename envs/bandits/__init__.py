@@ -4,8 +4,7 @@ from envs.bandits.bandit import Bandit, StochasticBandit
 from envs.bandits.clicks import BernoulliBandit, ClickBandit, SegmentBandit
 from envs.bandits.gaussian import GaussianBandit
 from envs.bandits.linear import LinearBandit
-from envs.bandits.logged_data import LoggedData, log_uniformly, read_log
-from envs.bandits.replay import ReplayBandit
+from envs.bandits.logged import LoggedData, ReplayBandit, log_uniformly, read_log
 
 __all__ = [
     "Bandit",

@@ -1,19 +1,244 @@
-"""What bandits share: counting pulls, rendering, and what `step` tells where arms are known."""
+"""What bandits share: counting pulls, what `step` tells, and how they are drawn."""
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
 
+from envs import drawing
 from envs.argument_checks import check_whole_number
-from envs.bandit_rendering import Tally, render_chart, render_text
-from envs.rendering import ChartRenderer
-from envs.scene import Chart
-from envs.shown_env import ShownEnv
-from mdp.array_types import Floats
+from envs.drawing import Box, Chart, ChartRenderer, Disc, Label, Shape, ShownEnv
+from mdp.array_types import Floats, Ints
+
+# Bandits as text and as bar charts: for each arm its true mean and what was seen of it.
+
+# Of more arms the first are shown, of more contexts those around the present one.
+MAX_ARMS_SHOWN = 40
+MAX_CONTEXTS_SHOWN = 4
+# In characters, of the bars in a text.
+BAR = 30
+# In pixels.
+MARGIN = 56
+SLOT = 64
+MAX_WIDTH = 960
+TITLE = 40
+PANEL = 200
+CAPTION = 48
+TEXT = 20
+# What numbers need: in narrower slots some of them are left out.
+MIN_LABELLED = 30
+
+
+@dataclass(eq=False)
+class Tally:
+    """What the pulls of an episode have brought, by context and arm.
+
+    Attributes:
+        counts: the number of pulls, shape (n_contexts, n_arms).
+        sums: the sum of their rewards, likewise.
+        last: context, arm and reward of the latest pull, None before the first.
+    """
+
+    counts: Ints
+    sums: Floats
+    last: tuple[int, int, float] | None = None
+
+    @classmethod
+    def empty(cls, n_contexts: int, n_arms: int) -> Tally:
+        """No pulls yet."""
+        shape = (n_contexts, n_arms)
+        return cls(np.zeros(shape, np.int64), np.zeros(shape))
+
+    def add(self, context: int, arm: int, reward: float) -> None:
+        """Count a pull."""
+        self.counts[context, arm] += 1
+        self.sums[context, arm] += reward
+        self.last = (context, arm, reward)
+
+    @property
+    def observed(self) -> Floats:
+        """The mean rewards, NaN where there was no pull."""
+        return np.divide(
+            self.sums, self.counts, out=np.full_like(self.sums, np.nan), where=self.counts > 0
+        )
+
+    @property
+    def title(self) -> str:
+        """The latest pull in words."""
+        if self.last is None:
+            return "no pull yet"
+        _, arm, reward = self.last
+        return f"pull {self.counts.sum()}: arm {arm}, reward {reward:.4g}"
+
+
+@dataclass(frozen=True)
+class _Scale:
+    """From values to places on an axis; zero is always on it."""
+
+    low: float
+    high: float
+
+    @classmethod
+    def over(cls, *means: Floats | None) -> _Scale:
+        known = np.concatenate([array.ravel() for array in means if array is not None])
+        known = np.append(known[np.isfinite(known)], 0)
+        low, high = float(known.min()), float(known.max())
+        return cls(low, high if high > low else low + 1)
+
+    def part(self, value: float) -> float:
+        """0 for the lowest value, 1 for the highest."""
+        return (value - self.low) / (self.high - self.low)
+
+
+def render_text(tally: Tally, true: Floats | None, present: int) -> str:
+    """The latest pull on a line, then a line for each arm.
+
+    In the bars ``=`` reaches from zero to the observed mean, ``|`` marks the true one.
+
+    Args:
+        tally: what has been pulled.
+        true: the true means, shape (n_contexts, n_arms); None where they are not known.
+        present: the context of the next pull.
+    """
+    observed = tally.observed
+    scale = _Scale.over(observed, true)
+    lines = [tally.title]
+    for context in _shown_contexts(len(observed), present):
+        if len(observed) > 1:
+            lines.append(f"context {context}{' (next)' if context == present else ''}")
+        lines.append("  arm    pulls  observed" + ("" if true is None else "  true now"))
+        for arm in range(min(observed.shape[1], MAX_ARMS_SHOWN)):
+            latest = tally.last is not None and tally.last[:2] == (context, arm)
+            mean = None if true is None else float(true[context, arm])
+            seen = float(observed[context, arm])
+            number = f"{'-':>10}" if np.isnan(seen) else f"{seen:10.3f}"
+            line = f"{'>' if latest else ' '} {arm:3} {tally.counts[context, arm]:8}{number}"
+            line += "" if mean is None else f"{mean:10.3f}"
+            lines.append(f"{line}  {_text_bar(scale, seen, mean)}".rstrip())
+        if observed.shape[1] > MAX_ARMS_SHOWN:
+            lines.append(f"  ... of {observed.shape[1]} arms")
+    return "\n".join(lines) + "\n"
+
+
+def render_chart(tally: Tally, true: Floats | None, present: int) -> Chart:
+    """A bar for each arm, with one panel for each context.
+
+    Args:
+        tally: what has been pulled.
+        true: the true means, shape (n_contexts, n_arms); None where they are not known.
+        present: the context of the next pull.
+    """
+    observed = tally.observed
+    contexts = _shown_contexts(len(observed), present)
+    n_arms = min(observed.shape[1], MAX_ARMS_SHOWN)
+    width = min(max(MARGIN + SLOT * n_arms, 360) + MARGIN // 4, MAX_WIDTH)
+    height = TITLE + len(contexts) * (PANEL + CAPTION)
+    cut = f"arms 0-{n_arms - 1} of {observed.shape[1]}" if n_arms < observed.shape[1] else ""
+    shapes = list(_heading(tally.title, cut, width, true is not None))
+    scale = _Scale.over(observed, true)
+    for i, context in enumerate(contexts):
+        panel = _Panel(scale, TITLE + i * (PANEL + CAPTION), width, n_arms)
+        if len(observed) > 1:
+            shapes += panel.name(context, context == present)
+        shapes += panel.axis()
+        for arm in range(n_arms):
+            latest = tally.last is not None and tally.last[:2] == (context, arm)
+            mean = None if true is None else float(true[context, arm])
+            count = int(tally.counts[context, arm])
+            shapes += panel.arm(arm, count, float(observed[context, arm]), mean, latest)
+    return Chart((width, height), shapes)
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """The arms in one context."""
+
+    scale: _Scale
+    top: int
+    width: int
+    n_arms: int
+
+    def y(self, value: float) -> float:
+        """The height at which a value stands."""
+        return self.top + 20 + (1 - self.scale.part(value)) * (PANEL - 40)
+
+    def name(self, context: int, present: bool) -> Iterator[Shape]:
+        """Which context this is, with a dot where it is the next one's."""
+        at = (self.width - MARGIN // 4, self.top + 8)
+        yield Label(f"context {context}", at, TEXT, drawing.INK, align=1)
+        if present:
+            yield Disc((at[0] - 84, at[1] - 1), 5, drawing.GREEN)
+
+    def axis(self) -> Iterator[Shape]:
+        """The zero line, and the numbers beside it."""
+        right = self.width - MARGIN // 4
+        for value in sorted({self.scale.low, 0.0, self.scale.high}):
+            colour = drawing.SHELF if value == 0 else drawing.GRID
+            yield Box((MARGIN, self.y(value)), (right - MARGIN, 1), 0, colour)
+            yield Label(f"{value:.3g}", (MARGIN - 8, self.y(value)), TEXT, drawing.INK, align=1)
+
+    def arm(
+        self, arm: int, count: int, observed: float, true: float | None, latest: bool
+    ) -> Iterator[Shape]:
+        """A bar up to the observed mean, a line at the true one, and the number of pulls."""
+        slot = (self.width - MARGIN - MARGIN // 4) / self.n_arms
+        left = MARGIN + slot * arm
+        if not np.isnan(observed):
+            upper, lower = sorted((self.y(observed), self.y(0)))
+            colour = drawing.DARK_BLUE if latest else drawing.BLUE
+            yield Box((left + slot * 0.2, upper), (slot * 0.6, lower - upper + 1), 0, colour)
+        if true is not None:
+            at = (left + slot * 0.08, self.y(true) - 2)
+            yield Box(at, (slot * 0.84, 4), 2, drawing.ORANGE)
+        middle, below = left + slot / 2, self.top + PANEL
+        each = math.ceil(MIN_LABELLED / slot)
+        if arm % each == 0:
+            yield Label(f"{arm}", (middle, below), TEXT + 4, drawing.INK)
+        if each == 1:
+            yield Label(f"{count}", (middle, below + 18), TEXT - 2, drawing.SHELF)
+
+
+def _heading(title: str, cut: str, width: int, knows_truth: bool) -> Iterator[Shape]:
+    """The latest pull, which arms are shown where not all are, and what the colours mean."""
+    left, right = MARGIN // 4, width - MARGIN // 4
+    yield Label(title, (left, 14), TEXT + 2, drawing.INK, align=0)
+    yield Label(cut, (right, 14), TEXT - 2, drawing.SHELF, align=1)
+    yield Box((left, 28), (12, 12), 0, drawing.BLUE)
+    yield Label("observed mean", (left + 18, 34), TEXT - 2, drawing.INK, align=0)
+    if knows_truth:
+        yield Box((left + 130, 32), (16, 4), 2, drawing.ORANGE)
+        yield Label("true mean now", (left + 152, 34), TEXT - 2, drawing.INK, align=0)
+    if width >= 560:
+        below = "below each arm: its number, its pulls"
+        yield Label(below, (right, 34), TEXT - 2, drawing.SHELF, align=1)
+
+
+def _shown_contexts(n_contexts: int, present: int) -> range:
+    """Contexts around the present one."""
+    first = max(0, min(present - MAX_CONTEXTS_SHOWN // 2, n_contexts - MAX_CONTEXTS_SHOWN))
+    return range(first, min(first + MAX_CONTEXTS_SHOWN, n_contexts))
+
+
+def _text_bar(scale: _Scale, observed: float, true: float | None) -> str:
+    def place(value: float) -> int:
+        return round(scale.part(value) * (BAR - 1))
+
+    cells = [" "] * BAR
+    if not np.isnan(observed):
+        first, last = sorted((place(0), place(observed)))
+        cells[first : last + 1] = "=" * (last + 1 - first)
+    if true is not None:
+        cells[place(true)] = "|"
+    return "".join(cells)
+
+
+# What bandits share: counting pulls, rendering, and what `step` tells where arms are known.
 
 MAX_PULLS = 10**9
 MAX_ARMS = 10_000

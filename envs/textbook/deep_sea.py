@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from envs.argument_checks import check_flag, check_number, check_whole_number
-from envs.map_env import MapEnv
+from envs.grid import MapEnv
 from mdp.transition_model import TransitionModel
 
 MOST_SIZE = 1000

@@ -5,9 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from envs.argument_checks import check_choice, check_flag, check_number, check_whole_number
-from envs.grid import GridWorld, Observation
-from envs.grid_dynamics import GridDynamics, Tile
-from envs.grid_map import GridMap
+from envs.grid import GridDynamics, GridMap, GridWorld, Observation, Tile
 
 DYNA = (
     ".......#G",

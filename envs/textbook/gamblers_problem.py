@@ -7,10 +7,8 @@ from functools import lru_cache
 import numpy as np
 
 from envs.argument_checks import check_number, check_whole_number
+from envs.drawing import Chart, ChartRenderer, Gauge, gauges_chart, gauges_text
 from envs.finite_env import MaskedFiniteEnv, summing_to_one
-from envs.gauges import Gauge, gauges_chart, gauges_text
-from envs.rendering import ChartRenderer
-from envs.scene import Chart
 from mdp.array_types import Bools
 from mdp.transition_model import TransitionModel
 

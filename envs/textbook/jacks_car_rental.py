@@ -9,10 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from envs.argument_checks import check_choice, check_whole_number
+from envs.drawing import Chart, ChartRenderer, Gauge, gauges_chart, gauges_text
 from envs.finite_env import MaskedFiniteEnv
-from envs.gauges import Gauge, gauges_chart, gauges_text
-from envs.rendering import ChartRenderer
-from envs.scene import Chart
 from mdp.array_types import Bools, Floats, Ints
 from mdp.transition_model import TransitionModel
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.argument_checks import check_number, check_whole_number
 from envs.finite_env import MaskedFiniteEnv
-from envs.map_env import ChainEnv
+from envs.grid import ChainEnv
 from mdp.array_types import Bools
 from mdp.transition_model import TransitionModel
 

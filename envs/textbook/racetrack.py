@@ -10,7 +10,7 @@ import numpy as np
 
 from envs.argument_checks import check_choice, check_number
 from envs.finite_env import summing_to_one
-from envs.map_env import MapEnv
+from envs.grid import MapEnv
 from mdp.array_types import Bools, Ints
 from mdp.transition_model import TransitionModel
 

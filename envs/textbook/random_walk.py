@@ -9,7 +9,7 @@ import numpy as np
 
 from envs.argument_checks import check_number, check_whole_number
 from envs.finite_env import summing_to_one
-from envs.map_env import ChainEnv
+from envs.grid import ChainEnv
 from mdp.transition_model import TransitionModel
 
 MOST_STATES = 10_000

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envs.map_env import ChainEnv
+from envs.grid import ChainEnv
 from mdp.transition_model import TransitionModel
 
 LEFT, RIGHT = 0, 1

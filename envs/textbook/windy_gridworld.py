@@ -8,8 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from envs.argument_checks import check_choice, check_flag, check_number
-from envs.grid_dynamics import MOVES
-from envs.map_env import MapEnv
+from envs.grid import MOVES, MapEnv
 from mdp.transition_model import TransitionModel
 
 MAP = (

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from envs.bandits import LoggedData, read_log
-from pipeline.agent_checks import check_algorithm
+from pipeline.agent_settings import check_algorithm
 from pipeline.errors import UserError, one_line
 from pipeline.models.find import run_of
 from pipeline.models.load import ModelFile, hand_written_algorithm, read_model
-from pipeline.module_records import check_recorded
+from pipeline.user_modules import check_recorded
 
 # What changes an agent's observations, so that they are no longer the log's contexts.
 _OBSERVATION_SETTINGS = ("normalize", "frame_stack", "env_wrapper", "vec_env_wrapper")

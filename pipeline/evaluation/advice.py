@@ -21,7 +21,7 @@ from envs.known_models import observations_of_states, transition_model
 from envs.layout import GridLayout
 from mdp import TransitionModel, policy_return, state_visitation, value_iteration
 from mdp.array_types import Floats
-from pipeline.auto_settings import resolved_spec
+from pipeline.agent_settings import resolved_spec
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL

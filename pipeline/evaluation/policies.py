@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from agents.common.mask_reading import check_masks_exist, present_masks
-from agents.linear.tile_algorithm import TileAlgorithm
+from agents.common.masks import check_masks_exist, present_masks
+from agents.linear.algorithm import TileAlgorithm
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
-from agents.tabular.q_table_policy import QTablePolicy
-from agents.tabular.tabular_algorithm import TabularAlgorithm
+from agents.tabular.algorithm import TabularAlgorithm
+from agents.tabular.policy import QTablePolicy
 from mdp.array_types import Bools, Floats, Ints
 from pipeline.errors import UserError
 

@@ -20,7 +20,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
-from envs.brackets.known_brackets import may_have_bracket, optimum_bracket
+from envs.brackets import may_have_bracket, optimum_bracket
 from mdp.array_types import Floats
 from pipeline.environments import make_single_env
 from pipeline.evaluation.policies import KNOWN_LIBRARIES, is_network, player
@@ -445,8 +445,8 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
     """
     from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
 
-    from agents.compiled.compile_envs import NotCompilable, monitor_of
-    from agents.networks.network_worlds import network_world
+    from agents.compiled.worlds import NotCompilable, monitor_of
+    from agents.networks.observations import network_world
 
     if not isinstance(env, DummyVecEnv) or any(monitor_of(each) is None for each in env.envs):
         return None
@@ -466,10 +466,10 @@ def evaluate_compiled(
     Tables and tiles act by the same bits; networks by the compiled forward pass, and by the
     library's `predict` where two actions are so close that rounding could decide.
     """
-    from agents.compiled.episodes import DECIMALS
     from agents.compiled.greedy_play import play_episodes
-    from agents.networks.matrix_products import one_thread
-    from agents.networks.network_worlds import NetworkEnvStates
+    from agents.compiled.records import DECIMALS
+    from agents.networks.observations import NetworkEnvStates
+    from agents.networks.perceptron import one_thread
 
     env, n_envs = copy.env, copy.env.num_envs
     if seed is not None:

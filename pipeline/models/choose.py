@@ -23,8 +23,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pipeline.agent_checks import check_algorithm
-from pipeline.auto_settings import without_auto
+from pipeline.agent_settings import check_algorithm, without_auto
 from pipeline.environments import check_env_id
 from pipeline.errors import UserError
 from pipeline.models.find import (
@@ -50,11 +49,10 @@ from pipeline.models.load import (
     read_statistics,
     telling_masks,
 )
-from pipeline.module_records import check_recorded
 from pipeline.runs import Run
 from pipeline.settings.hyperparams import NoEntryError, read_hyperparams, split
 from pipeline.train_spec import TrainSpec
-from pipeline.user_modules import UserModule
+from pipeline.user_modules import UserModule, check_recorded
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

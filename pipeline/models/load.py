@@ -306,7 +306,7 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
     """Give an agent the replay buffer in a file, where it is of a kind that has one."""
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-    from agents.dqn import MaskedReplayBuffer
+    from agents.library import MaskedReplayBuffer
     from safe_files import load_replay_buffer as load_safely
     from safe_files.files import MAX_BUFFER_BYTES
 

@@ -6,7 +6,7 @@ from gymnasium import spaces
 from hypothesis import strategies as st
 
 from agents import load_algorithm
-from agents.common.online import Transitions
+from agents.common.algorithm import Transitions
 
 N_STATES, N_ACTIONS = 4, 3
 

@@ -7,10 +7,10 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback
-from agents.compiled.training_records import UNDECIDED
-from agents.tabular.q_learning import QLearning
-from agents.tabular.temporal_difference import td_learning
+from agents.common.callbacks import BlockCallback
+from agents.compiled.worlds import UNDECIDED
+from agents.tabular.one_step import QLearning
+from agents.tabular.updates import td_learning
 from machine_code.compiling import inlined
 
 

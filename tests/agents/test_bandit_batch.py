@@ -10,9 +10,8 @@ import pytest
 
 import envs  # noqa: F401  # registers the bandits
 from agents import ALGORITHMS, load_algorithm
-from agents.bandits.batch import run_batch
-from agents.bandits.one_by_one import run_one_by_one
-from agents.compiled.compile_envs import NotCompilable
+from agents.bandits.runs import run_batch, run_one_by_one
+from agents.compiled.worlds import NotCompilable
 
 BERNOULLI = ("BernoulliBandit-v0", {})
 GAUSSIAN = ("GaussianBandit-v0", {})

@@ -11,9 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agents import load_algorithm
-from agents.bandits.bandit_algorithm import Pull
-from agents.bandits.kl_ucb import bernoulli_kl, kl_ucb_index, kl_upper_bound
-from agents.bandits.ucb import ucb_index
+from agents.bandits.algorithm import Pull
+from agents.bandits.upper_bounds import bernoulli_kl, kl_ucb_index, kl_upper_bound, ucb_index
 
 ARMS = 3
 

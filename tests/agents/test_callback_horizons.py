@@ -21,7 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
 from agents import load_algorithm
-from agents.common.callback_horizons import (
+from agents.common.callbacks import (
     NEVER,
     BlockCallback,
     EpisodeBudget,
@@ -31,9 +31,8 @@ from agents.common.callback_horizons import (
     members,
     unknown_callbacks,
 )
-from pipeline.callbacks import EpisodeCheckpoint, StepCheckpoint
+from pipeline.callbacks import EpisodeCheckpoint, EvaluationCallback, StepCheckpoint
 from pipeline.evaluation.sampled import Evaluation
-from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.runs import Run
 
 ENGINES = ("interpreted", "compiled")

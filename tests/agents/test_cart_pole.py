@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.compiled.cart_pole import CART_POLE_ENV, STATE, bin_index, swing
-from agents.compiled.compile_envs import compile_envs
-from agents.compiled.env_state import COMPENSATED_SUM
-from agents.compiled.env_steps import add_to_return, begin_episode
+from agents.compiled.greedy_play import COMPENSATED_SUM
+from agents.compiled.loop import add_to_return, begin_episode
+from agents.compiled.worlds import CART_POLE_ENV, STATE, bin_index, compile_envs, swing
 from envs.wrappers import DiscretizeObservation
 
 INTEGRATORS = ("euler", "semi-implicit euler")

@@ -10,7 +10,7 @@ from stable_baselines3.common.utils import FloatSchedule
 
 import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback, Horizon, calls_until_multiple
+from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from machine_code.compiling import inlined
 
 

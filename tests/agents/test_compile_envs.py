@@ -10,8 +10,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 import envs  # noqa: F401  # registers the environments
-from agents.compiled.compile_envs import NotCompilable, compile_envs
-from envs.grid_dynamics import Tile
+from agents.compiled.worlds import NotCompilable, compile_envs
+from envs.grid import Tile
 from envs.warehouse import WarehouseEnv
 from envs.wrappers import FlattenToDiscrete, ScaleReward, TerminationReward
 

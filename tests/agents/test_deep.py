@@ -7,7 +7,7 @@ from stable_baselines3 import DQN
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import nn
 
-from agents.deep import DeepQLearning, DoubleDQN, double_q_values
+from agents.library import DeepQLearning, DoubleDQN, double_q_values
 
 SETTINGS = {"learning_starts": 50, "train_freq": 4, "batch_size": 16, "buffer_size": 500, "seed": 0}
 

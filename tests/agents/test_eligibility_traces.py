@@ -8,7 +8,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.tabular.episodes.eligibility_traces import SMALLEST_TRACE
+from agents.tabular.traces import SMALLEST_TRACE
 from tests.agents.hand_fed import (
     ACTIONS,
     ENDS,

@@ -16,12 +16,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 import envs  # noqa: F401  # registers the environments
 from agents import ALGORITHMS, load_algorithm
-from agents.common.callback_horizons import (
-    BlockCallback,
-    EpisodeBudget,
-    Horizon,
-    calls_until_multiple,
-)
+from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon, calls_until_multiple
 from agents.common.schedules import ExponentialSchedule
 from envs.grid import GridWorld
 from envs.wrappers import DiscretizeObservation, FlattenToDiscrete, ScaleReward, TerminationReward

@@ -20,8 +20,8 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from agents import load_algorithm
-from agents.common.callback_horizons import Horizon, calls_until_multiple
-from agents.tabular.q_table_policy import QTablePolicy
+from agents.common.callbacks import Horizon, calls_until_multiple
+from agents.tabular.policy import QTablePolicy
 from envs.wrappers import DiscretizeObservation
 
 LAKE, WAREHOUSE, CART = "FrozenLake-v1", "envs:Warehouse-v0", "CartPole-v1"

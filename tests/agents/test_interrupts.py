@@ -9,8 +9,8 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback, Horizon
-from agents.compiled.interrupts import interrupts_held
+from agents.common.callbacks import BlockCallback, Horizon
+from agents.compiled.engine import interrupts_held
 
 N_ENVS = 2
 

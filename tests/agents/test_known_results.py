@@ -9,9 +9,8 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401
-from agents.common.callback_horizons import EpisodeBudget
-from agents.tabular.q_learning import QLearning
-from agents.tabular.sarsa import SARSA
+from agents.common.callbacks import EpisodeBudget
+from agents.tabular.one_step import SARSA, QLearning
 from envs.known_models import transition_model
 from mdp import policy_return
 

@@ -9,12 +9,10 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.tabular.models.dyna_q_plus import DatedModelPolicy
-from agents.tabular.models.model_policy import MOST_BYTES, ModelPolicy
-from agents.tabular.models.r_max import CountedModelPolicy
-from agents.tabular.models.sweeping_model import NONE
-from agents.tabular.models.sweeping_policy import _are_lists, _is_queue
-from agents.tabular.temporal_difference import learn_from_all
+from agents.tabular.dyna import MOST_BYTES, DatedModelPolicy, ModelPolicy
+from agents.tabular.optimism import CountedModelPolicy
+from agents.tabular.prioritized_sweeping import NONE, _are_lists, _is_queue
+from agents.tabular.updates import learn_from_all
 from envs.known_models import transition_model
 from mdp import TransitionModel, value_iteration
 from safe_files.files import MAX_ARCHIVE_BYTES

@@ -12,8 +12,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback
-from agents.compiled.log_records import event_bytes, window_means
+from agents.common.callbacks import BlockCallback
+from agents.compiled.records import event_bytes, window_means
 
 LAKE, WAREHOUSE = "FrozenLake-v1", "envs:Warehouse-v0"
 OF_THE_CLOCK = ("time/fps", "time/time_elapsed")

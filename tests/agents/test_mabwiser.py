@@ -6,8 +6,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
-from agents.bandits.batch import run_batch
-from agents.bandits.one_by_one import run_one_by_one
+from agents.bandits.runs import run_batch, run_one_by_one
 
 AGENTS = {
     "mabwiser_epsilon_greedy": "BernoulliBandit-v0",

@@ -12,11 +12,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import envs  # noqa: F401  # registers the bandits
 from agents import ALGORITHMS, load_algorithm
-from agents.bandits.bandit_algorithm import Pull
-from agents.bandits.batch import run_batch
-from agents.bandits.kl_ucb import kl_ucb_index
-from agents.bandits.one_by_one import run_one_by_one
-from agents.compiled.compile_envs import NotCompilable
+from agents.bandits.algorithm import Pull
+from agents.bandits.runs import run_batch, run_one_by_one
+from agents.bandits.upper_bounds import kl_ucb_index
+from agents.compiled.worlds import NotCompilable
 from envs.bandits import SegmentBandit
 
 NAMES = [name for name, entry in ALGORITHMS.items() if entry.family == "bandits"]

@@ -12,8 +12,7 @@ from gymnasium import spaces
 from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
-from agents.deep import DoubleDQN
-from agents.dqn import DQN, MaskedReplayBuffer
+from agents.library import DQN, DoubleDQN, MaskedReplayBuffer
 from envs.known_models import action_masks_of_states
 from envs.wrappers import ActionMasks
 

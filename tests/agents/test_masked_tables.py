@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import envs  # noqa: F401  # registers the environments
 from agents import ALGORITHMS, load_algorithm
-from agents.common.online import Transitions
+from agents.common.algorithm import Transitions
 from envs.wrappers import ActionMasks, IdleActionMasks
 
 NAMES = [name for name, entry in ALGORITHMS.items() if entry.family == "tabular"]

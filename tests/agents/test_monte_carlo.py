@@ -8,8 +8,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.common.online import Transitions
-from agents.tabular.episodes.importance_policy import ImportanceTablePolicy
+from agents.common.algorithm import Transitions
+from agents.tabular.monte_carlo import ImportanceTablePolicy
 from tests.agents.hand_fed import ENDS, N_ACTIONS, N_STATES, Fed, episodes, greedy, tables
 
 GAMMA, ALPHA = 0.75, 0.25

@@ -8,8 +8,7 @@ from gymnasium.envs.classic_control import MountainCarEnv
 from gymnasium.wrappers import TimeAwareObservation
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from agents.compiled.compile_envs import NotCompilable, compile_envs
-from agents.compiled.mountain_car import CAR_STATE, MOUNTAIN_CAR_ENV, drive
+from agents.compiled.worlds import CAR_STATE, MOUNTAIN_CAR_ENV, NotCompilable, compile_envs, drive
 
 
 @numba.njit

@@ -7,9 +7,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.compiled.training_records import ENV, PROGRESS
-from agents.tabular.q_learning_ucb import optimistic_update
-from agents.tabular.temporal_difference import learn_from_all
+from agents.compiled.worlds import ENV, PROGRESS
+from agents.tabular.optimism import optimistic_update
+from agents.tabular.updates import learn_from_all
 from envs.known_models import time_limit, transition_model
 from mdp import finite_horizon_optimum, policy_return
 from tests.agents.test_engine import assert_engines_agree, make

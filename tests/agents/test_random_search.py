@@ -8,8 +8,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from torch.nn.utils import parameters_to_vector
 
-from agents.common.callback_horizons import EpisodeBudget
-from agents.random_search import ARS
+from agents.common.callbacks import EpisodeBudget
+from agents.library import ARS
 
 
 class Watch(BaseCallback):

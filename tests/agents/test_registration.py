@@ -50,7 +50,7 @@ def test_the_same_twice_is_harmless():
 @pytest.mark.parametrize(
     ("name", "entry_point", "fields", "complaint"),
     [
-        ("ppo", "some_module:Mine", {}, "an agent ppo already (agents.policy_gradients:PPO)"),
+        ("ppo", "some_module:Mine", {}, "an agent ppo already (agents.library:PPO)"),
         ("PPO", "some_module:Mine", {}, "there is an agent ppo already"),
         ("taken", "some_module:Other", {}, "register some_module:Other under another name"),
         ("taken", "some_module:Mine", {"actions": ["Box"]}, "there is an agent taken already"),

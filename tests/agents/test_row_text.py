@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from agents.compiled.row_text import whole_rows
+from agents.compiled.records import whole_rows
 
 END = "1.5e-05\r\n"
 

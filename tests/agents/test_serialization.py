@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from stable_baselines3.common.utils import ConstantSchedule, FloatSchedule, LinearSchedule
 
+from agents.common.model_files import CODECS, UnknownTypeError, decode, encode
 from agents.common.schedules import ExponentialSchedule
-from agents.common.serialization import CODECS, UnknownTypeError, decode, encode
 
 ARRAY_DTYPES = [
     npst.boolean_dtypes(),

@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import DISABLED, KVWriter, Logger
 
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback, Horizon, calls_until_multiple
+from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 
 ENGINES = ("compiled", "interpreted")
 

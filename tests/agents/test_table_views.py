@@ -10,9 +10,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
-from agents.tabular.double_q_learning import DoubleQLearning
-from agents.tabular.q_learning import QLearning
-from agents.tabular.sarsa import SARSA
+from agents.tabular.one_step import SARSA, DoubleQLearning, QLearning
 
 STEPS = 300
 

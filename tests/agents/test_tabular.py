@@ -9,10 +9,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from agents import load_algorithm
-from agents.tabular.double_q_learning import DoubleQLearning
-from agents.tabular.expected_sarsa import ExpectedSARSA
-from agents.tabular.q_learning import QLearning
-from agents.tabular.sarsa import SARSA
+from agents.tabular.one_step import SARSA, DoubleQLearning, ExpectedSARSA, QLearning
 
 ALL = [QLearning, SARSA, ExpectedSARSA, DoubleQLearning]
 GREEDY = {"exploration_decay": "constant", "exploration_initial_eps": 0.0}

@@ -7,7 +7,7 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401
-from agents.tabular.q_learning import QLearning
+from agents.tabular.one_step import QLearning
 
 
 def trained(env_id: str, kwargs: dict[str, Any], engine: str) -> tuple[Any, ...]:

@@ -6,8 +6,8 @@ import pytest
 from gymnasium import spaces
 
 from agents import load_algorithm
-from agents.compiled.training_records import ENV, PROGRESS
-from agents.tabular.temporal_difference import update
+from agents.compiled.worlds import ENV, PROGRESS
+from agents.tabular.updates import update
 
 # Two states, three actions. The transition: state 0, action 1, reward 2, then state 1, where SARSA
 # has committed to action 0; gamma 0.5, step size 0.1.

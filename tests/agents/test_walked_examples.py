@@ -9,8 +9,7 @@ import pytest
 from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the bandits
-from agents.bandits.batch import run_batch
-from agents.bandits.one_by_one import run_one_by_one
+from agents.bandits.runs import run_batch, run_one_by_one
 
 DOCUMENT = Path(__file__).parents[2] / "CONTRIBUTING.md"
 EXAMPLES = re.findall(r"```python\n(.*?)```", DOCUMENT.read_text(), re.DOTALL)
@@ -57,7 +56,7 @@ def test_a_rule_worked_by_hand(example):
     values = model.policy.q_tables.numpy()
     values[0, 1] = [4, 8, 6, 6, 6, 6]
     model._last_obs, model._next_actions = np.array([0]), np.array([-1])
-    from agents.common.online import Transitions
+    from agents.common.algorithm import Transitions
 
     step = np.array([0]), np.array([3]), np.array([2.0]), np.array([False]), np.array([False])
     model._learn_from(Transitions(*step, np.array([1])))

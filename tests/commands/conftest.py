@@ -9,7 +9,7 @@ import enjoy
 import train
 from commands import share
 from commands.cli import run_command
-from pipeline.signs_of_life import Silence
+from pipeline.progress import Silence
 
 ROOT = Path(train.__file__).parent
 COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main, "pack": share.pack}
@@ -30,7 +30,7 @@ def pictures():
 def no_pictures_elsewhere(request, monkeypatch):
     """They take most of a short run."""
     if "pictures" not in request.fixturenames:
-        monkeypatch.setattr("pipeline.finishing._draw", lambda *_: None)
+        monkeypatch.setattr("pipeline.training._draw", lambda *_: None)
 
 
 @pytest.fixture

@@ -42,13 +42,8 @@ def moments():
     """What is called at each moment: its owner, its name, and on which of the calls."""
     from agents.compiled import engine
     from commands import terminal
-    from pipeline import (
-        evaluation_callback,
-        files,
-        finishing,
-        preparation,
-        worker_processes,
-    )
+    from pipeline import callbacks, files, preparation, training
+    from pipeline import stopping as stopping_module
     from pipeline.runs import Run
     from pipeline.state_saver import StateSaver
 
@@ -59,12 +54,12 @@ def moments():
         "before the first step": (StateSaver, "_on_training_start", always),
         "compiling": (engine, "run_block", always),
         "training": (StateSaver, "_on_step", lambda *_: next(calls) == 3),
-        "evaluating": (evaluation_callback.EvaluationCallback, "_append", always),
+        "evaluating": (callbacks.EvaluationCallback, "_append", always),
         "saving": (files, "put_in_place", lambda draft, path, *_: path.name == "FrozenLake-v1.zip"),
-        "judging": (finishing, "_final_evaluation", always),
-        "drawing": (finishing, "draw_learning_curve", always),
+        "judging": (training, "_final_evaluation", always),
+        "drawing": (training, "draw_learning_curve", always),
         "recording": (Run, "end", always),
-        "closing": (worker_processes, "close_environments", always),
+        "closing": (stopping_module, "close_environments", always),
     }
 
 

@@ -303,7 +303,7 @@ def test_a_run_that_fails_does_not_stop_the_others(type_command, folder):
 
 
 def test_the_first_training_is_played_of_a_users_own_environment(type_command, folder, monkeypatch):
-    monkeypatch.setattr("report.figures.figure_files.write_figures", lambda *_: [])
+    monkeypatch.setattr("report.figures.write_figures", lambda *_: [])
     monkeypatch.setattr("report.films.film_of", lambda _: None)
     words = ["--env", "Fragile-v0", "--gym-packages", "fragile_walks", "--algos", "qlearning"]
     words += ["--seeds", 1, "-n", 300, "-j", 1, "-f", "studies"]

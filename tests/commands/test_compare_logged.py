@@ -19,7 +19,7 @@ from envs.bandits import log_uniformly, read_log
 from experiments.off_policy.estimators import difference_in_value, mean_reward
 from experiments.off_policy.logged_policies import compare_policies, probabilities, read_policy
 from pipeline.errors import UserError
-from report.off_policy_table import sentences, shown, verdict
+from report.terminal import sentences, shown, verdict
 from verdicts import Estimate
 
 NAMES = {"0": "core", "1": "casual"}

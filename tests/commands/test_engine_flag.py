@@ -6,9 +6,8 @@ import re
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 
-from agents.networks import engine_costs
-from agents.networks.engine_costs import Work
-from agents.networks.engine_setting import TOO_SHORT, EnginePlan
+from agents.networks import engine_setting
+from agents.networks.engine_setting import TOO_SHORT, EnginePlan, Work
 from commands import compare, train, tune
 from commands.compare import study_spec
 from commands.terminal import about, search_line, study_line, training_line
@@ -17,7 +16,7 @@ from commands.tune import tuning_spec
 from experiments.plan import plan
 from pipeline.engine_outlook import EngineOutlook, planned_outlook
 from pipeline.errors import UserError
-from pipeline.packing.model_card import card
+from pipeline.model_card import card
 from tuning.retesting import Candidate, retest_study
 from tuning.suggesting import planned_run
 
@@ -164,8 +163,8 @@ class Mine(BaseCallback):
 @pytest.fixture
 def a_warm_machine(monkeypatch):
     """One of the pace of that on which the constants were measured."""
-    monkeypatch.setattr(engine_costs, "machine_pace", lambda: 1.0)
-    monkeypatch.setattr(engine_costs, "is_compiled_before", lambda name: True)
+    monkeypatch.setattr(engine_setting, "machine_pace", lambda: 1.0)
+    monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: True)
 
 
 def test_seconds_by_hand():
@@ -207,8 +206,8 @@ def test_the_head_where_nobody_knows_how_long_a_step_takes():
 
 
 def test_compiling_is_told_where_it_is_still_to_be_done(monkeypatch):
-    monkeypatch.setattr(engine_costs, "machine_pace", lambda: 1.0)
-    monkeypatch.setattr(engine_costs, "is_compiled_before", lambda name: False)
+    monkeypatch.setattr(engine_setting, "machine_pace", lambda: 1.0)
+    monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: False)
     line = training_line(EngineOutlook(COMPILED, COMPILED, WORK), None, CallbackList([]))
     assert line.startswith(
         "compiled, about 2 s of processor time and once about 9 s of compiling ("

@@ -4,7 +4,7 @@ import os
 import re
 import signal
 
-from pipeline.watching.table_recorder import TableRecorder
+from pipeline.watching import TableRecorder
 
 LAKE = ("train.py", "--env", "FrozenLake-v1", "--seed", "0", "--verbose", "1")
 TABLE = (*LAKE, "--algo", "qlearning", "-n", "300", "--watch-learning", "page.html")
@@ -54,7 +54,7 @@ def test_what_cannot_be_written_is_refused_before_the_training(type_command, tmp
 
 
 def test_a_page_that_finds_no_room_afterwards_ends_in_one_line(type_command, tmp_path, monkeypatch):
-    monkeypatch.setattr("report.learning_page.learning_assembly.write_text", fails)
+    monkeypatch.setattr("report.page.learning.write_text", fails)
     code, out, err = type_command(*TABLE)
     assert (code, err.count("\n")) == (2, 1)
     assert "page.html" in err

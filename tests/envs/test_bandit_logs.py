@@ -436,7 +436,7 @@ def test_a_log_is_read_in_pieces_without_a_seam(tmp_path, monkeypatch):
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["word,arm,reward,propensity", *lines]))
     whole = read_log(path)
-    monkeypatch.setattr("envs.bandits.log_columns.ROWS_AT_ONCE", 2)
+    monkeypatch.setattr("envs.bandits.logged.ROWS_AT_ONCE", 2)
     pieces = read_log(path)
     assert pieces.categories == whole.categories == ("a", "b", "c", "z")
     assert (
@@ -449,7 +449,7 @@ def test_a_log_is_read_in_pieces_without_a_seam(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("first", ["1", "a"])
 def test_text_and_numbers_in_different_pieces_do_not_mix(tmp_path, monkeypatch, first):
-    monkeypatch.setattr("envs.bandits.log_columns.ROWS_AT_ONCE", 2)
+    monkeypatch.setattr("envs.bandits.logged.ROWS_AT_ONCE", 2)
     path = tmp_path / "log.csv"
     cells = [first, first, "a" if first == "1" else "1", "1"]
     path.write_text("word,arm,reward\n" + "".join(f"{cell},0,1\n" for cell in cells))

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from envs import sprites
-from envs.bandit_rendering import Tally, render_chart, render_text
+from envs import drawing
 from envs.bandits import BernoulliBandit, GaussianBandit, LinearBandit, ReplayBandit, SegmentBandit
-from envs.sprites import Box, Label
+from envs.bandits.bandit import Tally, render_chart, render_text
+from envs.drawing import Box, Label
 
 LOG = Path(__file__).parent / "uniform_log.csv"
 
@@ -24,7 +24,7 @@ def picture(env: gym.Env[Any, Any]) -> NDArray[np.uint8]:
     return pixels
 
 
-def has(pixels: NDArray[np.uint8], colour: sprites.Colour) -> int:
+def has(pixels: NDArray[np.uint8], colour: drawing.Colour) -> int:
     """How many pixels have a colour."""
     return int((pixels == colour).all(axis=2).sum())
 
@@ -124,14 +124,14 @@ def test_a_bar_reaches_from_zero_to_the_observed_mean() -> None:
     tally.add(0, 1, -1.0)
     chart = render_chart(tally, np.array([[2.0, 1.0]]), 0)
     boxes = [shape for shape in chart.shapes if isinstance(shape, Box)]
-    bars = [box for box in boxes if box.colour in {sprites.BLUE, sprites.DARK_BLUE}][1:]
-    zero = next(box for box in boxes if box.colour == sprites.SHELF).corner[1]
+    bars = [box for box in boxes if box.colour in {drawing.BLUE, drawing.DARK_BLUE}][1:]
+    zero = next(box for box in boxes if box.colour == drawing.SHELF).corner[1]
     # The panel is 160 pixels high between the lowest value, -1, and the highest, 2.
     assert bars[0].corner[1] == pytest.approx(zero - 80)
     assert bars[0].size[1] == pytest.approx(81)
     assert bars[1].corner[1] == pytest.approx(zero)
     assert bars[1].size[1] == pytest.approx(160 / 3 + 1)
-    assert [bar.colour for bar in bars] == [sprites.BLUE, sprites.DARK_BLUE]
+    assert [bar.colour for bar in bars] == [drawing.BLUE, drawing.DARK_BLUE]
 
 
 def test_pictures_grow_with_arms_and_contexts_up_to_a_limit() -> None:
@@ -150,11 +150,11 @@ def test_a_picture_shows_true_means_at_once_and_bars_after_pulls() -> None:
     env = BernoulliBandit([0.2, 1.0], render_mode="rgb_array")
     env.reset(seed=0)
     before = picture(env)
-    assert has(before, sprites.ORANGE) > 300
-    assert has(before, sprites.DARK_BLUE) == 0
+    assert has(before, drawing.ORANGE) > 300
+    assert has(before, drawing.DARK_BLUE) == 0
     env.step(1)
     after = picture(env)
-    assert has(after, sprites.DARK_BLUE) > 1000
+    assert has(after, drawing.DARK_BLUE) > 1000
     assert np.array_equal(picture(env), after)
 
 
@@ -163,8 +163,8 @@ def test_what_is_not_known_is_not_drawn() -> None:
     env.reset()
     env.step(0)
     pixels = picture(env)
-    assert has(pixels, sprites.ORANGE) == 0
-    assert has(pixels, sprites.DARK_BLUE) > 1000
+    assert has(pixels, drawing.ORANGE) == 0
+    assert has(pixels, drawing.DARK_BLUE) > 1000
 
 
 def test_without_a_mode_nothing_is_counted() -> None:

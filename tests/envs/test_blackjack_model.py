@@ -9,7 +9,7 @@ from gymnasium.envs.toy_text.blackjack import BlackjackEnv, cmp, is_natural, sco
 
 import envs  # noqa: F401 (registers the environments)
 from agents import load_algorithm
-from agents.compiled.compile_envs import NotCompilable, compile_envs
+from agents.compiled.worlds import NotCompilable, compile_envs
 from envs.blackjack_model import blackjack_model, blackjack_observations, natural_state, state_of
 from envs.known_models import (
     observations_of_states,

@@ -11,12 +11,7 @@ from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv, Pendulum
 from gymnasium.wrappers import ClipReward, FlattenObservation, RescaleAction, TimeLimit
 
 import train
-from envs.brackets.known_brackets import (
-    OptimumBracket,
-    known_entries,
-    may_have_bracket,
-    optimum_bracket,
-)
+from envs.brackets import OptimumBracket, known_entries, may_have_bracket, optimum_bracket
 from envs.wrappers import DiscretizeObservation, ScaleReward
 
 SCRIPT = Path(train.__file__).parent / "benchmarks" / "optimum_brackets.py"

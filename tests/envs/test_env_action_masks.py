@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 
 import envs  # noqa: F401  # registers the environments
-from envs.action_masks import action_masks
 from envs.known_models import action_masks_of_states, observations_of_states, transition_model
 from envs.mine_maze import MineMazeEnv
 from envs.warehouse import WarehouseEnv
-from envs.wrappers import ActionMasks, FlattenToDiscrete, IdleActionMasks, ScaleReward
+from envs.wrappers import ActionMasks, FlattenToDiscrete, IdleActionMasks, ScaleReward, action_masks
 
 ENVS = {
     "Warehouse": lambda: gym.make("Warehouse-v0"),

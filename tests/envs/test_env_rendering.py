@@ -13,12 +13,11 @@ import pygame
 import pytest
 from numpy.typing import NDArray
 
-from envs import sprites
+from envs import drawing
+from envs.drawing import MAX_SIDE
 from envs.grid import GridWorld
-from envs.map_generation import random_warehouse
 from envs.mine_maze import MineMazeEnv
-from envs.rendering import MAX_SIDE
-from envs.warehouse import WarehouseEnv
+from envs.warehouse import WarehouseEnv, random_warehouse
 
 UP, DOWN, LEFT, RIGHT = range(4)
 Picture = NDArray[np.uint8]
@@ -37,7 +36,7 @@ def cell(drawn: Picture, row: int, column: int, size: int = 64) -> Picture:
     return drawn[row * size : (row + 1) * size, column * size : (column + 1) * size]
 
 
-def has(drawn: Picture, colour: sprites.Colour) -> bool:
+def has(drawn: Picture, colour: drawing.Colour) -> bool:
     return bool((drawn == colour).all(axis=2).any())
 
 
@@ -159,8 +158,8 @@ def test_the_robot_is_drawn_where_it_is_and_faces_where_it_goes() -> None:
     for action in range(4):
         row, column = (1 + (-1, 1, 0, 0)[action], 1 + (0, 0, -1, 1)[action])
         drawn = picture(env, action)
-        assert has(cell(drawn, row, column), sprites.INK)
-        assert not has(cell(drawn, 1, 1), sprites.INK)
+        assert has(cell(drawn, row, column), drawing.INK)
+        assert not has(cell(drawn, 1, 1), drawing.INK)
         facing[action] = cell(drawn, row, column)[20:44, 20:44]
     for one, other in itertools.combinations(facing.values(), 2):
         assert np.abs(one.astype(int) - other).mean() > 5
@@ -174,7 +173,7 @@ def test_the_way_walked_is_drawn_and_forgotten_at_reset() -> None:
         [tuple(cell(drawn, 0, column)[y, x]) for y, x in ((32, 4), (32, 60), (60, 32))]
         for column in (0, 1)
     ]
-    on, off = sprites.BLUE, sprites.FLOOR
+    on, off = drawing.BLUE, drawing.FLOOR
     assert trail == [[off, on, on], [on, on, off]]
     assert np.array_equal(cell(drawn, 1, 2), cell(before, 1, 2))
     assert np.array_equal(picture(env), before)
@@ -192,15 +191,15 @@ def test_running_into_something_leaves_no_trail() -> None:
 
 def test_power_is_gone_once_collected_and_back_at_reset() -> None:
     env = MineMazeEnv(desc=["SPG"], render_mode="rgb_array")
-    assert has(cell(picture(env), 0, 1), sprites.ORANGE)
-    assert not has(cell(picture(env, RIGHT, LEFT), 0, 1), sprites.ORANGE)
-    assert has(cell(picture(env), 0, 1), sprites.ORANGE)
+    assert has(cell(picture(env), 0, 1), drawing.ORANGE)
+    assert not has(cell(picture(env, RIGHT, LEFT), 0, 1), drawing.ORANGE)
+    assert has(cell(picture(env), 0, 1), drawing.ORANGE)
 
 
 def test_a_mine_that_was_hit_goes_off() -> None:
     env = MineMazeEnv(desc=["SM", ".G"], render_mode="rgb_array")
-    assert not has(picture(env), sprites.ORANGE)
-    assert has(cell(picture(env, RIGHT), 0, 1), sprites.ORANGE)
+    assert not has(picture(env), drawing.ORANGE)
+    assert has(cell(picture(env, RIGHT), 0, 1), drawing.ORANGE)
 
 
 def test_a_large_map_keeps_robot_goal_trail_and_shelves_visible() -> None:
@@ -213,10 +212,10 @@ def test_a_large_map_keeps_robot_goal_trail_and_shelves_visible() -> None:
         env.step(int(np.argmin([distances[m.next_state] + 9 * m.bumped for m in moves])))
     drawn = env.render()
     assert isinstance(drawn, np.ndarray)
-    assert has(drawn, sprites.SHELF_LIGHT)
-    assert has(drawn[:28, -28:], sprites.GREEN)
-    assert has(drawn[-28:, :28], sprites.SKY)
-    blue = (drawn == sprites.BLUE).all(axis=2).sum() - (start == sprites.BLUE).all(axis=2).sum()
+    assert has(drawn, drawing.SHELF_LIGHT)
+    assert has(drawn[:28, -28:], drawing.GREEN)
+    assert has(drawn[-28:, :28], drawing.SKY)
+    blue = (drawn == drawing.BLUE).all(axis=2).sum() - (start == drawing.BLUE).all(axis=2).sum()
     # Sixty cells of five pixels, five wide, less what markers hide and bends share.
     assert blue > 60 * 5 * 5 * 0.6
 
@@ -225,10 +224,10 @@ def test_power_and_mines_of_a_large_map() -> None:
     rows = ["." * 200] * 198 + ["S" + "." * 9 + "P" + "." * 189, "M" * 199 + "G"]
     env = MineMazeEnv(desc=rows, render_mode="rgb_array")
     before, after = picture(env), picture(env, *[RIGHT] * 20)
-    assert has(before[-5:], sprites.VERMILION)
-    assert has(before, sprites.ORANGE)
-    assert not has(after, sprites.ORANGE)
-    assert has(picture(env), sprites.ORANGE)
+    assert has(before[-5:], drawing.VERMILION)
+    assert has(before, drawing.ORANGE)
+    assert not has(after, drawing.ORANGE)
+    assert has(picture(env), drawing.ORANGE)
 
 
 def test_a_picture_belongs_to_the_caller() -> None:

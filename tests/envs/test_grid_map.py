@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import shortest_path
 
-from envs.grid_map import GridMap, distances_to
+from envs.grid import GridMap, distances_to
 from envs.mine_maze import MineMazeEnv
 from envs.warehouse import WarehouseEnv
 

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from envs.map_generation import random_warehouse
-from envs.warehouse import WarehouseEnv
+from envs.warehouse import WarehouseEnv, random_warehouse
 
 
 def shelves(rows: list[str]) -> np.ndarray[tuple[int, int], np.dtype[np.bool_]]:

@@ -11,9 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from envs.bandit_rendering import Tally, render_chart
-from envs.rendering import ChartRenderer, GridRenderer
-from envs.scene import Scene
+from envs.bandits.bandit import Tally, render_chart
+from envs.drawing import ChartRenderer, GridRenderer, Scene
 
 PICTURES = Path(__file__).parent / "pictures"
 # Another release of pygame may smooth edges and letters otherwise: that much is no change.

@@ -6,7 +6,7 @@ import pytest
 
 import envs  # noqa: F401 (registers the environments)
 from agents import load_algorithm
-from agents.compiled.engine_choice import choose_engine
+from agents.compiled.engine import choose_engine
 from envs.finite_env import choose, summing_to_one
 from envs.known_models import action_masks_of_states, success_outcomes, time_limit, transition_model
 from envs.textbook.windy_gridworld import WindyGridworldEnv

@@ -322,7 +322,7 @@ def test_a_million_cells_stay_small_and_fast() -> None:
     """Making, resetting and 1000 steps took 54 MB beyond the imports and 0.9 s when measured."""
     code = """
 import resource, sys, time
-import gymnasium as gym, envs.warehouse, envs.map_generation
+import gymnasium as gym, envs.warehouse, envs.warehouse
 peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 before, began = peak(), time.monotonic()
 env = gym.make("RandomWarehouse-v0", size=1000)

@@ -15,7 +15,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
-from agents.bandits.batch import run_batch
+from agents.bandits.runs import run_batch
 from envs.bandits import log_uniformly
 from experiments.analysis import analyse
 from experiments.bandits import (
@@ -32,15 +32,12 @@ from experiments.bandits import (
 )
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
-from pipeline.pull_recording import PullRecorder, are_bandits
+from pipeline.callbacks import PullRecorder, are_bandits
 from pipeline.runs import PULLS_FILE, Run
 from pipeline.training import train
 from report.conclusions import conclusion
-from report.series.regret_bounds import (
-    auer_bound,
-    best_of_normals,
-)
-from report.terminal_tables import print_analysis
+from report.series import auer_bound, best_of_normals
+from report.terminal import print_analysis
 
 FIGURES = ("arms", "rewards", "expected_rewards", "regrets", "optimal", "matched")
 MEANS = np.array([[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]])
@@ -429,13 +426,13 @@ def test_statistics_are_those_of_the_batch(batches):
 
 
 def test_what_has_no_compiled_copy_goes_one_by_one(tmp_path, monkeypatch, do_study):
-    from agents.compiled.compile_envs import NotCompilable
+    from agents.compiled.worlds import NotCompilable
 
     def refuse(*args):
         raise NotCompilable("of a reason")
 
     expected = do_study(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "one")
-    monkeypatch.setattr("agents.bandits.batch.run_batch", refuse)
+    monkeypatch.setattr("agents.bandits.runs.run_batch", refuse)
     found = do_study(study_of({"ucb": {"algo": "ucb"}}, n_seeds=2), tmp_path / "two")
     assert found.summary["engine"].unique().tolist() == ["one by one: of a reason"]
     assert found.summary["regret"].tolist() == expected.summary["regret"].tolist()

@@ -15,7 +15,7 @@ import pytest
 import yaml
 
 from agents import ALGORITHMS
-from agents.algorithm_entries import AlgorithmEntry
+from agents.registry import AlgorithmEntry
 from experiments import launching, run_in_child
 from experiments.child_processes import NO_LIMITS, StoppedError, TaskFailedError
 from experiments.launching import (

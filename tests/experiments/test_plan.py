@@ -12,7 +12,7 @@ from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from pipeline.runs import FAILED, FINISHED
 from pipeline.train_spec import TrainSpec
-from report.seed_sentence import seed_sentence, spans
+from report.words import seed_sentence, spans
 
 LAKE = EnvironmentSpec("FrozenLake-v1", "FrozenLake-v1", {"n_timesteps": 100})
 

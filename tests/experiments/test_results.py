@@ -27,12 +27,11 @@ from experiments.run_files import CURVE_COLUMNS
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline.runs import FINISHED
 from report.conclusions import conclusion, places_without_a_run
-from report.figures.figure_files import write_figures
-from report.result_files import write_tables
-from report.series.episode_blocks import episodes_table
-from report.series.study_series import study_series
-from report.terminal_tables import print_analysis, print_episodes_table
-from report.wording import enumeration, interval, number
+from report.documents import write_tables
+from report.figures import write_figures
+from report.series import episodes_table, study_series
+from report.terminal import print_analysis, print_episodes_table
+from report.words import enumeration, interval, number
 
 OPTIMUM, BASELINE = 100.0, 0.0
 ENVIRONMENT = EnvironmentSpec("Warehouse-v0", "Warehouse-v0", {"n_timesteps": 100})

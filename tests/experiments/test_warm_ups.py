@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 import agents
-from agents.tabular.tabular_algorithm import TabularAlgorithm
+from agents.tabular.algorithm import TabularAlgorithm
 from experiments import warm_ups
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec

@@ -34,7 +34,7 @@ log.addHandler(Note()); log.setLevel(logging.INFO); log.propagate = False
 # Q-learning on the cliff: what the greedy policy is worth.
 TRAIN = f"""{NOTE}
 from stable_baselines3.common.env_util import make_vec_env
-from agents.tabular.q_learning import QLearning
+from agents.tabular.one_step import QLearning
 model = QLearning(env=make_vec_env("CliffWalking-v1", seed=0), seed=0, learning_rate=0.5)
 model.learn(20_000)
 import gymnasium as gym
@@ -155,7 +155,7 @@ def test_where_nothing_can_be_written_it_is_compiled_in_memory(checkout, tmp_pat
     assert "Traceback" not in done.stderr
     warnings = run(
         root,
-        "import mdp.planning, agents.tabular.q_learning",
+        "import mdp.planning, agents.tabular.one_step",
         HOME=str(tmp_path / "home"),
         XDG_CACHE_HOME="",
     ).stderr
@@ -216,7 +216,7 @@ OWN_RULE = """
 import gc
 gc.disable()
 from mdp.machine_code import inlined  # its name in earlier versions
-from agents.tabular.q_learning import QLearning
+from agents.tabular.one_step import QLearning
 from stable_baselines3.common.env_util import make_vec_env
 WORTH = {worth}
 

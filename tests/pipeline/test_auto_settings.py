@@ -6,7 +6,7 @@ import pytest
 
 from envs.known_models import transition_model
 from envs.wrappers import ScaleReward
-from pipeline.auto_settings import resolved_spec, training_follows
+from pipeline.agent_settings import resolved_spec, training_follows
 from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import discount_note, exact_evaluator

@@ -11,7 +11,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from commands.train import describe_pulls, print_outcome
 from envs.bandits import log_uniformly
-from pipeline.pull_recording import PullSummary, summarise_pulls
+from pipeline.callbacks import PullSummary, summarise_pulls
 from pipeline.runs import PULLS_FILE
 from pipeline.settings import hyperparams
 from pipeline.train_spec import TrainSpec
@@ -115,7 +115,7 @@ def test_ctrl_c_leaves_the_pulls_so_far(tmp_path, monkeypatch):
 
 def test_ctrl_c_in_the_middle_of_a_note(tmp_path, monkeypatch):
     """What only some columns have yet is left out."""
-    from agents.bandits.pull_log import PullLog
+    from agents.bandits.runs import PullLog
 
     whole = PullLog._on_step
 

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from commands.enjoy import print_returns
 from commands.terminal import describe
-from envs.brackets.known_brackets import OptimumBracket
+from envs.brackets import OptimumBracket
 from pipeline.evaluation import sampled
 from pipeline.evaluation.sampled import Evaluation, Yardstick, bracketed_yardstick
 from pipeline.settings.hyperparams import split

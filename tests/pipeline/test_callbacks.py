@@ -22,15 +22,15 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecNormalize
 
 from agents import load_algorithm
-from agents.common.callback_horizons import EpisodeBudget
-from pipeline import evaluation_callback
+from agents.common.callbacks import EpisodeBudget
+from pipeline import callbacks as callbacks_module
 from pipeline.callbacks import (
     EpisodeCheckpoint,
+    EvaluationCallback,
     ExponentialExploration,
     StepCheckpoint,
 )
 from pipeline.evaluation.sampled import Evaluation, evaluate
-from pipeline.evaluation_callback import EvaluationCallback
 from pipeline.models.find import statistics_path
 from pipeline.runs import Run
 
@@ -181,7 +181,7 @@ def test_the_best_model_is_the_first_of_the_best(run):
 @pytest.mark.parametrize(("pause", "left"), [(0.0, [1, 2]), (1e9, [1, 1])])
 def test_files_are_there_soon_after_each_evaluation(run, monkeypatch, pause, left):
     """A run that is killed leaves what it has found until then, or until a second before."""
-    monkeypatch.setattr(evaluation_callback, "SECONDS_BETWEEN_WRITES", pause)
+    monkeypatch.setattr(callbacks_module, "SECONDS_BETWEEN_WRITES", pause)
     seen = []
 
     class Look(BaseCallback):

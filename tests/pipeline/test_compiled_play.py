@@ -9,9 +9,9 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 from stable_baselines3.common.env_util import make_vec_env
 
 from agents import load_algorithm
-from agents.compiled.compile_envs import compile_envs
 from agents.compiled.greedy_play import play_episodes
-from agents.networks.network_worlds import NetworkEnvStates, network_world
+from agents.compiled.worlds import compile_envs
+from agents.networks.observations import NetworkEnvStates, network_world
 from agents.networks.q_learner import choose_greedily
 from envs.wrappers import DiscretizeObservation
 from pipeline.evaluation.sampled import SampledEvaluator, compiled_copy, evaluate, evaluate_compiled

@@ -199,23 +199,21 @@ def test_further_episodes_are_others_and_always_the_same(tmp_path):
 
 
 def test_the_file_is_not_written_at_each_evaluation(tmp_path, monkeypatch):
-    from pipeline import evaluation_callback
+    from pipeline import callbacks
 
     writes = []
-    replacing = evaluation_callback.replacing
-    monkeypatch.setattr(
-        evaluation_callback, "replacing", lambda path: writes.append(path) or replacing(path)
-    )
-    monkeypatch.setattr(evaluation_callback, "SECONDS_BETWEEN_WRITES", 1e9)
+    replacing = callbacks.replacing
+    monkeypatch.setattr(callbacks, "replacing", lambda path: writes.append(path) or replacing(path))
+    monkeypatch.setattr(callbacks, "SECONDS_BETWEEN_WRITES", 1e9)
     outcome = run_of(spec_of(tmp_path, "qlearning", "FrozenLake-v1", 2000))
     assert [path.name for path in writes] == ["evaluations.npz"] * 2, "the first, and at the end"
     assert len(np.load(outcome.run.evaluations_path)["timesteps"]) == 20
 
 
 def test_what_a_broken_run_has_evaluated_is_there(tmp_path, monkeypatch):
-    from pipeline import evaluation_callback
+    from pipeline import callbacks
 
-    monkeypatch.setattr(evaluation_callback, "SECONDS_BETWEEN_WRITES", 1e9)
+    monkeypatch.setattr(callbacks, "SECONDS_BETWEEN_WRITES", 1e9)
     calls = []
 
     def broken(self, evaluation):
@@ -223,7 +221,7 @@ def test_what_a_broken_run_has_evaluated_is_there(tmp_path, monkeypatch):
         if len(calls) == 7:
             raise RuntimeError("broken")
 
-    monkeypatch.setattr(evaluation_callback.EvaluationCallback, "_log", broken)
+    monkeypatch.setattr(callbacks.EvaluationCallback, "_log", broken)
     with pytest.raises(RuntimeError, match="broken"):
         run_of(spec_of(tmp_path, "qlearning", "FrozenLake-v1", 2000))
     run = next((tmp_path / "qlearning").iterdir())

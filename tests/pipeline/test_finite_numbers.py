@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
-from agents.bandits.score_policy import BanditPolicy
+from agents.bandits.tables import BanditPolicy
 from experiments.bandits import _check_rewards
+from pipeline.callbacks import NumberWatch
 from pipeline.finite_numbers import NotFiniteError, check_model, check_rows, is_finite
-from pipeline.number_watch import NumberWatch
 
 
 class Broken(gym.Env):

@@ -6,8 +6,7 @@ import gymnasium as gym
 import pytest
 
 from agents import ALGORITHMS, load_algorithm
-from pipeline.agent_checks import check_fit
-from pipeline.auto_settings import resolved_spec, without_auto
+from pipeline.agent_settings import check_fit, resolved_spec, without_auto
 from pipeline.environments import make_single_env, make_training_env
 from pipeline.preparation import algorithm_kwargs
 from pipeline.settings import hyperparams

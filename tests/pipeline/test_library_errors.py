@@ -33,8 +33,8 @@ def of_memory(): raise RuntimeError("DefaultCPUAllocator: can't allocate memory"
 @pytest.mark.parametrize(
     ("module", "function", "is_blamed"),
     [
-        ("agents.deep", "of_torch", True),
-        ("agents.deep", "of_itself", False),
+        ("agents.library", "of_torch", True),
+        ("agents.library", "of_itself", False),
         ("torch.nn", "of_itself", True),
         ("torch.nn", "of_memory", False),
         ("someones_environment", "of_torch", False),

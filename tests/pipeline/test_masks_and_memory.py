@@ -13,7 +13,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import enjoy
 from agents import load_algorithm
-from pipeline.agent_checks import check_fit
+from pipeline.agent_settings import check_fit
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.policies import has_memory, player, policy_matrix, takes_masks

@@ -10,9 +10,9 @@ from gymnasium import spaces
 from rich.console import Console
 
 from agents import load_algorithm
-from envs.action_masks import has_masks
 from envs.known_models import action_masks_of_states
-from pipeline.agent_checks import check_fit
+from envs.wrappers import has_masks
+from pipeline.agent_settings import check_fit
 from pipeline.environments import make_evaluation_env, make_single_env, make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator

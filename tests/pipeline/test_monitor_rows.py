@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from rich.console import Console
 
-from pipeline.auto_settings import resolved_spec
+from pipeline.agent_settings import resolved_spec
 from pipeline.settings.hyperparams import override, read_hyperparams
 from pipeline.state_saver import StateSaver
 from pipeline.training import carry_out, prepare

@@ -20,10 +20,10 @@ from rich.console import Console
 
 from pipeline.digests import sealed
 from pipeline.errors import UserError
+from pipeline.model_card import fenced
 from pipeline.models.choose import ModelRequest, choose_model
-from pipeline.packing.model_card import fenced
-from pipeline.packing.pack_files import check_pack, default_target, pack, unpacked
-from pipeline.packing.scrubbing import check_untold, without_places, zip_to_tell
+from pipeline.packs import check_pack, default_target, pack, unpacked
+from pipeline.scrubbing import check_untold, without_places, zip_to_tell
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train

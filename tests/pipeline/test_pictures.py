@@ -13,9 +13,9 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.monitor import load_results
 
 from agents import load_algorithm
+from pipeline import curve_pictures
+from pipeline.curve_pictures import draw_learning_curve, moving_average, read_monitors
 from pipeline.evaluation.sampled import Yardstick
-from pipeline.pictures import learning_curve
-from pipeline.pictures.learning_curve import draw_learning_curve, moving_average, read_monitors
 from pipeline.runs import Run
 
 
@@ -146,8 +146,8 @@ def test_the_picture_of_a_run(run):
     write_evaluations(run, rng.random((5, 3)))
     size, pixels = picture(run)
     assert size == (960, 540)
-    assert has_colour(pixels, learning_curve.ORANGE)
-    assert has_colour(pixels, learning_curve.BLUE)
+    assert has_colour(pixels, curve_pictures.ORANGE)
+    assert has_colour(pixels, curve_pictures.BLUE)
     assert sorted(path.name for path in run.path.iterdir()) == [
         "0.monitor.csv",
         "FrozenLake-v1",
@@ -160,13 +160,13 @@ def test_the_picture_of_a_run(run):
 def test_training_alone_and_evaluation_alone(run):
     write_evaluations(run, [[1.0]])
     _, pixels = picture(run)
-    assert has_colour(pixels, learning_curve.BLUE)
-    assert not has_colour(pixels, learning_curve.ORANGE)
+    assert has_colour(pixels, curve_pictures.BLUE)
+    assert not has_colour(pixels, curve_pictures.ORANGE)
     run.evaluations_path.unlink()
     write_monitor(run.path, 0, [(float(i), 10, i) for i in range(50)])
     _, pixels = picture(run)
-    assert has_colour(pixels, learning_curve.ORANGE)
-    assert not has_colour(pixels, learning_curve.BLUE)
+    assert has_colour(pixels, curve_pictures.ORANGE)
+    assert not has_colour(pixels, curve_pictures.BLUE)
 
 
 @pytest.mark.parametrize("rows", [None, [], [(1.0, 3, 0.1)]])
@@ -175,14 +175,12 @@ def test_a_run_with_little_to_show_is_drawn_without_warnings(run, rows):
         write_monitor(run.path, 0, rows)
     size, pixels = picture(run)
     assert size == (960, 540)
-    assert not has_colour(pixels, learning_curve.BLUE)
+    assert not has_colour(pixels, curve_pictures.BLUE)
 
 
 def test_the_legend_covers_nothing(run, monkeypatch):
     drawn = []
-    monkeypatch.setattr(
-        "pipeline.pictures.learning_curve.write_png", lambda figure, _: drawn.append(figure)
-    )
+    monkeypatch.setattr("pipeline.curve_pictures.write_png", lambda figure, _: drawn.append(figure))
     write_monitor(run.path, 0, [(float(i), 10, i) for i in range(50)])
     write_evaluations(run, [[1.0], [2.0]])
     draw_learning_curve(run, "title", yardstick=Yardstick(optimum=50, baseline=0))
@@ -200,9 +198,7 @@ def test_the_legend_covers_nothing(run, monkeypatch):
 def axes_drawn(run, monkeypatch, judged=True, n_episodes=50, **options):
     """The axes of the picture, of a run with returns above its optimum, by their titles."""
     drawn = []
-    monkeypatch.setattr(
-        "pipeline.pictures.learning_curve.write_png", lambda figure, _: drawn.append(figure)
-    )
+    monkeypatch.setattr("pipeline.curve_pictures.write_png", lambda figure, _: drawn.append(figure))
     write_monitor(run.path, 0, [(89.0, 10, i) for i in range(n_episodes)])
     if judged:
         write_evaluations(run, [[70.0], [79.0]])
@@ -255,7 +251,7 @@ def test_the_mean_is_of_as_many_episodes_as_there_are(run, monkeypatch):
     assert not any("mean of" in name for name in names_in(axes))
     axes = axes_drawn(run, monkeypatch, n_episodes=200)[0]
     assert "training, mean of 100 episodes" in names_in(axes)
-    monkeypatch.setattr(learning_curve, "MAX_POINTS", 100)
+    monkeypatch.setattr(curve_pictures, "MAX_POINTS", 100)
     axes = axes_drawn(run, monkeypatch, n_episodes=200)[0]
     assert "training, 1 episode in 2" in names_in(axes)
 
@@ -264,7 +260,7 @@ def scale_of(returns):
     from matplotlib.figure import Figure
 
     axes = Figure().subplots()
-    learning_curve._compress_outliers(axes, np.array(returns, dtype=np.float64))
+    curve_pictures._compress_outliers(axes, np.array(returns, dtype=np.float64))
     assert ("log beyond" in axes.get_ylabel()) == (axes.get_yscale() == "symlog")
     return axes.get_yscale()
 
@@ -287,7 +283,7 @@ def test_early_returns_that_dwarf_the_last_are_compressed(returns, scale):
 
 def test_long_runs_are_thinned_out(run, monkeypatch):
     drawn = []
-    monkeypatch.setattr(learning_curve, "MAX_POINTS", 10)
+    monkeypatch.setattr(curve_pictures, "MAX_POINTS", 10)
     from matplotlib.axes import Axes
 
     plot = Axes.plot

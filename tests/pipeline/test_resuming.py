@@ -14,7 +14,7 @@ from rich.console import Console
 
 from agents import ALGORITHMS
 from pipeline import state_files
-from pipeline.auto_settings import resolved_spec
+from pipeline.agent_settings import resolved_spec
 from pipeline.digests import LOCK
 from pipeline.errors import UserError
 from pipeline.evaluation import sampled

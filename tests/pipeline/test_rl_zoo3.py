@@ -17,7 +17,7 @@ from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.results_plotter import ts2xy
 
 import train
-from pipeline.packing.pack_files import pack
+from pipeline.packs import pack
 from pipeline.runs import Run
 from tests.peers.peer_environment import peer_python
 

@@ -7,7 +7,7 @@ import pytest
 from gymnasium.utils import seeding
 
 from agents import load_algorithm
-from pipeline.auto_settings import resolved_spec, without_auto
+from pipeline.agent_settings import resolved_spec, without_auto
 from pipeline.environments import make_evaluation_env, make_training_env
 from pipeline.evaluation.sampled import evaluate, evaluation_seed
 from pipeline.settings import hyperparams

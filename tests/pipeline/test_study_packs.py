@@ -20,8 +20,7 @@ from pipeline.digests import LOCK
 from pipeline.errors import UserError
 from pipeline.locks import mark
 from pipeline.models.choose import ModelRequest, choose_model
-from pipeline.packing.pack_files import check_pack, unpacked
-from pipeline.packing.study_packs import is_study, pack_study
+from pipeline.packs import check_pack, is_study, pack_study, unpacked
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train

@@ -16,8 +16,14 @@ import pytest
 from pipeline import user_modules
 from pipeline.environments import check_env_id, make_env
 from pipeline.errors import UserError
-from pipeline.module_records import as_flag, check_recorded, keep_copies
-from pipeline.user_modules import UserModule, import_again, import_typed
+from pipeline.user_modules import (
+    UserModule,
+    as_flag,
+    check_recorded,
+    import_again,
+    import_typed,
+    keep_copies,
+)
 
 
 @pytest.fixture

@@ -8,20 +8,23 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from agents import load_algorithm
+from pipeline import map_pictures as drawing
 from pipeline.environments import make_training_env
 from pipeline.evaluation.exact import exact_evaluator
 from pipeline.evaluation.value_maps import value_map
-from pipeline.pictures import value_map as drawing
-from pipeline.pictures.map_cells import (
+from pipeline.map_pictures import (
+    decimals_for,
     draw_arrows,
     draw_ground,
     draw_numbers,
+    draw_value_map,
     is_below,
+    layer_name,
     mark_differing,
     policies_in,
     short_number,
+    shown_layers,
 )
-from pipeline.pictures.value_map import decimals_for, draw_value_map, layer_name, shown_layers
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 

@@ -12,8 +12,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback
-from pipeline.auto_settings import resolved_spec
+from agents.common.callbacks import BlockCallback
+from pipeline import watching
+from pipeline.agent_settings import resolved_spec
 from pipeline.environments import make_training_env
 from pipeline.errors import UserError
 from pipeline.evaluation.exact import exact_evaluator
@@ -21,14 +22,7 @@ from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.settings.hyperparams import read_hyperparams, split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare, train
-from pipeline.watching import map_recorder, table_recorder, watch_choice
-from pipeline.watching.table_recorder import (
-    NO_STATE,
-    TERMINATED,
-    TRUNCATED,
-    TableRecorder,
-    tables_of,
-)
+from pipeline.watching import NO_STATE, TERMINATED, TRUNCATED, TableRecorder, tables_of
 
 LAKE = "FrozenLake-v1"
 
@@ -201,12 +195,12 @@ def test_a_table_that_diverges_is_kept_to_the_last_bit_and_nan_moves_once():
 
 
 def test_there_is_an_end_to_what_is_kept(monkeypatch):
-    monkeypatch.setattr(table_recorder, "MOVES_UNASKED", 50)
-    monkeypatch.setattr(table_recorder, "MOST_MOVES", 80)
+    monkeypatch.setattr(watching, "MOVES_UNASKED", 50)
+    monkeypatch.setattr(watching, "MOST_MOVES", 80)
     for n_episodes, kept in ((0, 50), (10_000, 80)):
         _, recorder = watched(LAKE, n_timesteps=200, n_episodes=n_episodes)
         assert (len(recorder.moves), recorder.is_cut) == (kept, True)
-    monkeypatch.setattr(table_recorder, "MOST_CHANGES", 9)
+    monkeypatch.setattr(watching, "MOST_CHANGES", 9)
     _, recorder = watched(Corridor(), n_timesteps=50)
     assert len(recorder.changes) == 10
 
@@ -339,7 +333,7 @@ def test_of_a_network_there_is_a_map_at_each_update(tmp_path, algo, settings, st
 
 
 def test_of_many_maps_every_second_is_kept(tmp_path, monkeypatch):
-    monkeypatch.setattr(map_recorder, "MOST_MAPS", 4)
+    monkeypatch.setattr(watching, "MOST_MAPS", 4)
     spec = spec_of(algo="ppo", settings=SMALL_PPO, log_folder=tmp_path)
     training, _ = done(replace(spec, watch_learning=tmp_path / "page.html"))
     training.watch.finish()
@@ -369,7 +363,7 @@ def test_what_cannot_be_shown_is_refused_before_anything_is_trained(tmp_path, mo
         done(spec_of(algo="random", **page))
     with pytest.raises(UserError, match="--watch-episodes is for agents with tables: dqn"):
         done(spec_of(algo="dqn", settings=small, watch_episodes=3, **page))
-    monkeypatch.setattr(watch_choice, "MOST_ENTRIES", 63)
+    monkeypatch.setattr(watching, "MOST_ENTRIES", 63)
     with pytest.raises(UserError, match=r"up to 63 entries; those of qlearning on Froz.* have 64"):
         done(spec_of(**page))
     assert not Path(page["log_folder"]).exists()

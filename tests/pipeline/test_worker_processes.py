@@ -9,15 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from pipeline import worker_processes
+from pipeline import stopping
 from pipeline.errors import UserError
-from pipeline.stopping import Stopped, stops_noticed
-from pipeline.worker_processes import close_environments, deaths_told
+from pipeline.stopping import Stopped, close_environments, deaths_told, stops_noticed
 
 SCRIPT = """
 import multiprocessing, os, signal, time
 from pipeline.stopping import Stopped, stops_noticed
-from pipeline.worker_processes import close_environments, shield_workers
+from pipeline.stopping import close_environments, shield_workers
 
 def work(pipe):
     pipe.send("there")
@@ -48,7 +47,7 @@ if __name__ == "__main__":
 def test_workers_outlive_a_signal_to_all_but_not_the_training(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(SCRIPT)
-    root = Path(worker_processes.__file__).parents[1]
+    root = Path(stopping.__file__).parents[1]
     done = subprocess.run(
         [sys.executable, str(script)],
         env={**os.environ, "PYTHONPATH": str(root)},
@@ -78,7 +77,7 @@ def test_a_pipe_that_is_broken_is_an_error_unless_a_stop_was_asked_for():
 
 
 def test_environments_that_do_not_close_hold_nobody_up(monkeypatch):
-    monkeypatch.setattr(worker_processes, "SECONDS_FOR_CLOSING", 0.1)
+    monkeypatch.setattr(stopping, "SECONDS_FOR_CLOSING", 0.1)
     started = time.monotonic()
     with stops_noticed() as stop:
         with stop.held():

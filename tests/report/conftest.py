@@ -181,7 +181,7 @@ def drawn():
 @pytest.fixture
 def canvases(monkeypatch):
     """By file name, the axes of each figure as it was written; the files themselves are empty."""
-    import report.figures.figure_style as style
+    import report.figures as style
 
     seen = {}
 

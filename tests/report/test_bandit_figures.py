@@ -4,19 +4,25 @@ import numpy as np
 import pytest
 
 from experiments.bandits import PullStatistics
-from report.figures.bandit_figures import (
+from report.figures import (
     draw_arms,
     draw_belief,
     draw_regret,
     draw_rewards,
     draw_simple_regret,
+    write_figures,
 )
-from report.figures.figure_files import write_figures
-from report.series.agent_marks import COLOURS, Mark
-from report.series.posteriors import Belief
-from report.series.pull_series import ArmSeries, PullSeries, RegretBounds
-from report.series.run_series import RunSeries
-from report.series.study_series import EnvironmentSeries, StudySeries
+from report.series import (
+    COLOURS,
+    ArmSeries,
+    Belief,
+    EnvironmentSeries,
+    Mark,
+    PullSeries,
+    RegretBounds,
+    RunSeries,
+    StudySeries,
+)
 
 BLUE, ORANGE, GREEN = COLOURS[:3]
 GREY = "#595959"

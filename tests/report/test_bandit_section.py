@@ -12,11 +12,10 @@ from scipy import integrate
 
 from experiments.analysis import analyse
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from report.figures.figure_files import write_figures
-from report.page import bandit_section, write_report
-from report.page.sections import Report
-from report.series.posteriors import density, grid, is_normal, truth
-from report.series.study_series import study_series
+from report.figures import write_figures
+from report.page import world_sections, write_report
+from report.page.frame import Report
+from report.series import density, grid, is_normal, study_series, truth
 
 PLACES = (
     EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 400}),
@@ -90,7 +89,7 @@ def test_the_data_are_the_statistics(analysis, page):
 
 def test_the_table_by_context(analysis):
     segments = analysis.results.pulls["blind", "segments"]
-    tables = bandit_section.context_tables({"blind": segments})
+    tables = world_sections.context_tables({"blind": segments})
     assert [table.name for table in tables] == ["context 0", "context 1"]
     core, casual = tables
     assert [row.mean for row in core.rows] == [0.10, 0.25, 0.05]
@@ -103,7 +102,7 @@ def test_the_table_by_context(analysis):
         # The same as what was summed up pull by pull.
         known = np.nan_to_num(segments.context_regret[context])
         assert table.regrets["blind"] == pytest.approx(segments.shares[context] @ known)
-    (alone,) = bandit_section.context_tables({"it": analysis.results.pulls["normal", "coins"]})
+    (alone,) = world_sections.context_tables({"it": analysis.results.pulls["normal", "coins"]})
     assert alone.name == ""
 
 
@@ -155,7 +154,7 @@ def test_bandits_whose_arms_are_drawn_anew(tmp_path, do_study):
     agents = (AGENTS[2], AGENTS[3])
     study = StudySpec("s", "S", agents, PLACES[2:], n_seeds=3, metric="regret")
     analysis = analyse(do_study(study, tmp_path))
-    (item,) = bandit_section.section(Report(study_series(analysis), "")).places
+    (item,) = world_sections.bandits(Report(study_series(analysis), "")).places
     assert item["best"] == pytest.approx(1.5388, abs=1e-4)
     assert (item["bounds"], item["arms"], item["posteriors"]) == (None, None, [])
     assert set(item["curves"]) == {"normal", "eager"}

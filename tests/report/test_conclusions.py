@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from report.conclusions import conclusion
-from report.verdict_matrix import says_more, verdict_matrix
+from report.terminal import says_more, verdict_matrix
 from verdicts import FailureCount, Summary
 
 MEANS = {"a": 100.0, "b": 90.0, "c": 80.0}

@@ -10,14 +10,23 @@ from matplotlib.text import Text
 
 from experiments.analysis import OverallAnalysis
 from experiments.bandits import PullStatistics
-from report.figures import figure_style
-from report.figures.figure_files import write_figures
-from report.series.agent_marks import agent_marks
-from report.series.curve_series import Curve, LearningCurves
-from report.series.posteriors import Belief
-from report.series.pull_series import ArmSeries, PullSeries, RegretBounds
-from report.series.run_series import AgentRuns, Grid, RunSeries, Sweep
-from report.series.study_series import EnvironmentSeries, StudySeries
+from report import figures
+from report.figures import write_figures
+from report.series import (
+    AgentRuns,
+    ArmSeries,
+    Belief,
+    Curve,
+    EnvironmentSeries,
+    Grid,
+    LearningCurves,
+    PullSeries,
+    RegretBounds,
+    RunSeries,
+    StudySeries,
+    Sweep,
+    agent_marks,
+)
 from verdicts import Band
 
 NAMES = {
@@ -120,7 +129,7 @@ def laid_out(monkeypatch):
             FigureCanvasAgg(canvas).draw()
             found.append(canvas)
 
-    monkeypatch.setattr(figure_style, "write", lay_out)
+    monkeypatch.setattr(figures, "write", lay_out)
     return found
 
 

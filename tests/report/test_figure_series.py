@@ -8,9 +8,17 @@ import pytest
 
 from experiments.bandits import pull_statistics
 from experiments.study import AgentSpec
-from report.series.curve_series import learning_curves, linear_up_to
-from report.series.pull_series import arm_series, mean_regret, regret_of_runs
-from report.series.run_series import best_of, grids, run_series, sweeps
+from report.series import (
+    arm_series,
+    best_of,
+    grids,
+    learning_curves,
+    linear_up_to,
+    mean_regret,
+    regret_of_runs,
+    run_series,
+    sweeps,
+)
 
 
 def curve_rows(agent, kind, seed, values, steps=(10, 20)):

@@ -3,9 +3,9 @@
 import pytest
 from PIL import Image
 
-from pipeline.pictures.learning_curve import symlog_ticks
-from report.figures.figure_style import FigureFiles
-from report.off_policy_table import shown
+from pipeline.curve_pictures import symlog_ticks
+from report.figures import FigureFiles
+from report.terminal import shown
 from verdicts import Estimate
 
 

@@ -11,11 +11,10 @@ from experiments.child_processes import TaskFailedError
 from experiments.run_files import difference
 from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
-from report.learning_page import first_runs, kept_pages
-from report.learning_page.first_runs import _train_again, write_first_pages
-from report.page import write_report
-from report.page.sections import LearningPage
-from report.series.study_series import study_series
+from report.page import learning, write_report
+from report.page.frame import LearningPage
+from report.page.learning import _train_again, write_first_pages
+from report.series import study_series
 
 EPISODES = SimpleNamespace(steps=np.zeros(1), returns=np.zeros(1))
 HOSTILE = "</script><script>document.title='taken'</script>"
@@ -35,7 +34,7 @@ def done(monkeypatch):
         finally:
             clean_up()
 
-    monkeypatch.setattr(first_runs, "supervise", supervise)
+    monkeypatch.setattr(learning, "supervise", supervise)
 
     def write(analysis):
         trained.clear()
@@ -73,7 +72,7 @@ def test_each_agent_that_learns_is_shown_once_and_kept(done, analysis, tmp_path)
     note = page.with_suffix(".json")
     for damaged in ("{", "[]", "{}", json.dumps({**json.loads(note.read_text()), "words": 3})):
         note.write_text(damaged)
-        assert kept_pages.kept_page(tmp_path, first_of(analysis)) is None
+        assert learning.kept_page(tmp_path, first_of(analysis)) is None
 
 
 def first_of(analysis):
@@ -114,7 +113,7 @@ def test_agents_without_a_run_of_their_own_are_named(done, made_up, tmp_path):
     )
     results = replace(analysis.results, planned=(batch,), finished=(batch,))
     pages, _ = done(replace(analysis, results=results))
-    assert pages["ucb"].words == first_runs.BATCH
+    assert pages["ucb"].words == learning.BATCH
     assert pages["fails"].words == "no run of it has finished"
 
 

@@ -5,9 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from report.latex import LATEX, escaped, latex_table
-from report.markdown import MARKDOWN
-from report.verdict_table import verdicts_as
+from report.documents import LATEX, MARKDOWN, latex_table, latex_text, verdicts_as
 
 
 @pytest.mark.parametrize(
@@ -28,7 +26,7 @@ from report.verdict_table import verdicts_as
     ],
 )  # fmt: skip
 def test_nothing_of_a_text_is_a_command(text, latex):
-    assert escaped(text) == latex
+    assert latex_text(text) == latex
 
 
 def test_a_table_has_the_rules_of_booktabs_and_no_others():

@@ -14,8 +14,8 @@ from rich.console import Console
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
-from report.learning_page import learning_assembly, write_learning_page
-from report.learning_page.learning_data import _layout_of, exact_json
+from report.page import learning
+from report.page.learning import _layout_of, exact_json, write_learning_page
 
 
 @pytest.fixture
@@ -118,11 +118,11 @@ def test_of_a_network_the_page_says_which_updates_it_shows(watch, monkeypatch):
     assert data["moments"]["number"] == [*range(21)]
     path = training.spec.watch_learning
     # As large as the page is with every second one, and a letter less.
-    monkeypatch.setattr(learning_assembly, "MOST_BYTES", len(text) - 1)
+    monkeypatch.setattr(learning, "MOST_BYTES", len(text) - 1)
     write_learning_page(training.spec, training.watch, path)
     second = path.read_text(encoding="utf-8")
     assert "20 updates, one in 2 of which is shown" in second
-    monkeypatch.setattr(learning_assembly, "MOST_BYTES", len(second.encode()) - 1)
+    monkeypatch.setattr(learning, "MOST_BYTES", len(second.encode()) - 1)
     write_learning_page(training.spec, training.watch, path)
     text = path.read_text(encoding="utf-8")
     assert "20 updates, one in 4 of which is shown" in text
@@ -132,9 +132,9 @@ def test_of_a_network_the_page_says_which_updates_it_shows(watch, monkeypatch):
 
 def test_a_page_is_no_larger_than_three_megabytes(watch, monkeypatch):
     _, text, training = watch("Taxi-v4", n_timesteps=2000)
-    assert len(text) < learning_assembly.MOST_BYTES
+    assert len(text) < learning.MOST_BYTES
     smaller = len(text) - 20_000
-    monkeypatch.setattr(learning_assembly, "MOST_BYTES", smaller)
+    monkeypatch.setattr(learning, "MOST_BYTES", smaller)
     path = training.spec.watch_learning
     write_learning_page(training.spec, training.watch, path)
     cut = data_in(path.read_text(encoding="utf-8"))
@@ -169,7 +169,7 @@ def test_the_fullest_page_is_no_larger_either(watch):
     more["table"] = 0
     path = training.spec.watch_learning
     write_learning_page(training.spec, recorder, path)
-    assert learning_assembly.MOST_BYTES / 2 < path.stat().st_size < 3_000_000
+    assert learning.MOST_BYTES / 2 < path.stat().st_size < 3_000_000
 
 
 def test_a_page_is_replaced_whole(watch, small_disk):

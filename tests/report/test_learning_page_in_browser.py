@@ -15,7 +15,7 @@ from selenium.webdriver.support.ui import Select
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
-from report.learning_page import write_learning_page
+from report.page.learning import write_learning_page
 from tests.report.browsing import find, find_all, needs_browser, resize, script_click, wait
 
 pytestmark = needs_browser

@@ -1,7 +1,7 @@
 """Looks at a study in words: how many, when, with which seeds, at which level."""
 
 from experiments.looks import Design, Look, Looks, Question
-from report.look_sentences import look_sentences
+from report.words import look_sentences
 
 QUESTION = Question("final", None, None, 1000)
 

@@ -1,7 +1,7 @@
 """A study whose runs were done with different versions says so."""
 
 from report.page import write_report
-from report.series.study_series import study_series
+from report.series import study_series
 
 
 def test_the_page_names_them(report_study, tmp_path):

@@ -16,24 +16,24 @@ from plotly.offline import get_plotlyjs
 
 from experiments.looks import Look, LookLog, Looks, Question
 from report.conclusions import conclusion
-from report.figures.figure_style import line_style
+from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
-from report.page import (
-    film_section,
-    overview_section,
-    policy_section,
-    result_sections,
-    settings_section,
-    write_report,
-)
+from report.page import assembly, result_sections, world_sections, write_report
+from report.page import result_sections as result_sections_module
 from report.page.assembly import SECTIONS, render
-from report.page.markup import breakable, inline_script, p_value, packed, plain, setting
-from report.page.sections import Report
-from report.series.agent_marks import COLOURS, agent_marks
-from report.series.curve_series import Curve
-from report.series.run_series import Grid, RunSeries, Sweep
-from report.series.study_series import EnvironmentSeries, StudySeries, study_series
-from report.wording import interval_alone
+from report.page.frame import Report, breakable, inline_script, p_value, packed, plain, setting
+from report.series import (
+    COLOURS,
+    Curve,
+    EnvironmentSeries,
+    Grid,
+    RunSeries,
+    StudySeries,
+    Sweep,
+    agent_marks,
+    study_series,
+)
+from report.words import interval_alone
 from verdicts import Estimate
 
 HOSTILE = "</script><script>document.title='taken'</script>"
@@ -177,11 +177,9 @@ def test_settings_command_versions_and_failures(page, report_study):
 def test_settings_have_the_looks_and_of_old_runs_no_machine(report_study, tmp_path, monkeypatch):
     question = Question("final", None, None, 5)
     look = Look("2026-11-22 10:00:00", question, {"a": 4, "b": 4}, {}, {}, 0.045, planned=False)
-    monkeypatch.setattr(
-        settings_section, "read_looks", lambda _: LookLog({"Warehouse-v0": Looks((look,))})
-    )
+    monkeypatch.setattr(assembly, "read_looks", lambda _: LookLog({"Warehouse-v0": Looks((look,))}))
     infos = [{"versions": {"numpy": "2"}}]
-    assert settings_section._recorded("machine", infos) == {}
+    assert assembly._recorded("machine", infos) == {}
     write_report(study_series(report_study.analysis), tmp_path / "page.html", "compare.py")
     settings = Page((tmp_path / "page.html").read_text(encoding="utf-8")).all("section")[-1][1]
     assert "These runs have been looked at once." in settings
@@ -281,27 +279,27 @@ def test_a_film_is_small_and_made_once(report_study):
 def test_films_have_room_for_all_environments(report_study, monkeypatch):
     """Two agents of one route share a film; what has no room is named."""
     report = Report(study_series(report_study.analysis), "")
-    everything = film_section.section(report)
+    everything = world_sections.played_episodes(report)
     assert sum(map(len, everything.context["films"])) == 6
     assert not any(everything.context["without_room"])
     assert len(everything.data) == len(set(everything.data)) <= 6
     sizes = [film_of(run).stat().st_size for run in report_study.planned if run.seed == 0]
     # Half of it is the first environment's.
-    monkeypatch.setattr(film_section, "ALL_BYTES", 2 * min(sizes))
-    films = film_section.section(report)
+    monkeypatch.setattr(world_sections, "ALL_BYTES", 2 * min(sizes))
+    films = world_sections.played_episodes(report)
     shown, left = films.context["films"], films.context["without_room"]
     told = [len(a) + len(b) for a, b in zip(shown, left, strict=True)]
     assert told == [3, 3]
     assert any(films.context["without_room"])
-    monkeypatch.setattr(film_section, "ALL_BYTES", 0)
-    assert film_section.section(report) is None
+    monkeypatch.setattr(world_sections, "ALL_BYTES", 0)
+    assert world_sections.played_episodes(report) is None
 
 
 def test_maps_share_the_room_of_the_page(report_study, monkeypatch):
     report = Report(study_series(report_study.analysis), "")
     # Two kinds of figures on 16 cells, of 2 agents, at 4 moments; another environment has as much.
-    monkeypatch.setattr(policy_section, "MAX_FIGURES", 2 * (2 * 16 * 2 * 4))
-    lake, warehouse = policy_section.section(report).places
+    monkeypatch.setattr(world_sections, "MAX_FIGURES", 2 * (2 * 16 * 2 * 4))
+    lake, warehouse = world_sections.policies(report).places
     assert [run["seed"] for run in lake["runs"]] == [0, 0]
     for run in lake["runs"]:
         assert len(run["steps"]) == len(run["values"]) == len(run["actions"]) == 4
@@ -421,7 +419,7 @@ def test_plotly_is_packed_as_it_is():
 
 
 def test_small_figures_keep_the_lines_within(page, report_study):
-    found = overview_section.section(Report(study_series(report_study.analysis), ""))
+    found = result_sections_module.overview(Report(study_series(report_study.analysis), ""))
     lake, warehouse = found.context["figures"]
     assert (lake.name, warehouse.name) == ("FrozenLake-v1", "Warehouse-v0")
     for figure in (lake, warehouse):
@@ -436,8 +434,8 @@ def test_small_figures_keep_the_lines_within(page, report_study):
             dtype=float,
         )
         assert (corners >= 0).all()
-        assert corners[:, 0].max() == overview_section.WIDTH
-        assert corners[:, 1].max() <= overview_section.HEIGHT
+        assert corners[:, 0].max() == result_sections_module.WIDTH
+        assert corners[:, 1].max() <= result_sections_module.HEIGHT
         # Nothing lies above the optimum.
         assert corners[:, 1].min() >= figure.optimum - 0.1
 

@@ -13,15 +13,12 @@ from selenium.webdriver.support.ui import Select
 
 from experiments.analysis import analyse
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from report.latex import LATEX
-from report.markdown import MARKDOWN
+from report.documents import LATEX, MARKDOWN, verdicts_as
 from report.page import write_report
-from report.page.markup import STYLES, package_file, templates
-from report.page.settings_section import SettingsTable
-from report.series.agent_marks import agent_marks
-from report.series.study_series import study_series
-from report.tuning_page import write_tuning_page
-from report.verdict_table import verdicts_as
+from report.page.assembly import SettingsTable
+from report.page.frame import STYLES, package_file, templates
+from report.page.tuning import write_tuning_page
+from report.series import agent_marks, study_series
 from tests.report.browsing import (
     find,
     find_all,

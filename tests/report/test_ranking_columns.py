@@ -5,10 +5,9 @@ import math
 import pytest
 
 from report.page import result_sections
-from report.page.sections import Report
-from report.ranking_cells import bar
-from report.ranking_columns import BANDIT_COLUMNS, COLUMNS, Row, filled
-from report.series.study_series import StudySeries
+from report.page.frame import Report
+from report.ranking import BANDIT_COLUMNS, COLUMNS, Row, bar, filled
+from report.series import StudySeries
 from verdicts import Estimate, ThresholdSummary
 
 

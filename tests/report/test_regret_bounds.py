@@ -6,12 +6,7 @@ import gymnasium as gym
 import pytest
 
 import envs  # noqa: F401  # registers the bandits
-from report.series.regret_bounds import (
-    auer_bound,
-    best_expected_reward,
-    best_of_normals,
-    lai_robbins_slope,
-)
+from report.series import auer_bound, best_expected_reward, best_of_normals, lai_robbins_slope
 
 COINS = (0.2, 0.5, 0.75)
 

@@ -8,20 +8,30 @@ import pandas as pd
 import pytest
 
 from experiments.analysis import OverallAnalysis
-from report.figures.figure_files import write_figures
-from report.figures.figure_style import line_style
-from report.figures.study_figures import (
+from report.figures import (
     draw_blocks,
     draw_grid,
     draw_learning_curves,
     draw_profiles,
     draw_runs,
     draw_sweeps,
+    line_style,
+    write_figures,
 )
-from report.series.agent_marks import COLOURS, DASHES, Mark, agent_marks
-from report.series.curve_series import Curve, LearningCurves
-from report.series.run_series import AgentRuns, Grid, RunSeries, Sweep
-from report.series.study_series import EnvironmentSeries, StudySeries
+from report.series import (
+    COLOURS,
+    DASHES,
+    AgentRuns,
+    Curve,
+    EnvironmentSeries,
+    Grid,
+    LearningCurves,
+    Mark,
+    RunSeries,
+    StudySeries,
+    Sweep,
+    agent_marks,
+)
 from verdicts import Band
 
 BLUE, ORANGE, GREEN = COLOURS[:3]

@@ -10,7 +10,7 @@ from rich.console import Console
 
 from experiments.bandits import pull_statistics
 from report.conclusions import conclusion
-from report.terminal_tables import print_analysis, print_episodes_table
+from report.terminal import print_analysis, print_episodes_table
 from verdicts import FailureCount, PairComparison, ThresholdSummary
 
 ESCAPES = re.compile(r"\x1b\[[0-9;]*m")

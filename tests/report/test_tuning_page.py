@@ -6,10 +6,16 @@ import re
 import optuna
 import pytest
 
-from report.tuning_page import write_tuning_page
-from report.tuning_page.tuning_figures import history, parallel
-from report.tuning_page.tuning_tables import changes, cost, rows
-from report.tuning_page.tuning_trials import importances, trials_of
+from report.page.tuning import (
+    changes,
+    cost,
+    history,
+    importances,
+    parallel,
+    rows,
+    trials_of,
+    write_tuning_page,
+)
 
 
 def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):

@@ -7,10 +7,18 @@ import pandas as pd
 import pytest
 
 from report.conclusions import conclusion
-from report.latex import LATEX
-from report.markdown import escaped, markdown_table, name_of
-from report.result_files import write_verdicts
-from report.verdict_table import duration, headline, processor_seconds, ranking, standings
+from report.documents import (
+    LATEX,
+    duration,
+    headline,
+    markdown_table,
+    markdown_text,
+    name_of,
+    processor_seconds,
+    ranking,
+    standings,
+    write_verdicts,
+)
 from verdicts import FailureCount, PairComparison
 
 NAMES = ["low", "same", "open", "first"]
@@ -152,9 +160,12 @@ def test_durations(seconds, text):
 
 
 def test_nothing_of_a_text_is_markup():
-    assert escaped("double_dqn by 2 [1, 3]") == "double_dqn by 2 [1, 3]"
-    assert escaped("a|b <b>*x*</b> [x](y) `c`") == "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"
-    assert escaped("# one\n\ntwo _three_") == "\\# one two \\_three\\_"
+    assert markdown_text("double_dqn by 2 [1, 3]") == "double_dqn by 2 [1, 3]"
+    assert (
+        markdown_text("a|b <b>*x*</b> [x](y) `c`")
+        == "a\\|b \\<b\\>\\*x\\*\\</b\\> [x\\](y) \\`c\\`"
+    )
+    assert markdown_text("# one\n\ntwo _three_") == "\\# one two \\_three\\_"
     assert name_of("dqn") == "`dqn`"
     assert name_of("a`b|") == "a\\`b\\|"
     assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"

@@ -6,9 +6,9 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from report.terminal_tables import print_episodes_table
-from report.verdict_table import headline
-from report.wording import number, optimum_words, ordinal, seeds
+from report.documents import headline
+from report.terminal import print_episodes_table
+from report.words import number, optimum_words, ordinal, seeds
 
 
 @pytest.mark.parametrize(

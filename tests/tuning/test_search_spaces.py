@@ -10,7 +10,7 @@ import pytest
 from optuna.trial import FixedTrial
 
 from agents import ALGORITHMS, load_algorithm
-from pipeline.auto_settings import resolved_spec
+from pipeline.agent_settings import resolved_spec
 from pipeline.errors import UserError
 from pipeline.settings import hyperparams
 from pipeline.settings.components import build_algorithm_kwargs, default_policy, wrapper_factory

@@ -12,7 +12,7 @@ from verdicts import (
     paired_difference,
     probability_of_improvement,
 )
-from verdicts.bootstrap import interval_tail
+from verdicts.resampling import interval_tail
 
 NAN = np.nan
 QUICK = {"seed": 0, "n_resamples": 50}
@@ -100,7 +100,7 @@ def test_winning_always_leaves_a_doubt():
 def test_with_many_seeds_the_normal_interval_agrees_with_resampling(n_envs, monkeypatch):
     first, second = np.random.default_rng(0).normal([[[0.4]], [[0]]], 1, size=(2, 201, n_envs))
     normal = probability_of_improvement(first, second, seed=0)
-    monkeypatch.setattr("verdicts.improvement.MANY_SEEDS", 201)
+    monkeypatch.setattr("verdicts.pairs.MANY_SEEDS", 201)
     resampled = probability_of_improvement(first, second, seed=0)
     assert normal.point == resampled.point
     assert interval(normal) != interval(resampled)

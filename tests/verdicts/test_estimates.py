@@ -17,7 +17,7 @@ from verdicts import (
     performance_profile,
     summarise,
 )
-from verdicts.bootstrap import check_confidence, enough_resamples, interval_tail
+from verdicts.resampling import check_confidence, enough_resamples, interval_tail
 
 STATISTICS = ("mean", "median", "iqm")
 PLAIN = {"mean": np.mean, "median": np.median, "iqm": lambda x: stats.trim_mean(x, 0.25)}

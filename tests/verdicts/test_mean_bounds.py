@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from verdicts.mean_bounds import least_mean
+from verdicts.resampling import least_mean
 
 
 def test_as_worked_out():

@@ -11,8 +11,8 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.common.online import Transitions
-from agents.linear.tile_policy import TilePolicy
+from agents.common.algorithm import Transitions
+from agents.linear.algorithm import TilePolicy
 
 
 class Spaces(gym.Env):

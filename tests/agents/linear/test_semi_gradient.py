@@ -11,7 +11,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.common.online import Transitions
+from agents.common.algorithm import Transitions
 
 NAMES = ("semi_gradient_sarsa", "semi_gradient_q")
 SWING = {"low": [-2.4, -3, -0.21, -3], "high": [2.4, 3, 0.21, 3], "n_tiles": [2, 3, 6, 6]}

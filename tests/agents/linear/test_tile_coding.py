@@ -8,8 +8,7 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agents.linear.tile_coding import tiles_of_all
-from agents.linear.tile_settings import MOST_WEIGHTS, make_tiles, vectors_of
+from agents.linear.tiles import MOST_WEIGHTS, make_tiles, tiles_of_all, vectors_of
 
 UNIT = spaces.Box(0.0, 1.0, (2,))
 

@@ -11,9 +11,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 import envs  # noqa: F401  # registers the environments
 from agents import ALGORITHMS, load_algorithm
-from agents.common.callback_horizons import BlockCallback, EpisodeBudget
-from agents.networks import engine_costs
-from agents.networks.engine_costs import Work
+from agents.common.callbacks import BlockCallback, EpisodeBudget
+from agents.networks import engine_setting
+from agents.networks.engine_setting import Work
 
 
 class Plain(BaseCallback):
@@ -84,13 +84,13 @@ def test_which_engine_trains(case, monkeypatch):
     told = callback and callback()
     assert str(model.engine_plan(budget, told)) == chosen
     # Neither what has been compiled before nor the machine counts.
-    monkeypatch.setattr(engine_costs, "is_compiled_before", lambda name: pytest.fail("asked"))
-    monkeypatch.setattr(engine_costs, "machine_pace", lambda: pytest.fail("asked"))
+    monkeypatch.setattr(engine_setting, "is_compiled_before", lambda name: pytest.fail("asked"))
+    monkeypatch.setattr(engine_setting, "machine_pace", lambda: pytest.fail("asked"))
     assert str(model.engine_plan(budget, told)) == chosen
 
 
 @pytest.mark.parametrize(
-    ("seconds", "is_worth_it"), [(engine_costs.WORTH_COMPILING * 1.2, True), (1.0, False)]
+    ("seconds", "is_worth_it"), [(engine_setting.WORTH_COMPILING * 1.2, True), (1.0, False)]
 )
 def test_what_is_worth_compiling(seconds, is_worth_it):
     work = Work("q", 0.0, 1, 1.0, 32, 2, 5_000, 5_000)

@@ -20,13 +20,8 @@ from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.common.callback_horizons import (
-    BlockCallback,
-    EpisodeBudget,
-    Horizon,
-    calls_until_multiple,
-)
-from agents.networks.network_engine import NetworkEngine
+from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon, calls_until_multiple
+from agents.networks.engine import NetworkEngine
 from envs.wrappers import OneHotObservation
 
 ENVS = {

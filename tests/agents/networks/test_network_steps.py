@@ -14,7 +14,7 @@ from torch.distributions import Categorical
 
 import envs  # noqa: F401  # registers the environments
 from agents import load_algorithm
-from agents.common.callback_horizons import BlockCallback, Horizon
+from agents.common.callbacks import BlockCallback, Horizon
 from envs.wrappers import OneHotObservation
 
 # What rounding comes to after a few hundred steps of training.

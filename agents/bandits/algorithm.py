@@ -1,0 +1,343 @@
+"""The base of the bandit agents: pulling arms, waiting for feedback, learning from it."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from typing import Any, NamedTuple, Protocol, Unpack, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.common.algorithm import Transitions
+from agents.common.masks import MaskBufferPolicy, check_masks_exist, checked_masks, present_masks
+from agents.common.settings import LearningArguments, check_space
+from agents.compiled.learning_algorithm import LearningAlgorithm, StepSize
+from agents.compiled.worlds import NotCompilable
+from mdp.array_types import Bools, Floats, Ints
+
+# What the policies of bandit agents share: they pull the arm that they judge best.
+
+
+class ArmPolicy(MaskBufferPolicy):
+    """Pulls the first of the arms judged best, of those that were allowed where masks are kept."""
+
+    @abstractmethod
+    def judged(self, observations: NDArray[Any]) -> Floats:
+        """What each arm is judged by at each of n observations, shape (n, arms)."""
+
+    def kept_masks(self, observations: Ints) -> Bools:
+        """What was allowed last at observations of shape (n,), everything where none was met.
+
+        Returns:
+            Masks, bool of shape (n, arms).
+
+        Raises:
+            ValueError: if an observation has no row.
+        """
+        outside = observations[(observations < 0) | (observations >= len(self.masks))]
+        if outside.size:
+            raise ValueError(f"context {outside[0]} is not in Discrete({len(self.masks)})")
+        masks = self.masks[observations]
+        return np.asarray(masks | ~masks.any(axis=1, keepdims=True))
+
+    def best_arms(self, observations: NDArray[Any], masks: Bools) -> Ints:
+        """The first of the best arms of those in ``masks``, of shape (n, arms)."""
+        judged = self.judged(observations)
+        # Among the allowed alone: an arm may be judged to be worth minus infinity.
+        allowed = [np.flatnonzero(mask) for mask in masks]
+        best = [arms[row[arms].argmax()] for arms, row in zip(allowed, judged, strict=True)]
+        return np.array(best, dtype=np.int64)
+
+    def _predict(
+        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
+    ) -> th.Tensor:
+        """The first of the best arms; an observation of each to shape (n,)."""
+        assert isinstance(observation, th.Tensor)
+        observations = observation.numpy()
+        if len(self.masks):
+            rows = observations.astype(np.int64).reshape(-1)
+            return th.from_numpy(self.best_arms(rows, self.kept_masks(rows)))
+        return th.from_numpy(self.judged(observations).argmax(axis=1))
+
+
+# Which rewards an agent can learn from.
+
+ANY = "any"
+UNIT = "between 0 and 1"
+BINARY = "0 or 1"
+
+
+class Choosy(Protocol):
+    """An agent that says which rewards it can learn from."""
+
+    @property
+    def rewards_known(self) -> str:
+        """One of `ANY`, `UNIT` and `BINARY`."""
+
+
+# Environments whose rewards have normal noise on them.
+UNBOUNDED_KINDS = ("gaussian", "linear")
+
+
+def reward_misfit(agent: Choosy, reward: float) -> str:
+    """Say why the agent cannot learn from ``reward``; empty where it can."""
+    known = agent.rewards_known
+    if known == ANY or reward in (0.0, 1.0) or (known == UNIT and 0.0 <= reward <= 1.0):
+        return ""
+    return f"{type(agent).__name__} as it is set learns from rewards that are {known}"
+
+
+def check_reward(agent: Choosy, reward: float) -> None:
+    """Refuse a reward that the agent cannot learn from.
+
+    Raises:
+        ValueError: saying which it can learn from.
+    """
+    misfit = reward_misfit(agent, reward)
+    if misfit:
+        raise ValueError(f"{misfit}, not {reward:g}")
+
+
+def check_kinds(agent: Choosy, env: VecEnv) -> None:
+    """Refuse, before the first pull, environments that are known to give other rewards.
+
+    Raises:
+        ValueError: saying which rewards the agent can learn from.
+    """
+    if agent.rewards_known == ANY or not env.has_attr("kind"):
+        return
+    if set(env.get_attr("kind")) & set(UNBOUNDED_KINDS):
+        raise ValueError(
+            f"{reward_misfit(agent, float('nan'))}, and this environment's have normal noise"
+        )
+
+
+# What all bandit agents share: pulling arms, waiting for feedback, learning from it.
+
+
+class BanditArguments(LearningArguments, total=False):
+    """What the constructors of agents hand on that go by masks; see `BanditAlgorithm`."""
+
+    mask_actions: bool
+
+
+class Pull(NamedTuple):
+    """A pull and its reward, kept until the feedback is due.
+
+    Attributes:
+        context: what the arm was chosen in: a row of the tables, or a list of features.
+        arm: what was pulled.
+        reward: what it gave.
+        probability: how likely the choice was, for the rules that need to know; else 1.
+        mask: the arms that were allowed, a bool for each; None for agents that do not go by masks.
+    """
+
+    context: Any
+    arm: int
+    reward: float
+    probability: float
+    mask: list[bool] | None = None
+
+
+class BanditAlgorithm(LearningAlgorithm):
+    """Learns which arm is best in a context, as if what it does changed nothing later.
+
+    Where the environment's ``info`` says ``feedback_due: False``, rewards are kept until it says
+    ``True``, and learnt from then in their order; pulls that it says were not ``matched`` by a log
+    are not learnt from.
+
+    Args:
+        policy: name of the policy.
+        env: environment with `Discrete` actions, the arms, or its id.
+        learning_rate: step size, for agents that have one.
+        mask_actions: choose among the arms that the environment allows at each pull, and learn as
+            if there were no others. It says so by a method `action_masks()`, which may go by more
+            than the context.
+        kwargs: as in `LearningAlgorithm`.
+
+    Raises:
+        ValueError: if an argument lies outside its range, or a space or a reward does not fit; if
+            masks are asked for and the environment or the agent has no use for them, or one is
+            malformed or allows nothing.
+    """
+
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_infos", "_probabilities", "_masks")
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        learning_rate: StepSize = 0.0,
+        mask_actions: bool = False,
+        **kwargs: Unpack[LearningArguments],
+    ) -> None:
+        self.mask_actions = mask_actions
+        self._masks: Bools = np.ones((0, 0), dtype=np.bool_)
+        self._pending: list[list[Any]] = []
+        self._infos: list[dict[str, Any]] = []
+        self._probabilities: Floats = np.ones(0)
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    def _check_arguments(self) -> None:
+        check_space(self, "actions", self.action_space)
+        if self.mask_actions:
+            self._check_masks()
+
+    def _check_masks(self) -> None:
+        """Refuse masks that the environment does not tell, or the agent does not go by."""
+        if _owner(type(self), "_choose") is not _owner(type(self), "_choose_allowed"):
+            raise ValueError(f"mask_actions: {type(self).__name__} chooses among all arms")
+        if self.env is not None:
+            check_masks_exist(self.env)
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if self.mask_actions and isinstance(self.observation_space, spaces.Discrete):
+            cast(ArmPolicy, self.policy).keep_masks()
+
+    def check_compilable(self) -> None:
+        if self.mask_actions:
+            raise NotCompilable("the environment is asked for its action masks at each pull")
+
+    @property
+    def n_arms(self) -> int:
+        """Number of arms."""
+        return int(cast(spaces.Discrete, self.action_space).n)
+
+    @property
+    def rewards_known(self) -> str:
+        """The rewards that the agent can learn from, one of `agents.bandits.algorithm`."""
+        return ANY
+
+    @abstractmethod
+    def _contexts(self, obs: NDArray[Any]) -> Any:
+        """What arms are chosen in, one for each of the observations, shape (n, ...)."""
+
+    @abstractmethod
+    def _choose(self, contexts: Any, rng: np.random.Generator) -> tuple[Ints, Floats]:
+        """An arm for each context and how likely it was, shapes (n,)."""
+
+    def _choose_allowed(
+        self, contexts: Any, masks: Bools, rng: np.random.Generator
+    ) -> tuple[Ints, Floats]:
+        """As `_choose`, among the arms in ``masks``, of shape (n, arms)."""
+        # Never asked: with masks, a class that does not say this is refused when it is made.
+        raise NotImplementedError
+
+    @abstractmethod
+    def _learn(self, pull: Pull) -> None:
+        """Learn from one pull."""
+
+    def _setup_learn(
+        self, total_timesteps: int, callback: MaybeCallback = None, *args: Any, **kwargs: Any
+    ) -> tuple[int, BaseCallback]:
+        assert self.env is not None
+        check_kinds(self, self.env)
+        if self.mask_actions:
+            self._check_masks()
+        return super()._setup_learn(total_timesteps, callback, *args, **kwargs)
+
+    def _begin_episodes(self) -> None:
+        self._pending = [[] for _ in range(self.n_envs)]
+
+    def _choose_actions(self) -> Ints:
+        obs: Any = self._last_obs
+        contexts = self._contexts(obs)
+        if not self.mask_actions:
+            actions, self._probabilities = self._choose(contexts, self.rng)
+            return actions
+        assert self.env is not None
+        self._masks = present_masks(self.env, obs)
+        actions, self._probabilities = self._choose_allowed(contexts, self._masks, self.rng)
+        if len(self._policy_masks):
+            self._policy_masks[obs] = self._masks
+        return actions
+
+    @property
+    def _policy_masks(self) -> Bools:
+        """What was allowed last in each context, of no rows where contexts are vectors."""
+        return cast(ArmPolicy, self.policy).masks
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: Bools | None = None) -> None:
+        super()._update_info_buffer(infos, dones)
+        # What an environment says of a pull decides what is learnt from it.
+        self._infos = infos
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        contexts = self._contexts(transitions.obs).tolist()
+        for i, info in enumerate(self._infos):
+            pending = self._pending[i]
+            if info.get("matched", True):
+                reward = float(transitions.rewards[i])
+                check_reward(self, reward)
+                arm, probability = int(transitions.actions[i]), float(self._probabilities[i])
+                told = [self._masks[i].tolist()] if self.mask_actions else []
+                pending.append([contexts[i], arm, reward, probability, *told])
+            if info.get("feedback_due", True) or transitions.dones[i]:
+                for pull in pending:
+                    self._learn(Pull(*pull))
+                self._n_updates += len(pending)
+                pending.clear()
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+        action_masks: Any = None,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The arm judged best, or an exploring choice unless ``deterministic``.
+
+        Takes one observation or an array of n, and returns an action or n of them, and ``state``;
+        ``episode_start`` is not used. With ``mask_actions``, ``action_masks`` of shape (n, arms)
+        say what is allowed; without them it is what was allowed last in the context.
+
+        Raises:
+            ValueError: if there are masks and the agent does not go by them, or none and it does.
+        """
+        if action_masks is not None and not self.mask_actions:
+            raise ValueError("action_masks: the agent was made without mask_actions")
+        if deterministic and not self.mask_actions:
+            return super().predict(observation, state, episode_start, deterministic)
+        obs = np.asarray(observation)
+        contexts = self._contexts(obs)
+        if not self.mask_actions:
+            actions, _ = self._choose(contexts, self.predict_rng)
+        else:
+            masks = self._masks_at(obs, len(contexts), action_masks)
+            if deterministic:
+                actions = cast(ArmPolicy, self.policy).best_arms(obs, masks)
+            else:
+                actions, _ = self._choose_allowed(contexts, masks, self.predict_rng)
+        shape = obs.shape[: obs.ndim - len(self.observation_space.shape or ())]
+        return actions.reshape(shape), state
+
+    def _masks_at(self, obs: NDArray[Any], n: int, told: Any) -> Bools:
+        """The arms to choose among at ``n`` observations, told or kept, shape (n, arms)."""
+        if told is None and not len(self._policy_masks):
+            raise ValueError("mask_actions: predict needs action_masks where contexts are vectors")
+        if told is None:
+            return cast(ArmPolicy, self.policy).kept_masks(obs.reshape(-1).astype(np.int64))
+        masks = np.atleast_2d(told)
+        if len(masks) != n:
+            shape, right = np.shape(told), (n, self.n_arms)
+            raise ValueError(f"action_masks must be of shape {right}, not {shape}")
+        one_each = obs.reshape(n, *(self.observation_space.shape or ()))
+        return checked_masks(masks, one_each, self.n_arms)
+
+    def _record_training(self) -> None:
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if self.exploration_schedule(1.0) > 0:
+            self.logger.record("rollout/exploration_rate", self.exploration_rate)
+
+
+def _owner(cls: type, name: str) -> type:
+    """The class that an attribute of ``cls`` stands in."""
+    return next(base for base in cls.__mro__ if name in vars(base))

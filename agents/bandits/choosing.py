@@ -1,0 +1,553 @@
+"""Compiled functions that choose arms and learn from rewards: by scores and by linear models."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agents.common.exploration import greedy_action
+from agents.compiled.generators import generator_of
+from agents.compiled.loop import CompiledOnlyError, by_type
+from machine_code.compiling import inlined, kernel
+from mdp.array_types import Bools, Floats, Ints
+
+# Agents that keep a score for each arm in each context: choosing an arm, learning from its reward.
+#
+# Compiled functions, shared by the interpreted and the compiled loop. What an algorithm adds is
+# `choose_arm` and `learn_from_pull`, and `choice_probability` where its update asks for it.
+
+# A pull and its reward, kept until the feedback is due.
+PULL = np.dtype(
+    [
+        ("row", np.int64),  # the context
+        ("arm", np.int64),
+        ("reward", np.float64),
+        ("probability", np.float64),  # how likely the choice was, where the update asks for it
+    ],
+    align=True,
+)
+
+
+@by_type
+def masked_count(tables: Any) -> int:
+    """Number of the rewards of arms in the context that are left out of the tables."""
+    raise CompiledOnlyError
+
+
+@by_type
+def masked_sum(tables: Any) -> float:
+    """Sum of the rewards of arms in the context that are left out of the tables."""
+    raise CompiledOnlyError
+
+
+class ScoreTables(NamedTuple):
+    """What an agent knows; each of shape (contexts, arms).
+
+    Attributes:
+        scores: what it judges arms by: a value, a posterior mean, a preference, a log-weight.
+        sums: sum of the rewards.
+        counts: number of the rewards.
+    """
+
+    scores: Floats
+    sums: Floats
+    counts: Ints
+
+    @inlined
+    def masked_count(self) -> int:
+        """All arms are in the tables."""
+        return 0
+
+    @inlined
+    def masked_sum(self) -> float:
+        """All arms are in the tables."""
+        return 0.0
+
+
+class Feedback(NamedTuple):
+    """Pulls that wait for their feedback.
+
+    Attributes:
+        pulls: room for them, records of type `PULL`, shape (capacity,).
+        waiting: how many there are, shape (1,).
+    """
+
+    pulls: NDArray[Any]
+    waiting: Ints
+
+
+class ScoreAgent(NamedTuple):
+    """An agent as compiled functions see it.
+
+    Attributes:
+        settings: a record of the type that its class has.
+        tables: what it knows, `ScoreTables` or `AllowedTables`.
+        feedback: pulls that are not learnt from yet.
+        arms: room for a number for each arm, shape (arms,).
+        draws: room for the random numbers of a choice, shape (2,).
+        rng: a handle of its generator.
+    """
+
+    settings: Any
+    tables: Any
+    feedback: Feedback
+    arms: Floats
+    draws: Floats
+    rng: Any
+
+
+@by_type
+def choose_arm(agent: ScoreAgent, row: int, progress: Any) -> int:
+    """An arm in the context ``row``."""
+    raise CompiledOnlyError
+
+
+@by_type
+def choice_probability(agent: ScoreAgent, row: int, arm: int) -> float:
+    """How likely the choice of ``arm`` was."""
+    raise CompiledOnlyError
+
+
+@by_type
+def learn_from_pull(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """Learn from a record of type `PULL`, whose reward is counted in already."""
+
+
+@by_type
+def before_counting(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """Learn what has to be learnt before the reward is counted in."""
+
+
+@inlined
+def no_probability(agent: ScoreAgent, row: int, arm: int) -> float:
+    """The update does not ask for it."""
+    return 1.0
+
+
+@inlined
+def nothing_before(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """The update needs the reward counted in."""
+
+
+@inlined
+def total_count(tables: Any, row: int) -> int:
+    """Rewards seen in a context, those of masked arms among them."""
+    total = masked_count(tables)
+    for arm in range(tables.counts.shape[1]):
+        total += tables.counts[row, arm]
+    return total
+
+
+@inlined
+def mean_reward(tables: Any, row: int) -> float:
+    """Average of all rewards seen in a context, at least one."""
+    total = masked_sum(tables)
+    for arm in range(tables.sums.shape[1]):
+        total += tables.sums[row, arm]
+    return total / total_count(tables, row)
+
+
+@inlined
+def learn(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """Count a reward in, and learn from it."""
+    before_counting(agent, pull, progress)
+    agent.tables.counts[pull.row, pull.arm] += 1
+    agent.tables.sums[pull.row, pull.arm] += pull.reward
+    learn_from_pull(agent, pull, progress)
+
+
+@inlined
+def act_on_scores(agent: ScoreAgent, env: Any, progress: Any) -> None:
+    """Pull an arm in the context that the environment shows."""
+    row = 0 if agent.settings.ignore_context else env.obs
+    env.action = choose_arm(agent, row, progress)
+    env.probability = choice_probability(agent, row, env.action)
+
+
+@inlined
+def learn_from_feedback(agent: ScoreAgent, envs: Any, progress: Any) -> None:
+    """Keep the pull; learn from all that wait where their feedback comes in."""
+    feedback, env = agent.feedback, envs[0]
+    pull = feedback.pulls[feedback.waiting[0]]
+    pull.row = 0 if agent.settings.ignore_context else env.obs
+    pull.arm = env.action
+    pull.reward = env.reward
+    pull.probability = env.probability
+    feedback.waiting[0] += 1
+    if env.feedback_due:
+        for k in range(feedback.waiting[0]):
+            learn(agent, feedback.pulls[k], progress)
+        feedback.waiting[0] = 0
+    env.obs = env.new_obs
+
+
+@kernel
+def choose_arms(
+    agent: ScoreAgent, rows: Ints, progress: Any, arms: Ints, probabilities: Floats
+) -> int:
+    """Fill in an arm for each of the contexts ``rows``, and how likely it was; shapes (n,).
+
+    Returns:
+        -1, or the place of a context that has no row in the tables, before which it stops.
+    """
+    for i in range(len(rows)):
+        if not 0 <= rows[i] < agent.tables.scores.shape[0]:
+            return i
+        arms[i] = choose_arm(agent, rows[i], progress)
+        probabilities[i] = choice_probability(agent, rows[i], arms[i])
+    return -1
+
+
+@kernel
+def learn_one(agent: ScoreAgent, pull: Any, progress: Any) -> None:
+    """`learn`, for the interpreted loop."""
+    learn(agent, pull, progress)
+
+
+# Agents with a linear model of each arm's reward in the context.
+#
+# Each arm's ridge regression keeps the matrix A = ridge I + sum x x' as its factors L D L', which a
+# new context changes by a rank-one update that cannot lose positive definiteness (Gill, Golub,
+# Murray
+# and Saunders, 1974, method C1). Compiled functions, shared by both loops. What an algorithm adds
+# is
+# `bonus`, and `pick` where it does not take the best.
+
+
+class Regressions(NamedTuple):
+    """What an agent knows.
+
+    Attributes:
+        factors: D on the diagonal and L below it, shape (arms, features, features).
+        moments: sum of reward times context, shape (arms, features).
+        coefficients: of the regression, shape (arms, features).
+        counts: number of rewards, shape (arms,).
+    """
+
+    factors: Floats
+    moments: Floats
+    coefficients: Floats
+    counts: Ints
+
+
+class LinearAgent(NamedTuple):
+    """An agent as compiled functions see it.
+
+    Attributes:
+        settings: a record of the type that its class has.
+        models: what it knows.
+        feedback: pulls that are not learnt from yet.
+        contexts: of those pulls, shape (capacity, features).
+        context: what an arm is to be chosen in, shape (features,).
+        arms: room for a number for each arm, shape (arms,).
+        features: room for a number for each feature, shape (features,).
+        draws: room for the random numbers of a choice, shape (2,).
+        rng: a handle of its generator.
+    """
+
+    settings: Any
+    models: Regressions
+    feedback: Feedback
+    contexts: Floats
+    context: Floats
+    arms: Floats
+    features: Floats
+    draws: Floats
+    rng: Any
+
+
+@by_type
+def bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """What is added to the predicted reward before the best arm is taken."""
+    raise CompiledOnlyError
+
+
+@by_type
+def pick(agent: LinearAgent, progress: Any) -> int:
+    """An arm by the scores in ``agent.arms`` and the first draw in ``agent.draws``."""
+    raise CompiledOnlyError
+
+
+@inlined
+def best_arm(agent: LinearAgent, progress: Any) -> int:
+    """A best arm, whichever of several the draw falls on."""
+    return greedy_action(agent.arms, agent.draws[0] * agent.settings.tie_scale)
+
+
+@inlined
+def predicted_mean(models: Regressions, arm: int, context: Floats) -> float:
+    """Expected reward of ``arm`` in ``context``, of shape (features,)."""
+    mean = 0.0
+    for i in range(len(context)):
+        mean += context[i] * models.coefficients[arm, i]
+    return mean
+
+
+@inlined
+def deviation(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """The square root of x' A^-1 x."""
+    factors, solved = agent.models.factors, agent.features
+    variance = 0.0
+    for i in range(len(context)):
+        solved[i] = context[i]
+        for j in range(i):
+            solved[i] -= factors[arm, i, j] * solved[j]
+        variance += solved[i] * solved[i] / factors[arm, i, i]
+    return math.sqrt(variance)
+
+
+@inlined
+def choose_by_model(agent: LinearAgent, context: Floats, progress: Any) -> int:
+    """An arm in ``context``."""
+    for arm in range(len(agent.arms)):
+        agent.arms[arm] = predicted_mean(agent.models, arm, context)
+        agent.arms[arm] += bonus(agent, arm, context)
+    agent.draws[0] = generator_of(agent.rng).random()
+    return pick(agent, progress)
+
+
+@inlined
+def add_context(models: Regressions, arm: int, context: Floats, rest: Floats) -> None:
+    """Make the factors those of A + x x'; ``rest`` is room for a number for each feature."""
+    factors = models.factors
+    for i in range(len(context)):
+        rest[i] = context[i]
+    weight = 1.0
+    for j in range(len(context)):
+        pivot = rest[j]
+        old = factors[arm, j, j]
+        new = old + weight * pivot * pivot
+        gain = weight * pivot / new
+        weight *= old / new
+        factors[arm, j, j] = new
+        for i in range(j + 1, len(context)):
+            rest[i] -= pivot * factors[arm, i, j]
+            factors[arm, i, j] += gain * rest[i]
+
+
+@inlined
+def solve(models: Regressions, arm: int) -> None:
+    """Make the coefficients those of A^-1 times the moments."""
+    factors, solution = models.factors, models.coefficients
+    n_features = solution.shape[1]
+    for i in range(n_features):
+        solution[arm, i] = models.moments[arm, i]
+        for j in range(i):
+            solution[arm, i] -= factors[arm, i, j] * solution[arm, j]
+    for i in range(n_features - 1, -1, -1):
+        solution[arm, i] /= factors[arm, i, i]
+        for j in range(i + 1, n_features):
+            solution[arm, i] -= factors[arm, j, i] * solution[arm, j]
+
+
+@inlined
+def learn_by_model(agent: LinearAgent, pull: Any, context: Floats) -> None:
+    """Learn from a record of type `PULL` in ``context``."""
+    models = agent.models
+    add_context(models, pull.arm, context, agent.features)
+    for i in range(len(context)):
+        models.moments[pull.arm, i] += pull.reward * context[i]
+    models.counts[pull.arm] += 1
+    solve(models, pull.arm)
+
+
+@inlined
+def act_on_context(agent: LinearAgent, env: Any, progress: Any) -> None:
+    """Pull an arm in the context that the environment shows."""
+    env.action = choose_by_model(agent, agent.context, progress)
+    waiting = agent.feedback.waiting[0]
+    # The environment moves on to another context before there is anything to learn from this one.
+    for i in range(len(agent.context)):
+        agent.contexts[waiting, i] = agent.context[i]
+
+
+@inlined
+def learn_from_contexts(agent: LinearAgent, envs: Any, progress: Any) -> None:
+    """Keep the pull; learn from all that wait where their feedback comes in."""
+    feedback, env = agent.feedback, envs[0]
+    pull = feedback.pulls[feedback.waiting[0]]
+    pull.arm = env.action
+    pull.reward = env.reward
+    feedback.waiting[0] += 1
+    if env.feedback_due:
+        for k in range(feedback.waiting[0]):
+            learn_by_model(agent, feedback.pulls[k], agent.contexts[k])
+        feedback.waiting[0] = 0
+    env.obs = env.new_obs
+
+
+@kernel
+def choose_all_by_model(agent: LinearAgent, contexts: Floats, progress: Any, arms: Ints) -> None:
+    """Fill in an arm for each of the contexts, which are of shape (n, features)."""
+    for i in range(len(contexts)):
+        arms[i] = choose_by_model(agent, contexts[i], progress)
+
+
+@kernel
+def learn_one_by_model(agent: LinearAgent, pull: Any, context: Floats) -> None:
+    """`learn_by_model`, for the interpreted loop."""
+    learn_by_model(agent, pull, context)
+
+
+# Choosing and learning among the arms that the environment allows.
+#
+# A rule is handed a smaller bandit: a copy of what the agent knows of the allowed arms in the
+# present
+# context, and of no others. So no rule needs a line for masks, and where all arms are allowed it
+# does
+# the same to the bit. Agents that do not go by masks never come here.
+
+
+class AllowedTables(NamedTuple):
+    """What an agent knows of the allowed arms in one context; arrays of shape (1, n).
+
+    Attributes:
+        scores: as in `ScoreTables`.
+        sums: as in `ScoreTables`.
+        counts: as in `ScoreTables`.
+        other_count: number of the rewards of the other arms.
+        other_sum: their sum.
+    """
+
+    scores: Floats
+    sums: Floats
+    counts: Ints
+    other_count: int
+    other_sum: float
+
+    @inlined
+    def masked_count(self) -> int:
+        """Rewards of the masked arms."""
+        return self.other_count
+
+    @inlined
+    def masked_sum(self) -> float:
+        """Their sum."""
+        return self.other_sum
+
+
+class AllowedRoom(NamedTuple):
+    """Where a smaller bandit is put together.
+
+    Attributes:
+        scores: shape (1, arms).
+        sums: shape (1, arms).
+        counts: shape (1, arms).
+        arms: which arm is the smaller bandit's k-th, shape (arms,).
+    """
+
+    scores: Floats
+    sums: Floats
+    counts: Ints
+    arms: Ints
+
+
+def allowed_room(n_arms: int) -> AllowedRoom:
+    """Room for bandits of up to ``n_arms``."""
+    shape, whole = (1, n_arms), np.int64
+    return AllowedRoom(
+        np.empty(shape), np.empty(shape), np.empty(shape, whole), np.empty(n_arms, whole)
+    )
+
+
+@inlined
+def allowed_tables(tables: ScoreTables, row: int, mask: Bools, room: AllowedRoom) -> AllowedTables:
+    """What is known of the arms of ``mask`` in the context ``row``, copied."""
+    n, other_count, other_sum = 0, 0, 0.0
+    for arm in range(len(mask)):
+        if mask[arm]:
+            room.arms[n] = arm
+            room.scores[0, n] = tables.scores[row, arm]
+            room.sums[0, n] = tables.sums[row, arm]
+            room.counts[0, n] = tables.counts[row, arm]
+            n += 1
+        else:
+            other_count += tables.counts[row, arm]
+            other_sum += tables.sums[row, arm]
+    scores, sums, counts = room.scores[:, :n], room.sums[:, :n], room.counts[:, :n]
+    return AllowedTables(scores, sums, counts, other_count, other_sum)
+
+
+@kernel
+def choose_allowed_arms(
+    agent: ScoreAgent,
+    rows: Ints,
+    masks: Bools,
+    room: AllowedRoom,
+    progress: Any,
+    arms: Ints,
+    probabilities: Floats,
+) -> int:
+    """As `choose_arms`, among the arms in ``masks``, of shape (n, arms)."""
+    for i in range(len(rows)):
+        if not 0 <= rows[i] < agent.tables.scores.shape[0]:
+            return i
+        known = allowed_tables(agent.tables, rows[i], masks[i], room)
+        numbers = agent.arms[: known.scores.shape[1]]
+        smaller = ScoreAgent(agent.settings, known, agent.feedback, numbers, agent.draws, agent.rng)
+        chosen = choose_arm(smaller, 0, progress)
+        arms[i] = room.arms[chosen]
+        probabilities[i] = choice_probability(smaller, 0, chosen)
+    return -1
+
+
+@kernel
+def learn_one_allowed(
+    agent: ScoreAgent, pull: Any, mask: Bools, room: AllowedRoom, progress: Any
+) -> None:
+    """As `learn_one`, of a pull at which the arms in ``mask`` were allowed, of shape (arms,)."""
+    tables, row = agent.tables, pull.row
+    known, place = allowed_tables(tables, row, mask, room), 0
+    n = known.scores.shape[1]
+    smaller = ScoreAgent(
+        agent.settings, known, agent.feedback, agent.arms[:n], agent.draws, agent.rng
+    )
+    for k in range(n):
+        if room.arms[k] == pull.arm:
+            place = k
+    pull.row = 0
+    pull.arm = place
+    learn(smaller, pull, progress)
+    for k in range(n):
+        arm = room.arms[k]
+        tables.scores[row, arm] = room.scores[0, k]
+        tables.sums[row, arm] = room.sums[0, k]
+        tables.counts[row, arm] = room.counts[0, k]
+
+
+@inlined
+def choose_allowed_by_model(agent: LinearAgent, context: Floats, arms: Ints, progress: Any) -> int:
+    """One of ``arms`` in ``context``; each has a model of its own, so that nothing is copied."""
+    smaller = LinearAgent(
+        agent.settings,
+        agent.models,
+        agent.feedback,
+        agent.contexts,
+        agent.context,
+        agent.arms[: len(arms)],
+        agent.features,
+        agent.draws,
+        agent.rng,
+    )
+    for k in range(len(arms)):
+        smaller.arms[k] = predicted_mean(agent.models, arms[k], context)
+        smaller.arms[k] += bonus(agent, arms[k], context)
+    agent.draws[0] = generator_of(agent.rng).random()
+    return int(arms[pick(smaller, progress)])
+
+
+@kernel
+def choose_all_allowed_by_model(
+    agent: LinearAgent, contexts: Floats, masks: Bools, room: Ints, progress: Any, arms: Ints
+) -> None:
+    """As `choose_all_by_model`, among the arms in ``masks``, of shape (n, arms)."""
+    for i in range(len(contexts)):
+        n = 0
+        for arm in range(masks.shape[1]):
+            if masks[i, arm]:
+                room[n] = arm
+                n += 1
+        arms[i] = choose_allowed_by_model(agent, contexts[i], room[:n], progress)

@@ -1,0 +1,333 @@
+"""Contextual agents with a linear model of each arm: LinUCB and its kin."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Unpack
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from agents.bandits.algorithm import ArmPolicy, BanditAlgorithm, BanditArguments, Pull
+from agents.bandits.choosing import (
+    PULL,
+    Feedback,
+    LinearAgent,
+    Regressions,
+    act_on_context,
+    best_arm,
+    choose_all_allowed_by_model,
+    choose_all_by_model,
+    deviation,
+    learn_from_contexts,
+    learn_one_by_model,
+)
+from agents.common.exploration import choose_action
+from agents.common.schedules import epsilon_schedule
+from agents.common.settings import (
+    ExplorationDecay,
+    check_above_zero,
+    check_at_least,
+    check_epsilons,
+    check_space,
+    settings_of,
+)
+from agents.compiled.generators import generator_of, handles_of
+from machine_code.compiling import inlined
+from mdp.array_types import Bools, Floats, Ints
+
+# The policy of agents with a linear model of each arm's reward: all that they know, in buffers.
+
+
+class LinearBanditPolicy(ArmPolicy):
+    """Pulls the arm of the highest predicted reward.
+
+    Args:
+        observation_space: `Box` of shape (d,), or `Discrete` with d values, each of them a feature.
+        action_space: `Discrete` with A values: the arms.
+        lr_schedule: not used; here because every policy is handed one.
+        ridge: what the regressions start from, on the diagonal.
+
+    Attributes:
+        factors: of each arm's regression matrix, float64 of shape (A, d, d).
+        moments: sum of reward times context, float64 of shape (A, d).
+        coefficients: of each arm's regression, float64 of shape (A, d).
+        counts: number of rewards of each arm, int64 of shape (A,).
+    """
+
+    factors: th.Tensor
+    moments: th.Tensor
+    coefficients: th.Tensor
+    counts: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        ridge: float = 1.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
+        n_arms, n_features = int(action_space.n), number_of_features(observation_space)
+        identity = ridge * th.eye(n_features, dtype=th.float64)
+        self.register_buffer("factors", identity.repeat(n_arms, 1, 1))
+        self.register_buffer("moments", th.zeros((n_arms, n_features), dtype=th.float64))
+        self.register_buffer("coefficients", th.zeros((n_arms, n_features), dtype=th.float64))
+        self.register_buffer("counts", th.zeros(n_arms, dtype=th.int64))
+
+    @property
+    def models(self) -> Regressions:
+        """The buffers as arrays that share their memory."""
+        return Regressions(
+            self.factors.numpy(),
+            self.moments.numpy(),
+            self.coefficients.numpy(),
+            self.counts.numpy(),
+        )
+
+    def judged(self, observations: NDArray[Any]) -> Floats:
+        contexts = features(self.observation_space, observations)
+        return np.asarray(contexts @ self.coefficients.numpy().T)
+
+
+def number_of_features(space: spaces.Space[Any]) -> int:
+    """Length of the vectors that `features` makes."""
+    return int(space.n) if isinstance(space, spaces.Discrete) else int(space.shape[0])  # type: ignore[index]
+
+
+def features(space: spaces.Space[Any], observations: NDArray[Any]) -> Floats:
+    """Observations as vectors, one-hot where they are numbers; shape (n, d)."""
+    n_features = number_of_features(space)
+    if isinstance(space, spaces.Discrete):
+        return np.asarray(np.eye(n_features)[observations.astype(np.int64).reshape(-1)])
+    vectors: Floats = observations.astype(np.float64).reshape(-1, n_features)
+    return vectors
+
+
+# Contextual agents with a linear model of each arm's reward.
+
+
+class LinearArguments(BanditArguments, total=False):
+    """What the constructors of these agents take; see `LinearBanditAgent`."""
+
+    ridge: float
+
+
+@inlined
+def no_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """Arms are judged by their predicted rewards."""
+    return 0.0
+
+
+@inlined
+def confidence_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """So many standard deviations of the prediction."""
+    return float(agent.settings.alpha * deviation(agent, arm, context))
+
+
+@inlined
+def sampled_bonus(agent: LinearAgent, arm: int, context: Floats) -> float:
+    """A draw from the posterior of the prediction, less its mean.
+
+    One context is scored, so that a normal number for each arm's mean reward does what a draw of
+    all its coefficients would.
+    """
+    noise = agent.settings.alpha * generator_of(agent.rng).standard_normal()
+    return float(noise * deviation(agent, arm, context))
+
+
+@inlined
+def pick_epsilon_greedily(agent: LinearAgent, progress: Any) -> int:
+    """A uniformly random arm with probability epsilon, else a best one."""
+    settings = agent.settings
+    agent.draws[1] = generator_of(agent.rng).random()
+    epsilon, ties = progress.exploration, settings.tie_scale
+    return choose_action(settings.strategy, agent.arms, epsilon, ties, agent.draws)
+
+
+class LinearBanditAgent(BanditAlgorithm):
+    """An agent with a ridge regression for each arm; contexts that are numbers become one-hot.
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: environment with `Box` observations of shape (d,) or `Discrete` ones, or its id.
+        ridge: what the regressions start from, on the diagonal, above 0.
+        kwargs: as in `BanditAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "LinearBanditPolicy": LinearBanditPolicy
+    }
+    policy: LinearBanditPolicy
+
+    # What the training loops call; `bonus` is each algorithm's own.
+    act = act_on_context
+    learn_from_step = learn_from_contexts
+    pick = best_arm
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "LinearBanditPolicy",
+        env: GymEnv | str | None = None,
+        ridge: float = 1.0,
+        **kwargs: Unpack[BanditArguments],
+    ) -> None:
+        self.ridge = ridge
+        super().__init__(policy, env, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        space = self.observation_space
+        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+            check_space(self, "observations of shape (d,) in a Box space or", space)
+        check_above_zero(settings_of(self, "ridge"))
+
+    def _make_policy(self) -> LinearBanditPolicy:
+        policy: Any = self.policy_class
+        made: LinearBanditPolicy = policy(
+            self.observation_space, self.action_space, self.lr_schedule, ridge=self.ridge
+        )
+        return made
+
+    def compiled_agent(
+        self,
+        rng: np.random.Generator,
+        models: Regressions | None = None,
+        capacity: int = 1,
+        context: Floats | None = None,
+    ) -> LinearAgent:
+        """The agent as compiled functions see it.
+
+        Args:
+            rng: its generator.
+            models: what it knows; by default what its policy holds.
+            capacity: pulls that may wait for their feedback.
+            context: what an arm is to be chosen in, in the memory of the environment.
+        """
+        n_features = number_of_features(self.observation_space)
+        return LinearAgent(
+            self.settings()[0],
+            models or self.policy.models,
+            Feedback(np.zeros(capacity, dtype=PULL), np.zeros(1, dtype=np.int64)),
+            np.empty((capacity, n_features)),
+            np.empty(n_features) if context is None else context,
+            np.empty(self.n_arms),
+            np.empty(n_features),
+            np.empty(2),
+            handles_of([rng])[0],
+        )
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
+        return self.compiled_agent(rng)
+
+    def _contexts(self, obs: NDArray[Any]) -> Floats:
+        return features(self.observation_space, obs)
+
+    def _choose(self, contexts: Floats, rng: np.random.Generator) -> tuple[Ints, Floats]:
+        arms = np.empty(len(contexts), dtype=np.int64)
+        choose_all_by_model(
+            self._workspace_for(rng, len(contexts)), contexts, self.progress()[0], arms
+        )
+        return arms, np.ones(len(arms))
+
+    def _choose_allowed(
+        self, contexts: Floats, masks: Bools, rng: np.random.Generator
+    ) -> tuple[Ints, Floats]:
+        arms, room = (np.empty(n, dtype=np.int64) for n in (len(contexts), self.n_arms))
+        agent = self._workspace_for(rng, len(contexts))
+        choose_all_allowed_by_model(agent, contexts, masks, room, self.progress()[0], arms)
+        return arms, np.ones(len(arms))
+
+    def _learn(self, pull: Pull) -> None:
+        record = np.array([(0, *pull[1:4])], dtype=PULL)[0]
+        learn_one_by_model(self._workspace_for(self.rng, 1), record, np.array(pull.context))
+
+
+class LinUCB(LinearBanditAgent):
+    """Linear upper confidence bounds with disjoint models (Li et al., 2010).
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: as in `LinearBanditAgent`.
+        alpha: how many standard deviations the bound lies above the predicted reward.
+        kwargs: as in `LinearBanditAgent`.
+    """
+
+    parameters = {"alpha": np.float64}  # noqa: RUF012
+    bonus = confidence_bonus
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "LinearBanditPolicy",
+        env: GymEnv | str | None = None,
+        alpha: float = 1.0,
+        **kwargs: Unpack[LinearArguments],
+    ) -> None:
+        self.alpha = alpha
+        super().__init__(policy, env, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_at_least(0, settings_of(self, "alpha"))
+
+
+class LinThompson(LinUCB):
+    """Linear Thompson sampling (Agrawal and Goyal, 2013), with a model for each arm.
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: as in `LinearBanditAgent`.
+        alpha: scales the posterior's standard deviation; right is that of the rewards' noise.
+        kwargs: as in `LinearBanditAgent`.
+    """
+
+    bonus = sampled_bonus
+
+
+class LinEpsilonGreedy(LinearBanditAgent):
+    """Epsilon-greedy in the predicted rewards.
+
+    Args:
+        policy: ``"LinearBanditPolicy"``.
+        env: as in `LinearBanditAgent`.
+        exploration_initial_eps: epsilon at the start.
+        exploration_final_eps: epsilon at the end of ``exploration_fraction``.
+        exploration_fraction: share of training over which epsilon falls.
+        exploration_decay: how epsilon falls; ``"constant"`` stays at the initial value.
+        kwargs: as in `LinearBanditAgent`.
+    """
+
+    bonus = no_bonus
+    pick = pick_epsilon_greedily
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "LinearBanditPolicy",
+        env: GymEnv | str | None = None,
+        exploration_initial_eps: float = 0.1,
+        exploration_final_eps: float = 0.01,
+        exploration_fraction: float = 1.0,
+        exploration_decay: ExplorationDecay = "constant",
+        **kwargs: Unpack[LinearArguments],
+    ) -> None:
+        self.exploration_initial_eps = exploration_initial_eps
+        self.exploration_final_eps = exploration_final_eps
+        self.exploration_fraction = exploration_fraction
+        self.exploration_decay = exploration_decay
+        super().__init__(policy, env, **kwargs)
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_epsilons(self)
+
+    def _make_exploration_schedule(self) -> Schedule:
+        return epsilon_schedule(
+            self.exploration_decay,
+            self.exploration_initial_eps,
+            self.exploration_final_eps,
+            self.exploration_fraction,
+        )

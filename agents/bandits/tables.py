@@ -1,0 +1,234 @@
+"""The base of the bandit agents that keep a score for each arm in each context."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Unpack, cast
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+
+from agents.bandits.algorithm import ArmPolicy, BanditAlgorithm, BanditArguments, Pull
+from agents.bandits.choosing import (
+    PULL,
+    Feedback,
+    ScoreAgent,
+    ScoreTables,
+    act_on_scores,
+    allowed_room,
+    choose_allowed_arms,
+    choose_arms,
+    learn_from_feedback,
+    learn_one,
+    learn_one_allowed,
+    no_probability,
+    nothing_before,
+)
+from agents.common.settings import check_space
+from agents.compiled.generators import handles_of
+from agents.compiled.learning_algorithm import StepSize
+from mdp.array_types import Bools, Floats, Ints
+
+# The policy of agents that keep a score for each arm: all that they know, in buffers.
+
+
+class BanditPolicy(ArmPolicy):
+    """Pulls the arm of the highest score in the context.
+
+    The tables are buffers, so that they travel in the ``policy.pth`` of a model file.
+
+    Args:
+        observation_space: `Discrete`: the context.
+        action_space: `Discrete` with A values: the arms.
+        lr_schedule: not used; here because every policy is handed one.
+        n_contexts: number of contexts C that are told apart; 1 for none.
+        initial_score: of every arm at the start.
+
+    Attributes:
+        scores: what the agent judges arms by, float64 of shape (C, A).
+        sums: sum of the rewards, float64 of shape (C, A).
+        counts: number of the rewards, int64 of shape (C, A).
+    """
+
+    scores: th.Tensor
+    sums: th.Tensor
+    counts: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Discrete,
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        n_contexts: int = 1,
+        initial_score: float = 0.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
+        shape = (n_contexts, int(action_space.n))
+        self.register_buffer("scores", th.full(shape, initial_score, dtype=th.float64))
+        self.register_buffer("sums", th.zeros(shape, dtype=th.float64))
+        self.register_buffer("counts", th.zeros(shape, dtype=th.int64))
+
+    def _sizes(self) -> dict[str, Any]:
+        return {"n_contexts": len(self.scores)}
+
+    @property
+    def tables(self) -> ScoreTables:
+        """The buffers as arrays that share their memory."""
+        return ScoreTables(self.scores.numpy(), self.sums.numpy(), self.counts.numpy())
+
+    @property
+    def mean_rewards(self) -> Floats:
+        """Average reward of each arm, nan where there is none, shape (C, A)."""
+        return mean_rewards(self.sums.numpy(), self.counts.numpy())
+
+    def judged(self, observations: NDArray[Any]) -> Floats:
+        rows = observations.astype(np.int64).reshape(-1)
+        scores: Floats = self.scores.numpy()[rows % len(self.scores)]
+        return scores
+
+
+def mean_rewards(sums: Floats, counts: Ints) -> Floats:
+    """Sums over counts, nan where the count is 0; all of one shape."""
+    means = np.full(sums.shape, np.nan)
+    np.divide(sums, counts, out=means, where=counts > 0)
+    return means
+
+
+# What the agents share that keep a score for each arm in each context.
+
+
+class TableArguments(BanditArguments, total=False):
+    """What the constructors of these agents take; see `TableBandit`."""
+
+    ignore_context: bool
+
+
+class TableBandit(BanditAlgorithm):
+    """An agent with a score for each arm in each context, run for each context on its own.
+
+    Args:
+        policy: ``"BanditPolicy"``.
+        env: environment with `Discrete` observations, the contexts, or its id.
+        learning_rate: step size, for agents that have one.
+        ignore_context: one row for all contexts: what a pooled A/B test does.
+        kwargs: as in `BanditAlgorithm`.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"BanditPolicy": BanditPolicy}
+    policy: BanditPolicy
+    parameters = {"ignore_context": np.bool_}  # noqa: RUF012
+
+    # What the training loops call; `choose_arm` and `learn_from_pull` are each algorithm's own.
+    act = act_on_scores
+    learn_from_step = learn_from_feedback
+    choice_probability = no_probability
+    before_counting = nothing_before
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy] = "BanditPolicy",
+        env: GymEnv | str | None = None,
+        learning_rate: StepSize = 0.0,
+        ignore_context: bool = False,
+        **kwargs: Unpack[BanditArguments],
+    ) -> None:
+        self.ignore_context = ignore_context
+        super().__init__(policy, env, learning_rate, **kwargs)
+
+    @property
+    def initial_score(self) -> float:
+        """Score of every arm at the start."""
+        return 0.0
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        check_space(self, "observations", self.observation_space)
+
+    def _make_policy(self) -> BanditPolicy:
+        n_observations = int(cast(spaces.Discrete, self.observation_space).n)
+        policy: Any = self.policy_class
+        made: BanditPolicy = policy(
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            n_contexts=1 if self.ignore_context else n_observations,
+            initial_score=self.initial_score,
+        )
+        return made
+
+    def compiled_agent(
+        self, rng: np.random.Generator, tables: ScoreTables | None = None, capacity: int = 1
+    ) -> ScoreAgent:
+        """The agent as compiled functions see it.
+
+        Args:
+            rng: its generator.
+            tables: what it knows; by default what its policy holds.
+            capacity: pulls that may wait for their feedback.
+        """
+        return ScoreAgent(
+            self.settings()[0],
+            tables or self.policy.tables,
+            Feedback(np.zeros(capacity, dtype=PULL), np.zeros(1, dtype=np.int64)),
+            np.empty(self.n_arms),
+            np.empty(2),
+            handles_of([rng])[0],
+        )
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
+        return self.compiled_agent(rng)
+
+    def _contexts(self, obs: NDArray[Any]) -> Ints:
+        rows = obs.astype(np.int64).reshape(-1)
+        return np.zeros_like(rows) if self.ignore_context else rows
+
+    def _choose(self, contexts: Ints, rng: np.random.Generator) -> tuple[Ints, Floats]:
+        arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
+        outside = choose_arms(
+            self._workspace_for(rng, len(contexts)),
+            contexts,
+            self.progress()[0],
+            arms,
+            probabilities,
+        )
+        self._check_context(contexts, outside)
+        return arms, probabilities
+
+    def _choose_allowed(
+        self, contexts: Ints, masks: Bools, rng: np.random.Generator
+    ) -> tuple[Ints, Floats]:
+        arms, probabilities = np.empty(len(contexts), dtype=np.int64), np.empty(len(contexts))
+        outside = choose_allowed_arms(
+            self._workspace_for(rng, len(contexts)),
+            contexts,
+            masks,
+            allowed_room(self.n_arms),
+            self.progress()[0],
+            arms,
+            probabilities,
+        )
+        self._check_context(contexts, outside)
+        return arms, probabilities
+
+    def _check_context(self, contexts: Ints, outside: int) -> None:
+        """Refuse the context at ``outside``, unless that is -1."""
+        if outside >= 0:
+            n_contexts = len(self.policy.scores)
+            raise ValueError(f"context {contexts[outside]} is not in Discrete({n_contexts})")
+
+    def _learn(self, pull: Pull) -> None:
+        agent, progress = self._workspace_for(self.rng, 1), self.progress()[0]
+        record = np.array([pull[:4]], dtype=PULL)[0]
+        if pull.mask is None:
+            learn_one(agent, record, progress)
+        else:
+            mask = np.array(pull.mask, dtype=np.bool_)
+            learn_one_allowed(agent, record, mask, allowed_room(self.n_arms), progress)
+
+    def estimates(self, tables: ScoreTables) -> Floats:
+        """What the agent takes the arms' mean rewards for, shapes (..., contexts, arms)."""
+        return tables.scores

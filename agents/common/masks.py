@@ -1,0 +1,158 @@
+"""Which actions the environment allows: read from it, checked, and kept by policies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from agents.common.model_files import TablePolicy
+from envs.known_models import action_masks_of_states, observations_of_states
+from envs.wrappers import METHOD, action_masks, mask_source
+from mdp.array_types import Bools, Ints
+
+# Observations of `Discrete` spaces, as tables are looked up by them.
+
+
+def numbers_in(space: Any, observations: Any) -> Ints:
+    """Observations as whole numbers, in their own shape.
+
+    Args:
+        space: `Discrete`, beginning at 0.
+        observations: of any shape.
+
+    Raises:
+        ValueError: if one is not in the space, which would be looked up in the row of another.
+    """
+    given = np.asarray(observations)
+    outside = given[~((given >= 0) & (given < space.n) & (given == np.floor(given)))]
+    if outside.size:
+        raise ValueError(f"observation {outside[0]} is not in {space}, the agent's space")
+    return given.astype(np.int64)
+
+
+# Action masks of environments in a VecEnv, checked: what agents with ``mask_actions`` ask for.
+
+
+def check_masks_exist(env: VecEnv) -> None:
+    """Refuse environments that do not say what may be done.
+
+    Raises:
+        ValueError: saying what they would have to have.
+    """
+    inside = env.unwrapped
+    if isinstance(inside, DummyVecEnv):
+        found = all(mask_source(one) is not None for one in inside.envs)
+    else:
+        found = env.has_attr(METHOD)
+    if not found:
+        raise ValueError(
+            "mask_actions: the environment has no method action_masks(); where its info holds "
+            "action_mask, wrap it in envs.wrappers.ActionMasks"
+        )
+
+
+def present_masks(env: VecEnv, obs: Any) -> Bools:
+    """What may be done now, bool of shape (n_envs, n_actions).
+
+    Args:
+        env: the environments.
+        obs: what they show, to be named in errors, shape (n_envs, ...).
+
+    Raises:
+        ValueError: if an environment has no masks, or a malformed one.
+    """
+    inside = env.unwrapped
+    if isinstance(inside, DummyVecEnv):
+        masks = [action_masks(one) for one in inside.envs]
+        if any(mask is None for mask in masks):
+            check_masks_exist(env)
+    else:
+        masks = env.env_method(METHOD)
+    return checked_masks(masks, obs, int(env.action_space.n))  # type: ignore[attr-defined]
+
+
+def checked_masks(masks: Any, obs: Any, n_actions: int) -> Bools:
+    """Masks as an array, bool of shape (n, n_actions).
+
+    Args:
+        masks: one for each observation.
+        obs: the observations, shape (n, ...).
+        n_actions: how many actions there are.
+
+    Raises:
+        ValueError: if one has another shape or allows nothing; the message names the observation.
+    """
+    for mask, one in zip(masks, obs, strict=True):
+        shape, shown = np.shape(mask), " ".join(str(one).split())
+        if shape != (n_actions,):
+            raise ValueError(
+                f"the action mask for observation {shown} has shape {shape}, it must be "
+                f"({n_actions},), a bool for each action"
+            )
+        if not np.any(mask):
+            raise ValueError(f"the action mask for observation {shown} allows no action")
+    return np.asarray(masks, dtype=np.bool_)
+
+
+def masks_of_observations(env: VecEnv, n_observations: int) -> Bools | None:
+    """What may be done at each observation, bool of shape (n_observations, n_actions).
+
+    Returns:
+        The masks, all False for what is observed in no state; or None where they are not known for
+        all states, or differ between environments or between states that look alike.
+    """
+    inside = env.unwrapped
+    if not isinstance(inside, DummyVecEnv):
+        return None
+    found: Bools | None = None
+    for one in inside.envs:
+        masks, observations = action_masks_of_states(one), observations_of_states(one)
+        if masks is None or observations is None or observations.ndim != 1:
+            return None
+        by_observation = np.zeros((n_observations, masks.shape[1]), dtype=np.bool_)
+        by_observation[observations] = masks
+        if not np.array_equal(by_observation[observations], masks):
+            return None
+        if found is not None and not np.array_equal(found, by_observation):
+            return None
+        found = by_observation
+    return found
+
+
+# Policies that keep what the environment allows at each observation.
+
+
+class MaskBufferPolicy(TablePolicy):
+    """A policy that may hold a mask for each observation, in its model file too.
+
+    Attributes:
+        allowed_actions: what the environment allows at each observation, bool of shape (S, A), a
+            row of False where that is not known; only there after `keep_masks`.
+    """
+
+    allowed_actions: th.Tensor
+
+    def keep_masks(self) -> None:
+        """Make room for what the environment allows, where both spaces are `Discrete`."""
+        sizes: Any = (self.observation_space, self.action_space)
+        shape = tuple(int(space.n) for space in sizes)
+        self.register_buffer("allowed_actions", th.zeros(shape, dtype=th.bool))
+
+    @property
+    def masks(self) -> Bools:
+        """`allowed_actions` as an array that shares its memory, of no rows where there are none."""
+        if "allowed_actions" not in self._buffers:
+            n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
+            return np.zeros((0, n_actions), dtype=np.bool_)
+        return np.asarray(self.allowed_actions.numpy())
+
+    def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
+        """Take over tables; an agent may go by masks that was saved without them, or no longer."""
+        tables = {name: state_dict[name] for name in state_dict if name != "allowed_actions"}
+        if "allowed_actions" in self._buffers:
+            unknown = th.zeros_like(self.allowed_actions)
+            tables["allowed_actions"] = state_dict.get("allowed_actions", unknown)
+        return super().load_state_dict(tables, strict, assign)

@@ -1,0 +1,492 @@
+"""Agents of Stable-Baselines3 with compiled engines and masks, and deep agents built on them."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, ClassVar, Self
+
+import numpy as np
+import sb3_contrib
+import stable_baselines3
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.dqn.policies import QNetwork
+from torch import nn
+from torch.nn.functional import mse_loss
+from torch.nn.utils import clip_grad_norm_, parameters_to_vector
+
+from agents.common.callbacks import tell_safe_moment
+from agents.common.masks import check_masks_exist, checked_masks, present_masks
+from agents.common.settings import full_signature
+from agents.networks.engine_setting import (
+    CompiledNetworks,
+    NetworkEngineChoice,
+    Work,
+    check_policy_agent,
+    work_of,
+)
+from agents.networks.policy_training import (
+    PolicyTraining,
+    collect_rollout,
+    policy_networks,
+    policy_training,
+)
+from agents.networks.q_training import CompiledQLearning
+from agents.networks.torch_bridge import Network, check_optimizer
+from envs.wrappers import INFO_KEY
+from mdp.array_types import Bools
+
+# Stable-Baselines3's DQN, which can be told what the environment allows.
+
+# From observations of shape (batch, ...) to the values that targets are made of.
+NextValues = Callable[[th.Tensor], th.Tensor]
+
+
+class MaskedReplayBuffer(ReplayBuffer):
+    """Keeps with each transition what the state allows that it leads to.
+
+    The masks lie beside the actions in the same array, so that both are drawn together.
+
+    Attributes:
+        sampled_masks: those of the batch that was drawn last, bool of shape (batch, n_actions).
+    """
+
+    action_space: spaces.Discrete
+    sampled_masks: th.Tensor
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.action_dim = 1 + int(self.action_space.n)
+        shape = (self.buffer_size, self.n_envs, self.action_dim)
+        self.actions = np.zeros(shape, dtype=self.actions.dtype)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The masks of a batch are of that batch alone.
+        return {name: value for name, value in vars(self).items() if name != "sampled_masks"}
+
+    def add(
+        self,
+        obs: NDArray[Any],
+        next_obs: NDArray[Any],
+        action: NDArray[Any],
+        reward: NDArray[Any],
+        done: NDArray[Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Keep a step of every environment, whose ``infos`` hold the masks."""
+        everything = np.ones(self.action_dim - 1, dtype=np.bool_)
+        masks = [
+            # Nothing follows a termination, and nothing is asked for there.
+            everything if ended and not info.get("TimeLimit.truncated", False) else info[INFO_KEY]
+            for ended, info in zip(done, infos, strict=True)
+        ]
+        checked = checked_masks(masks, next_obs, self.action_dim - 1)
+        with_masks = np.column_stack([action.reshape(self.n_envs), checked])
+        super().add(obs, next_obs, with_masks, reward, done, infos)
+
+    def _get_samples(
+        self, batch_inds: NDArray[Any], env: VecNormalize | None = None
+    ) -> ReplayBufferSamples:
+        samples = super()._get_samples(batch_inds, env)
+        self.sampled_masks = samples.actions[:, 1:].bool()
+        return samples._replace(actions=samples.actions[:, :1])
+
+
+class DQN(CompiledQLearning):
+    """Stable-Baselines3's DQN; with ``mask_actions`` among the actions that are allowed.
+
+    Masks then hold in exploration, in the greedy choice, and in the maximum of the target, for
+    which they are kept with the transitions. Without, it is the library's agent in everything, and
+    so are its model files. Arguments are those of `stable_baselines3.DQN` and:
+
+    Args:
+        mask_actions: whether masks count. The environment has to tell them by ``action_masks()``
+            and by ``info["action_mask"]``: `envs.wrappers.ActionMasks` does both.
+
+    Raises:
+        ValueError: if it does not, or with ``n_steps`` above 1, Dict observations, or another
+            replay buffer.
+    """
+
+    __signature__: ClassVar[inspect.Signature]
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.__signature__ = full_signature(cls)
+
+    def __init__(self, *args: Any, mask_actions: bool = False, **kwargs: Any) -> None:
+        self.mask_actions = mask_actions
+        super().__init__(*args, **kwargs)
+
+    def _setup_model(self) -> None:
+        if self.mask_actions:
+            self._check_maskable()
+            self.replay_buffer_class = MaskedReplayBuffer
+        super()._setup_model()
+
+    def _check_maskable(self) -> None:
+        if self.n_steps != 1:
+            raise ValueError(f"mask_actions needs n_steps of 1, not {self.n_steps}")
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ValueError("mask_actions does not work with Dict observations")
+        if self.replay_buffer_class not in {None, ReplayBuffer, MaskedReplayBuffer}:
+            raise ValueError("mask_actions brings its own replay buffer: leave replay_buffer_class")
+        if self.env is not None:
+            check_masks_exist(self.env)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        prepared = super()._setup_learn(*args, **kwargs)
+        if self.mask_actions:
+            assert self.env is not None
+            check_masks_exist(self.env)
+            if not all(INFO_KEY in (info or {}) for info in self.env.unwrapped.reset_infos):
+                raise ValueError(
+                    f"mask_actions of {type(self).__name__}: info holds no {INFO_KEY}, which tells "
+                    "of states that episodes are cut off in: wrap the environment in "
+                    "envs.wrappers.ActionMasks"
+                )
+        return prepared
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[NDArray[Any], NDArray[Any]]:
+        if not self.mask_actions:
+            return super()._sample_action(learning_starts, action_noise, n_envs)
+        assert self.env is not None
+        obs: Any = self._last_obs
+        masks = present_masks(self.env, obs)
+        if self.num_timesteps < learning_starts:
+            actions = self._random_actions(masks)
+        else:
+            actions, _ = self.predict(obs, action_masks=masks)
+        return actions, actions
+
+    def _random_actions(self, masks: Bools) -> NDArray[Any]:
+        """A uniformly random allowed action for each row of ``masks``."""
+        space: Any = self.action_space
+        return np.array([space.sample(mask.astype(np.int8)) for mask in masks])
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+        action_masks: Any = None,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The greedy action, or an exploring one unless ``deterministic``, as the library has it.
+
+        Args:
+            observation: one, or several along the first axis.
+            state: handed back.
+            episode_start: not used.
+            deterministic: the greedy action.
+            action_masks: the allowed actions, bool of shape (n, n_actions), or (n_actions,) for one
+                observation; all where it is left out.
+        """
+        if action_masks is None:
+            return super().predict(observation, state, episode_start, deterministic)
+        masks = np.atleast_2d(np.asarray(action_masks, dtype=np.bool_))
+        self.policy.set_training_mode(False)
+        obs, is_batch = self.policy.obs_to_tensor(observation)
+        # One toss for all observations, as in the library.
+        if not deterministic and np.random.rand() < self.exploration_rate:  # noqa: NPY002
+            actions = self._random_actions(masks)
+        else:
+            with th.no_grad():
+                values = masked(self.q_net(obs), th.as_tensor(masks, device=self.device))
+            actions = values.argmax(dim=1).cpu().numpy()
+        return (actions if is_batch else actions[0]), state
+
+    def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
+        target_network = self.q_net_target
+        # The library maximises over the columns of what this returns.
+        self.q_net_target = self._next_values(target_network)  # type: ignore[assignment]
+        try:
+            super()._train_in_python(gradient_steps, batch_size)
+        finally:
+            self.q_net_target = target_network
+
+    def _next_values(self, target: QNetwork) -> NextValues:
+        """What a target's maximum goes over: the target network's values of allowed actions."""
+        return lambda next_obs: self._among_allowed(target(next_obs))
+
+    def _among_allowed(self, next_values: th.Tensor) -> th.Tensor:
+        """Minus infinity for what the states that a batch leads to do not allow."""
+        if not self.mask_actions:
+            return next_values
+        assert isinstance(self.replay_buffer, MaskedReplayBuffer)
+        return masked(next_values, self.replay_buffer.sampled_masks)
+
+    def _excluded_save_params(self) -> list[str]:
+        # A file without masks is one of the library's; with them, the buffer's class follows.
+        left_out = "replay_buffer_class" if self.mask_actions else "mask_actions"
+        return [*super()._excluded_save_params(), left_out]
+
+
+def masked(values: th.Tensor, masks: th.Tensor) -> th.Tensor:
+    """Minus infinity where the mask is False; both of shape (n, n_actions)."""
+    return values.masked_fill(~masks, -th.inf)
+
+
+DQN.__signature__ = full_signature(DQN)
+
+
+# Deep agents written by hand on those of Stable-Baselines3.
+
+
+def double_q_values(online: NextValues, target: QNetwork, next_obs: th.Tensor) -> th.Tensor:
+    """The target network's value of the action that the online network prefers.
+
+    Args:
+        online: the network that is trained, or what counts of its values.
+        target: its lagging copy.
+        next_obs: observations, shape (batch, ...).
+
+    Returns:
+        Values, shape (batch, 1).
+    """
+    best_actions = online(next_obs).argmax(dim=1, keepdim=True)
+    values: th.Tensor = target(next_obs).gather(dim=1, index=best_actions)
+    return values
+
+
+class DoubleDQN(DQN):
+    """Double DQN (van Hasselt, Guez and Silver, 2016): DQN but for its target.
+
+    Arguments are those of `agents.library.DQN`; ``engine`` is ``"auto"`` by default.
+    """
+
+    __signature__: ClassVar[inspect.Signature]
+
+    target_kind = "double_q"
+
+    def __init__(self, *args: Any, engine: NetworkEngineChoice = "auto", **kwargs: Any) -> None:
+        super().__init__(*args, engine=engine, **kwargs)
+
+    def _next_values(self, target: QNetwork) -> NextValues:
+        # One column, so that there is nothing left to choose from.
+        online: NextValues = lambda next_obs: self._among_allowed(self.q_net(next_obs))  # noqa: E731
+        return lambda next_obs: double_q_values(online, target, next_obs)
+
+
+class DeepQLearning(CompiledQLearning):
+    """Deep Q-learning with experience replay as first published (Mnih et al., 2013).
+
+    DQN without what was added to it later: the target comes from the network that learns, as it is
+    at that very update, and the loss is the squared error, where Stable-Baselines3's DQN has a
+    lagging copy and Huber's loss. Arguments are those of `stable_baselines3.DQN` and ``engine`` of
+    `agents.networks.engine_setting.CompiledNetworks`, which is ``"auto"`` by default;
+    ``target_update_interval`` is without effect.
+    """
+
+    __signature__: ClassVar[inspect.Signature]
+
+    target_kind = "online"
+    largest_error = math.inf
+
+    def __init__(self, *args: Any, engine: NetworkEngineChoice = "auto", **kwargs: Any) -> None:
+        super().__init__(*args, engine=engine, **kwargs)
+
+    def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
+        assert self.replay_buffer is not None
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        losses = []
+        for _ in range(gradient_steps):
+            batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+            loss = self._loss(batch)
+            self.policy.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+            self.policy.optimizer.step()
+            losses.append(loss.item())
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/loss", np.mean(losses))
+
+    def _loss(self, batch: ReplayBufferSamples) -> th.Tensor:
+        """Half the mean squared error of the taken actions' values, a scalar."""
+        discounts = self.gamma if batch.discounts is None else batch.discounts
+        with th.no_grad():
+            next_values = self.q_net(batch.next_observations).amax(dim=1, keepdim=True)
+            targets = batch.rewards + (1 - batch.dones) * discounts * next_values
+        values = self.q_net(batch.observations).gather(dim=1, index=batch.actions.long())
+        return mse_loss(values, targets) / 2
+
+
+DoubleDQN.__signature__ = full_signature(DoubleDQN)
+DeepQLearning.__signature__ = full_signature(DeepQLearning)
+
+
+# Stable-Baselines3's PPO and A2C, which can train on compiled code.
+
+
+class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
+    """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does.
+
+    Attributes:
+        collected: steps of the rollout that the compiled loop has under way.
+    """
+
+    _training: PolicyTraining | None
+    _shared_training: Callable[[], PolicyTraining]
+    _own = (*CompiledNetworks._own, "collected")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.collected = 0
+        super().__init__(*args, **kwargs)
+
+    @property
+    def minibatch_size(self) -> int | None:
+        """Steps that are learnt from at once; None for all of a rollout."""
+        return getattr(self, "batch_size", None)
+
+    @property
+    def is_within_rollout(self) -> bool:
+        return self.collected > 0
+
+    def _check_compilable(self) -> None:
+        check_policy_agent(self)
+        check_optimizer(self.policy.optimizer)
+        policy_networks(self.policy, self._seen_in_python())
+
+    def _work_of(self, n_steps: float) -> Work:
+        rollout = self.n_steps * self.n_envs
+        batch_size = self.minibatch_size or rollout
+        n_rollouts = math.ceil(n_steps / rollout)
+        n_updates = n_rollouts * getattr(self, "n_epochs", 1) * math.ceil(rollout / batch_size)
+        policy: Any = self.policy
+        extractor = policy.mlp_extractor
+        actor = nn.ModuleList([extractor.policy_net, policy.action_net])
+        critic = nn.ModuleList([extractor.value_net, policy.value_net])
+        return work_of(
+            "policy",
+            [actor, critic],
+            self.observation_space,
+            n_rollouts * rollout,
+            self.n_envs,
+            n_updates,
+            batch_size,
+        )
+
+    def _schedules(self) -> list[Schedule]:
+        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
+        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
+
+    def _compiled_training(self, seen: Any) -> AbstractContextManager[PolicyTraining]:
+        return policy_training(self, seen)
+
+    def _acting_network(self, seen: Any) -> Network:
+        return policy_networks(self.policy, seen)[0]
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fill the rollout buffer; False once a callback asks to stop."""
+        if self._sharing is None:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        rollout_buffer.pos, rollout_buffer.full = 0, False
+        callback.on_rollout_start()
+        return collect_rollout(self._shared_training(), env, callback)
+
+    def train(self) -> None:
+        """Learn from the rollout buffer."""
+        if self._sharing is None:
+            super().train()
+        else:
+            self._shared_training().train()
+
+
+class PPO(CompiledPolicyGradient, stable_baselines3.PPO):
+    """Stable-Baselines3's PPO (Schulman et al., 2017), with the argument ``engine``."""
+
+    __signature__: ClassVar[inspect.Signature]
+
+
+class A2C(CompiledPolicyGradient, stable_baselines3.A2C):
+    """Stable-Baselines3's A2C (Mnih et al., 2016), with the argument ``engine``."""
+
+    __signature__: ClassVar[inspect.Signature]
+
+
+PPO.__signature__ = full_signature(PPO)
+A2C.__signature__ = full_signature(A2C)
+
+
+# Augmented random search, under the same callbacks as every other agent.
+
+
+class _TrainingStoppedError(Exception):
+    """A callback asks for the end, in the midst of a candidate's episodes."""
+
+    def __init__(self, callback: BaseCallback) -> None:
+        super().__init__()
+        self.callback = callback
+
+
+class ARS(sb3_contrib.ARS):
+    """Augmented random search (Mania, Guy and Recht, 2018), as sb3-contrib has it.
+
+    Arguments are those of `sb3_contrib.ARS`. What differs lies around the algorithm: callbacks are
+    told what each step brought, are called once for it and can end the training; an agent that was
+    loaded goes on from its weights, where ``zero_policy`` is off too; its schedules go on as well.
+    """
+
+    _last_dones: Any = None
+    # Its rollouts begin in the midst of an update, whose directions are drawn by then.
+    tells_safe_moments = True
+
+    def _do_one_update(self, callback: BaseCallback, async_eval: Any) -> None:
+        tell_safe_moment(callback)
+        super()._do_one_update(callback, async_eval)
+
+    def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
+        """As `sb3_contrib.ARS.learn`, but for callbacks that ask for the end."""
+        try:
+            return super().learn(total_timesteps, *args, **kwargs)
+        except _TrainingStoppedError as stopped:
+            stopped.callback.on_training_end()
+            return self
+
+    def _trigger_callback(
+        self,
+        _locals: dict[str, Any],
+        _globals: dict[str, Any],
+        callback: BaseCallback,
+        n_envs: int,
+    ) -> None:
+        """Called after a step for each environment whose episode counts; act on the first call."""
+        if _locals["dones"] is self._last_dones:
+            return
+        self._last_dones = _locals["dones"]
+        self.num_timesteps += n_envs
+        callback.update_locals(_locals)
+        if not callback.on_step():
+            raise _TrainingStoppedError(callback)
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        # What a callback or an earlier training changed about the total counts here too.
+        super()._update_current_progress_remaining(num_timesteps, self._total_timesteps)
+
+    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
+        """As in the library; the search goes on around what was set."""
+        super().set_parameters(*args, **kwargs)
+        self.weights = parameters_to_vector(self.policy.parameters()).detach()  # type: ignore[assignment]
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_dones"]

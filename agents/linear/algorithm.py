@@ -1,0 +1,478 @@
+"""The base of the agents on active tiles: arguments, weights, policy, and training."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, Unpack
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.common.algorithm import Transitions
+from agents.common.model_files import TablePolicy
+from agents.common.settings import (
+    CommonArguments,
+    TieBreaking,
+    check_option,
+    check_share,
+    check_space,
+    settings_of,
+)
+from agents.compiled.engine import CompiledEngine, EngineChoice, choose_engine
+from agents.compiled.generators import handles_of
+from agents.compiled.greedy_play import Playground
+from agents.compiled.learning_algorithm import LearningAlgorithm
+from agents.compiled.worlds import PROGRESS, UNDECIDED, env_dtype
+from agents.linear.tiles import (
+    Bound,
+    HandedVectors,
+    LinearAgent,
+    Room,
+    Tiles,
+    act_in_all,
+    act_on_tiles,
+    add_up,
+    learn_from_all,
+    look,
+    make_tiles,
+    tiles_of_all,
+    vectors_of,
+)
+from agents.networks.observations import (
+    BEFORE,
+    NetworkEnvStates,
+    move_on,
+    network_playground,
+    network_world,
+)
+from agents.networks.q_learner import best_of
+from machine_code.compiling import called
+from mdp.array_types import Floats, Ints
+
+# The policy of agents on active tiles: their weights, in buffers.
+
+
+class TilePolicy(TablePolicy):
+    """Takes the action of the highest sum of weights over the active tiles.
+
+    Args:
+        observation_space: `Box` of shape (d,), or `Discrete`, each number of which is a tile.
+        action_space: `Discrete` with A values.
+        lr_schedule: not used; here because every policy is handed one.
+        tiling: further arguments of `agents.linear.tiles.make_tiles`.
+        values_states: whether there are weights of state values too.
+
+    Attributes:
+        weights: of action values or preferences, float64 of shape (tiles, A).
+        state_weights: of state values, float64 of shape (tiles,), or (0,) without them.
+        tiles: how observations become tiles.
+    """
+
+    weights: th.Tensor
+    state_weights: th.Tensor
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Discrete,
+        lr_schedule: Schedule | None = None,
+        tiling: dict[str, Any] | None = None,
+        values_states: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(observation_space, action_space, **kwargs)
+        self.tiling = dict(tiling or {})
+        n_actions = int(action_space.n)
+        self.tiles = make_tiles(observation_space, **self.tiling, n_actions=n_actions)
+        n_tiles = self.tiles.n_tiles
+        self.register_buffer("weights", th.zeros((n_tiles, n_actions), dtype=th.float64))
+        n_valued = n_tiles if values_states else 0
+        self.register_buffer("state_weights", th.zeros(n_valued, dtype=th.float64))
+
+    def _sizes(self) -> dict[str, Any]:
+        return {"tiling": self.tiling, "values_states": len(self.state_weights) > 0}
+
+    def sums(self, observations: NDArray[Any]) -> Floats:
+        """Action values or preferences at n observations, shape (n, A)."""
+        active = tiles_of_all(self.tiles, vectors_of(self.observation_space, observations))
+        weights = self.weights.numpy()
+        sums = np.zeros((len(active), weights.shape[1]))
+        for tiles in active.T:  # in the order in which the training loops add up
+            sums += weights[tiles]
+        return sums
+
+    def _predict(
+        self, observation: th.Tensor | dict[str, th.Tensor], deterministic: bool = False
+    ) -> th.Tensor:
+        """The first of the best actions; an observation of each to shape (n,)."""
+        assert isinstance(observation, th.Tensor)
+        return th.from_numpy(self.sums(observation.numpy()).argmax(axis=1))
+
+
+# What compiled functions work on while the interpreted loop steps the environments.
+
+NUMBERED_ENV = env_dtype(("number", np.int64))
+
+
+class TileWorkspace:
+    """Records of n environments, of how far the training is, and of the agent.
+
+    Args:
+        agent: whose weights are worked on in place.
+        space: what it observes.
+        n: number of environments, or of observations.
+    """
+
+    def __init__(self, agent: LinearAgent, space: spaces.Space[Any], n: int) -> None:
+        self.space = space
+        self.envs = np.zeros(n, dtype=NUMBERED_ENV)
+        self.envs["number"] = np.arange(n)
+        self.envs["next_action"] = UNDECIDED
+        self.progress = np.zeros(1, dtype=PROGRESS)
+        # Looked up once: finding a field takes longer than filling it.
+        names = ("exploration", "learning_rate", "mean_td_error")
+        self._exploration, self._learning_rate, self._mean_td_error = (
+            self.progress[name] for name in names
+        )
+        self.fields = {name: self.envs[name] for name in NUMBERED_ENV.names or ()}
+        n_dims = len(agent.room.vector)
+        self.seen = HandedVectors(np.zeros((n, n_dims)), np.zeros((n, n_dims)))
+        self.agent = agent._replace(seen=self.seen)
+
+    def note_progress(self, exploration: float, learning_rate: float, mean_td_error: float) -> None:
+        """Set how much to explore, the step size, and what the error was last."""
+        self._exploration[0] = exploration
+        self._learning_rate[0] = learning_rate
+        self._mean_td_error[0] = mean_td_error
+
+    @property
+    def next_actions(self) -> Ints:
+        """What the agent has committed to in each environment, or `UNDECIDED`; shape (n,)."""
+        actions: Ints = self.fields["next_action"]
+        return actions
+
+    def act(self, observations: NDArray[Any]) -> Ints:
+        """An action for each observation, the one that was committed to where there is one."""
+        self.seen.before[:] = vectors_of(self.space, observations)
+        act_in_all(self.agent, self.envs, self.progress[0])
+        actions: Ints = self.fields["action"].copy()
+        return actions
+
+    def learn(self, transitions: Transitions) -> float:
+        """Learn from a step of each environment, and return the mean absolute error."""
+        fields = self.fields
+        self.seen.before[:] = vectors_of(self.space, transitions.obs)
+        self.seen.after[:] = vectors_of(self.space, transitions.next_obs)
+        fields["action"][:] = transitions.actions
+        fields["reward"][:] = transitions.rewards
+        fields["terminated"][:] = transitions.terminated
+        fields["done"][:] = transitions.dones
+        learn_from_all(self.agent, self.envs, self.progress[0])
+        return float(self._mean_td_error[0])
+
+
+# The compiled loop for agents on active tiles.
+
+
+class SeenWorld(NamedTuple):
+    """A compiled environment, and how its observations are read.
+
+    Attributes:
+        world: what `agents.compiled.loop` steps.
+        seen: one of the kinds of `agents.networks.observations`.
+    """
+
+    world: Any
+    seen: Any
+
+
+def tile_world(vec_env: VecEnv) -> SeenWorld:
+    """The compiled counterpart of environments.
+
+    Raises:
+        NotCompilable: where there is none; the message says why.
+    """
+    return SeenWorld(*network_world(vec_env))
+
+
+class TileEngine(CompiledEngine):
+    """One call of ``learn`` on the compiled loop.
+
+    Args:
+        agent: the algorithm, whose weights and generator are used in place.
+        seen_world: the compiled counterpart of its environments.
+        callback: what is told of the steps.
+        log_interval: episodes between two log records, or None.
+    """
+
+    def __init__(
+        self, agent: Any, seen_world: SeenWorld, callback: BaseCallback, log_interval: int | None
+    ) -> None:
+        self.seen = seen_world.seen
+        super().__init__(agent, seen_world.world, callback, log_interval)
+
+    def _make_states(self) -> NetworkEnvStates:
+        return NetworkEnvStates(self.agent.env, self.world, self.seen)
+
+    def _playground(self, vec_env: VecEnv) -> Playground:
+        return network_playground(vec_env)
+
+    def _compiled_agent(self) -> Any:
+        return self.agent.compiled_agent(self.agent.rng, self.seen)
+
+
+# Sums of weights that act on compiled environments, learning nothing.
+
+
+class TilePlayer(NamedTuple):
+    """Takes the first of the actions with the highest sum; attributes as in `LinearAgent`."""
+
+    weights: Floats
+    tiles: Tiles
+    seen: Any
+    room: Room
+
+    @called
+    def act(self: Any, env: Any, progress: Any) -> None:
+        """Take the best action."""
+        look(self, env, BEFORE, self.room.tiles)
+        add_up(self, self.room.tiles)
+        env.action = best_of(self.room.sums)
+
+    @called
+    def learn_from_step(self, envs: Any, progress: Any) -> None:
+        """Nothing is learnt; the next observations are there."""
+        for i in range(len(envs)):
+            move_on(self.seen, envs[i])
+
+
+def tile_player(agent: LinearAgent) -> TilePlayer:
+    """The agent without what it explores and learns by; the weights stay where they are."""
+    return TilePlayer(agent.weights, agent.tiles, agent.seen, agent.room)
+
+
+# What all agents on active tiles share: arguments, weights, and how they are trained.
+
+
+class TileArguments(CommonArguments, total=False):
+    """What the constructors of these agents hand on; see `TileAlgorithm`."""
+
+    gamma: float
+    n_tilings: int
+    n_tiles: int | Sequence[int]
+    low: Bound
+    high: Bound
+    engine: EngineChoice
+
+
+class TileAlgorithm(LearningAlgorithm):
+    """Learns weights of tiles: those of a tile coder, or a table's where observations are numbers.
+
+    Args:
+        policy: ``"TilePolicy"``.
+        env: environment with `Discrete` actions, and observations in a `Box` of shape (d,), which
+            count in single precision, or in a `Discrete` space; or its id.
+        learning_rate: step size, constant or scheduled. It is divided by the number of tilings, so
+            that 1 moves a sum all the way to its target; the book's alpha is this quotient.
+        tie_breaking: as in `LearningAlgorithm`.
+        gamma: discount factor.
+        n_tilings: number of tilings. This and the next three are for a `Box`; of `Discrete`
+            observations each number is a tile of its own.
+        n_tiles: tiles of each tiling in each dimension, a number or a list of d.
+        low: where tiles begin, a number or a list of d; None, there too, for the space's own bound.
+        high: where they end, likewise. What lies outside counts as lying on the edge.
+        engine: as in `TabularAlgorithm`; compiled are environments with a known model, CartPole and
+            MountainCar.
+        kwargs: as in `OnlineAlgorithm`.
+
+    Raises:
+        ValueError: if an argument lies outside its range, a space does not fit, a dimension has no
+            bounds, or there would be too many weights.
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"TilePolicy": TilePolicy}
+    policy: TilePolicy
+    parameters = {"gamma": np.float64}  # noqa: RUF012
+    values_states: ClassVar[bool] = False
+    logs_by_records = True
+
+    act = act_on_tiles
+
+    _rebuilt = (*LearningAlgorithm._rebuilt, "_next_actions")
+
+    def __init__(
+        self,
+        policy: str | type[BasePolicy],
+        env: GymEnv | str | None = None,
+        learning_rate: float | Schedule = 0.1,
+        tie_breaking: TieBreaking = "random",
+        gamma: float = 1.0,
+        n_tilings: int = 8,
+        n_tiles: int | Sequence[int] = 8,
+        low: Bound = None,
+        high: Bound = None,
+        engine: EngineChoice = "auto",
+        **kwargs: Unpack[CommonArguments],
+    ) -> None:
+        self.gamma = gamma
+        self.n_tilings = n_tilings
+        self.n_tiles = n_tiles
+        self.low = low
+        self.high = high
+        self.engine = engine
+        self.engine_in_use = ""
+        self.mean_td_error = 0.0
+        self._next_actions: Ints = np.empty(0, dtype=np.int64)
+        super().__init__(policy, env, learning_rate, tie_breaking, **kwargs)
+
+    def _check_arguments(self) -> None:
+        check_space(self, "actions", self.action_space)
+        space = self.observation_space
+        if not (isinstance(space, spaces.Box) and len(space.shape) == 1):
+            check_space(self, "observations of shape (d,) in a Box space or", space)
+        check_option("engine", self.engine, EngineChoice)
+        if isinstance(self.learning_rate, str):
+            raise ValueError(
+                f"learning_rate must be a number or a schedule, not {self.learning_rate!r}"
+            )
+        check_share(settings_of(self, "gamma"))
+
+    def _make_policy(self) -> TilePolicy:
+        tiling = dict(settings_of(self, "n_tilings", "n_tiles", "low", "high"))
+        policy: Any = self.policy_class
+        made: TilePolicy = policy(
+            self.observation_space,
+            self.action_space,
+            self.lr_schedule,
+            tiling=tiling,
+            values_states=self.values_states,
+        )
+        made.weights[:] = th.from_numpy(self._initial_sums() / made.tiles.n_tilings)
+        return made
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actions."""
+        return int(self.action_space.n)  # type: ignore[attr-defined]
+
+    @abstractmethod
+    def _initial_sums(self) -> Floats:
+        """Each action's sum at the start, shape (A,)."""
+
+    @abstractmethod
+    def _probabilities(self, sums: Floats) -> Floats:
+        """How likely actions are by sums of shape (n, A), likewise."""
+
+    def _memory_record(self) -> Any:
+        """What compiled functions are handed besides the weights, in the memory of the agent."""
+        return ()
+
+    def compiled_agent(self, rng: np.random.Generator, seen: Any = None) -> LinearAgent:
+        """The agent as compiled functions see it, its weights in the memory of its policy.
+
+        Args:
+            rng: its generator.
+            seen: how observations are read, one of the kinds of `agents.networks.observations`.
+        """
+        tiles = self.policy.tiles
+        here, ahead = np.empty((2, tiles.n_tilings), dtype=np.int64)
+        room = Room(np.empty(len(tiles.dimensions)), here, ahead, np.empty(self.n_actions))
+        return LinearAgent(
+            self.settings()[0],
+            self.policy.weights.numpy(),
+            self._memory_record(),
+            tiles,
+            seen,
+            room,
+            handles_of([rng])[0],
+        )
+
+    def greedy_player(self, seen: Any) -> TilePlayer:
+        """What plays as `predict` does on compiled environments, whose observations are read so."""
+        return tile_player(self.compiled_agent(self.rng, seen))
+
+    def _begin_episodes(self) -> None:
+        self._next_actions = np.full(self.n_envs, UNDECIDED)
+
+    def _run(self, total_timesteps: int, callback: BaseCallback, log_interval: int | None) -> None:
+        engine = choose_engine(self, callback, log_interval, tile_world, TileEngine)
+        if engine is not None:
+            engine.run(total_timesteps)
+            return
+        super()._run(total_timesteps, callback, log_interval)
+
+    def hand_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Write what the compiled loop goes on from into its records."""
+        envs["next_action"] = self._next_actions
+        progress["mean_td_error"] = self.mean_td_error
+
+    def take_over(self, envs: NDArray[np.void], progress: NDArray[np.void]) -> None:
+        """Go on from where the compiled loop is."""
+        self._next_actions = envs["next_action"].copy()
+        self.mean_td_error = float(progress["mean_td_error"][0])
+
+    def _make_workspace(self, rng: np.random.Generator, n: int) -> TileWorkspace:
+        return TileWorkspace(self.compiled_agent(rng), self.observation_space, n)
+
+    def _present_workspace(self) -> TileWorkspace:
+        workspace: TileWorkspace = self._workspace_for(self.rng, self.n_envs)
+        self._note_progress(workspace)
+        workspace.next_actions[:] = self._next_actions
+        return workspace
+
+    def _note_progress(self, workspace: TileWorkspace) -> None:
+        remaining = self._current_progress_remaining
+        exploration, step_size = self.exploration_schedule(remaining), self.lr_schedule(remaining)
+        workspace.note_progress(exploration, step_size, self.mean_td_error)
+
+    def _choose_actions(self) -> Ints:
+        workspace = self._present_workspace()
+        actions = workspace.act(np.asarray(self._last_obs))
+        self._next_actions = workspace.next_actions.copy()
+        return actions
+
+    def _learn_from(self, transitions: Transitions) -> None:
+        workspace = self._present_workspace()
+        self.mean_td_error = workspace.learn(transitions)
+        self._next_actions = workspace.next_actions.copy()
+        self._n_updates += self.n_envs
+
+    def predict(
+        self,
+        observation: NDArray[Any] | dict[str, NDArray[Any]],
+        state: tuple[NDArray[Any], ...] | None = None,
+        episode_start: NDArray[Any] | None = None,
+        deterministic: bool = False,
+    ) -> tuple[NDArray[Any], tuple[NDArray[Any], ...] | None]:
+        """The action of the highest sum, or one as in training unless ``deterministic``.
+
+        Takes one observation or an array of n, and returns an action or n of them, and ``state``;
+        ``episode_start`` is not used.
+        """
+        if deterministic:
+            return super().predict(observation, state, episode_start, deterministic)
+        return self._exploring_actions(observation), state
+
+    def action_probabilities(self, observations: NDArray[Any] | None = None) -> Floats:
+        """What the policy does now that training acts by, shape (n, A).
+
+        Args:
+            observations: n of them; by default all numbers of a `Discrete` space.
+        """
+        if observations is None:
+            check_space(self, "observations", self.observation_space)
+            observations = np.arange(self.observation_space.n)  # type: ignore[attr-defined]
+        return self._probabilities(self.policy.sums(observations))
+
+    def _record_training(self) -> None:
+        self.logger.record("train/mean_absolute_td_error", self.mean_td_error)
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        rate = self.lr_schedule(self._current_progress_remaining)
+        self.logger.record("train/learning_rate", rate)

@@ -1,1 +1,0 @@
-"""MABWiser's bandits behind the interface of the others."""

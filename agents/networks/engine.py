@@ -1,0 +1,376 @@
+"""Trains an agent of the library on the compiled loop, and keeps the rest from noticing."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.vec_env import VecEnv
+
+from agents.common.callbacks import (
+    NEVER,
+    EpisodeBudget,
+    Horizon,
+    heeds_rollouts,
+    horizon,
+    members,
+    wants_position,
+)
+from agents.compiled.engine import CompiledEngine
+from agents.compiled.generators import handles_of
+from agents.compiled.greedy_play import COMPENSATED_SUM, Playground
+from agents.compiled.learning_algorithm import compiled_schedule
+from agents.compiled.loop import learn_from_last_step, run_block
+from agents.compiled.records import Episodes
+from agents.networks.observations import NetworkEnvStates, Numbers, network_playground
+from agents.networks.torch_bridge import Reference, SharedTensors, address_of
+
+# Telling callbacks where rollouts begin and end, which blocks of compiled steps may pass over.
+
+
+class RolloutEvents:
+    """What the callbacks of a training are told of its rollouts.
+
+    Args:
+        agent: the agent.
+        callback: all of its callbacks.
+
+    Attributes:
+        are_heeded: whether one acts on rollouts, so that blocks have to end with them.
+    """
+
+    def __init__(self, agent: Any, callback: BaseCallback) -> None:
+        self.agent = agent
+        asked = [member for member in members(callback) if type(member) is not CallbackList]
+        self.of_rollouts = [member for member in asked if heeds_rollouts(member)]
+        self.of_blocks = [member for member in asked if not heeds_rollouts(member)]
+        self.are_heeded = bool(self.of_rollouts)
+
+    def begin(self) -> None:
+        """A block begins, and perhaps a rollout; a run that was cut off goes back to its state."""
+        for member in self.of_blocks:
+            member.on_rollout_start()
+        if not self.agent.is_within_rollout:
+            for member in self.of_rollouts:
+                member.on_rollout_start()
+
+    def end(self) -> None:
+        """A rollout ends, before it is learnt from."""
+        for member in self.of_rollouts:
+            member.on_rollout_end()
+
+    def end_block(self) -> None:
+        """A block ends, and has been learnt from."""
+        for member in self.of_blocks:
+            member.on_rollout_end()
+
+
+# What an agent of the library and compiled code hand to each other while it trains.
+
+# An address that is filled in once there is a reference to what it belongs to.
+NOWHERE = np.uintp(0)
+
+
+class NetworkTraining(ABC):
+    """An agent of the library in training.
+
+    Args:
+        agent: the agent.
+        seen: how its networks see compiled environments.
+        tensors: of its networks and its optimizer.
+
+    Attributes:
+        learner: the agent as compiled functions see it, by reference.
+        held: the same itself.
+        shown: observations of environments in Python, shape (n_envs, d).
+        waits: whether rollouts are learnt from by `learn_from_rollout`, and not by the loop.
+        heeds_budgets: whether a number of episodes to train for moves the schedules.
+        improves_by: the compiled function that learns from a minibatch.
+    """
+
+    held: Any
+    heeds_budgets: ClassVar[bool]
+    improves_by: ClassVar[Callable[[Any, float, float], int]]
+
+    def __init__(self, agent: Any, seen: Any, tensors: SharedTensors) -> None:
+        self.agent = agent
+        self.seen = seen
+        self.tensors = tensors
+        self.waits = False
+        # A handle does not keep it alive.
+        self.generator = agent.rng
+        self.held = self._make_learner()
+        self.learner = Reference(self.held)
+        self.hold(improve=address_of(type(self).improves_by, self.learner))
+        width = 1 if isinstance(seen, Numbers) else int(tensors.networks[0].layers.sizes[0])
+        self.shown = np.zeros((agent.n_envs, width))
+
+    @abstractmethod
+    def _make_learner(self) -> Any:
+        """The agent as compiled functions see it."""
+
+    @abstractmethod
+    def in_loop(self) -> Any:
+        """What the compiled loop asks."""
+
+    @abstractmethod
+    def schedules(self) -> dict[str, Schedule]:
+        """What compiled code works out after each step, by the names in its record."""
+
+    @abstractmethod
+    def read_settings(self) -> None:
+        """Take over what a callback has changed."""
+
+    def read_tensors(self) -> None:
+        """Go on with the weights and the optimizer that a callback may have put there.
+
+        Raises:
+            ValueError: if the optimizer has become one that compiled code does not know.
+        """
+        optimizer = self.tensors.take_over()
+        if optimizer is not self.held.optimizer:
+            self.hold(optimizer=optimizer)
+
+    def hold(self, **parts: Any) -> None:
+        """Put other parts in the place of the learner's."""
+        self.held = self.held._replace(**parts)
+        self.learner.hold(self.held)
+
+    def read_generator(self) -> None:
+        """Draw from the agent's generator, which a callback may have replaced."""
+        if self.agent.rng is not self.generator:
+            self.generator = self.agent.rng
+            self.held.rng[:] = handles_of([self.generator])
+
+    def show(self, observations: Any) -> None:
+        """Take observations of environments in Python, of as many numbers as there is room for.
+
+        Raises:
+            ValueError: if one lies outside of its space, where no weights are.
+        """
+        self.shown[:] = np.reshape(observations, self.shown.shape)
+        self.check_numbers(self.shown)
+
+    def check_numbers(self, shown: Any) -> None:
+        """Make sure that numbers of states are within their space; anything goes for vectors.
+
+        Raises:
+            ValueError: if they are not.
+        """
+        if isinstance(self.seen, Numbers) and not (shown.min() >= 0 and shown.max() < self.seen.n):
+            wrong = int(shown[(shown < 0) | (shown >= self.seen.n)][0])
+            raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
+
+    @abstractmethod
+    def take_over_progress(self, remaining: float) -> None:
+        """Let the agent know how much of the training remains, at the moments when it finds out."""
+
+    @abstractmethod
+    def give_up_rollout(self) -> None:
+        """Forget how much was collected since the last training."""
+
+    @abstractmethod
+    def read(self) -> None:
+        """Begin where the agent is."""
+
+    @abstractmethod
+    def write(self) -> None:
+        """Let the agent know where compiled code is."""
+
+    def until_end(self, total_timesteps: int) -> int:
+        """Steps of every environment until the training is over."""
+        left: int = total_timesteps - self.agent.num_timesteps
+        return -(-left // int(self.agent.n_envs))
+
+    def until_log(self, log_interval: int | None) -> Horizon:
+        """When something is logged next."""
+        return Horizon(NEVER, NEVER)
+
+    @abstractmethod
+    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
+        """Let the agent know of episodes that have ended, and log where it is time to."""
+
+    @property
+    @abstractmethod
+    def is_rollout_over(self) -> bool:
+        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
+
+    @abstractmethod
+    def until_rollout_end(self) -> Horizon:
+        """When a rollout ends that is to wait."""
+
+    @abstractmethod
+    def learn_from_rollout(self, remaining: float) -> None:
+        """Learn from the rollout that waits, with that share of the training left."""
+
+    @abstractmethod
+    def before_training(self, log_interval: int | None) -> None:
+        """What comes before learning from a rollout that ends with the last step of a block."""
+
+    @abstractmethod
+    def record(self) -> None:
+        """Hand what the last training has given to the agent's logger."""
+
+
+def record_of(kind: np.dtype[np.void], **values: Any) -> Any:
+    """A record, alone in an array."""
+    records = np.zeros(1, dtype=kind)
+    for name, value in values.items():
+        records[name] = value
+    return records
+
+
+# Trains an agent of the library on the compiled loop, and keeps the rest from noticing.
+
+# Between two blocks signals are seen to, and displays move.
+SECONDS_PER_BLOCK = 0.2
+
+
+class NetworkEngine(CompiledEngine):
+    """One call of ``learn`` on the compiled loop.
+
+    Args:
+        training: the agent, as it and compiled code share it.
+        world: the compiled counterpart of its environments.
+        callback: what is told of the steps.
+        log_interval: episodes between two log records, or rollouts, or None.
+    """
+
+    counts_where_stopped = False  # as in the library
+
+    states: NetworkEnvStates
+
+    def __init__(
+        self,
+        training: NetworkTraining,
+        world: Any,
+        callback: BaseCallback,
+        log_interval: int | None,
+    ) -> None:
+        self.training = training
+        self.rollouts = RolloutEvents(training.agent, callback)
+        training.waits = self.rollouts.are_heeded
+        self.steps_at_once = 1
+        self.has_begun = False
+        self.in_loop = training.in_loop()
+        # Where rollouts are of a fixed length, episodes to train for do not move schedules.
+        self.total_timesteps = training.agent._total_timesteps
+        super().__init__(training.agent, world, callback, log_interval)
+
+    def _make_states(self) -> NetworkEnvStates:
+        return NetworkEnvStates(self.agent.env, self.world, self.training.seen)
+
+    def _playground(self, vec_env: VecEnv) -> Playground:
+        return network_playground(vec_env)
+
+    def _learner(self) -> Any:
+        """The agent as compiled functions see it, also after a callback has changed it."""
+        for name, schedule in self.training.schedules().items():
+            self.progress[0][f"{name}_schedule"] = compiled_schedule(schedule)
+        self.training.read_settings()
+        self._take_generators()
+        return self.in_loop
+
+    def _is_over(self, total_timesteps: int) -> bool:
+        # As in the library, what is being collected is collected to its end.
+        return self.training.until_end(total_timesteps) <= 0
+
+    def _run_block(self, total_timesteps: int) -> bool:
+        self._begin_rollout()
+        progress = self.progress[0]
+        limit = self._steps_allowed(total_timesteps)
+        began = time.perf_counter()
+        n_steps = run_block(
+            self.world,
+            self._learner(),
+            self.envs,
+            self.handles,
+            progress,
+            self.log,
+            limit.calls,
+            limit.episodes,
+            COMPENSATED_SUM,
+        )
+        self._note_speed(n_steps, time.perf_counter() - began)
+        episodes = Episodes.of(self.log.episodes[: progress["logged_episodes"]])
+        if not self._tell(episodes, n_steps):
+            # As in the library, the last step is not learnt from, nor what belongs to it.
+            self.training.give_up_rollout()
+            return False
+        self._learn_from_last(episodes, n_steps)
+        self.rollouts.end_block()
+        return True
+
+    def _learn_from_last(self, episodes: Episodes, n_steps: int) -> None:
+        training, progress = self.training, self.progress[0]
+        if not training.waits:
+            training.before_training(self.log_interval)
+        learn_from_last_step(self._learner(), self.envs, progress)
+        last_step = int(np.searchsorted(episodes.steps, n_steps - 1))
+        self._take_over_counts(1, len(episodes.envs) - last_step)
+        if training.waits and training.is_rollout_over:
+            self.rollouts.end()
+            training.before_training(self.log_interval)
+            self._learner()
+            training.learn_from_rollout(float(progress["remaining"]))
+            self._take_over_counts(0, 0)
+        training.record()
+
+    def _record_earlier(self) -> None:
+        self.training.record()
+
+    def _begin_rollout(self) -> None:
+        if not self.has_begun:
+            # Callbacks have been told already.
+            self.has_begun = True
+        elif wants_position(self.callback):
+            self._write()
+            self.rollouts.begin()
+            self._read()
+        else:
+            self.rollouts.begin()
+
+    def _steps_allowed(self, total_timesteps: int) -> Horizon:
+        """How far to go until somebody has to be asked."""
+        agent = self.agent
+        ahead, log = horizon(self.callback), self.training.until_log(self.log_interval)
+        left = self.training.until_end(total_timesteps)
+        over = self.training.until_rollout_end()
+        steps = min(ahead.calls, log.calls, over.calls, left, self.block_steps, self.steps_at_once)
+        self.progress[0]["episodes"] = getattr(agent, "_episode_num", 0)
+        return Horizon(max(steps, 1), min(ahead.episodes, log.episodes, over.episodes))
+
+    def _note_speed(self, n_steps: int, seconds: float) -> None:
+        """Adapt how many steps a block may have; results do not depend on that."""
+        fitting = n_steps * SECONDS_PER_BLOCK / max(seconds, 1e-6)
+        self.steps_at_once = max(1, min(int(fitting), 4 * self.steps_at_once))
+
+    def _take_over_counts(self, n_steps: int, n_episodes: int) -> None:
+        self.training.take_over_progress(float(self.progress[0]["remaining"]))
+        self._take_over_position()
+        if n_episodes:
+            self.training.count_episodes(n_episodes, self.log_interval)
+
+    def _take_over_position(self) -> None:
+        self.agent._last_obs = self.states.observations(self.envs, "")
+        self.training.write()
+
+    def _read(self) -> None:
+        agent, progress = self.agent, self.progress[0]
+        progress["num_timesteps"] = agent.num_timesteps
+        progress["total_timesteps"] = self.total_timesteps
+        if self.training.heeds_budgets:
+            progress["total_timesteps"] = agent._total_timesteps
+            for budget in members(self.callback):
+                if isinstance(budget, EpisodeBudget):
+                    progress["episode_budget"] = budget.n_episodes
+                    progress["budget_episodes"] = budget.episodes_seen
+        progress["remaining"] = agent._current_progress_remaining
+        self.training.read()
+        self.states.read()
+        self.states.take_observations(agent._last_obs)

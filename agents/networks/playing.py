@@ -1,0 +1,162 @@
+"""Networks that act on compiled environments, learning nothing.
+
+Compiled sums are rounded in another order than PyTorch's. Where two actions are so close that this
+could decide, the library's `predict` does: what is played is what it would have played.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+
+from agents.networks.observations import BEFORE, look, move_on
+from agents.networks.perceptron import (
+    Inputs,
+    Layers,
+    Singles,
+    forward,
+    last_outputs,
+    make_inputs,
+    make_outputs,
+)
+from agents.networks.q_learner import best_of
+from agents.networks.torch_bridge import FlatTensors, Network, Reference, address_of, call
+from machine_code.compiling import inlined, kernel
+
+# By so much, relative to the largest output, the best has to be ahead: many times what rounding
+# makes of layers of 256 units. And by so much at least, since PyTorch compares probabilities.
+CLEARLY, AT_LEAST = 1e-4, 1e-6
+
+_ASKED = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctypes.c_double)
+
+
+class GreedyNetwork(NamedTuple):
+    """A network whose largest output is the best action, by reference.
+
+    Attributes:
+        layers: its shape.
+        flat: its parameters.
+        single: one observation, to act on.
+        single_outputs: for what is put out for it.
+        ask: the address of what says the action where two are close.
+    """
+
+    layers: Layers
+    flat: Singles
+    single: Inputs
+    single_outputs: Singles
+    ask: np.uintp
+
+
+@kernel
+def choose_surely(network: Any, _: float, __: float) -> int:
+    """The best action for the observation in ``network.single``."""
+    forward(network.layers, network.flat, network.single, 1, network.single_outputs)
+    outputs = last_outputs(network.layers, network.single_outputs, 1)[0]
+    best, largest = best_of(outputs), 0.0
+    for k in range(len(outputs)):
+        largest = max(largest, abs(outputs[k]))
+    for k in range(len(outputs)):
+        # Numbers that are none are not ahead either.
+        ahead = outputs[best] - outputs[k] > max(CLEARLY * largest, AT_LEAST)
+        if k != best and not ahead:
+            return call(network.ask, network, 0.0, 0.0)
+    return best
+
+
+class Oracle:
+    """Asks Python which action is best, for compiled code.
+
+    Args:
+        predict: from the first row of a network's inputs to an action.
+
+    Attributes:
+        address: where compiled code calls it.
+        inputs: what that code shows.
+        errors: what `predict` has raised, which cannot pass through compiled code.
+    """
+
+    def __init__(self, predict: Callable[[Inputs], int]) -> None:
+        self.predict = predict
+        self.inputs: Any = None
+        self.errors: list[BaseException] = []
+        # Compiled code does not keep it alive.
+        self._called = _ASKED(self._answer)
+        self.address = np.uintp(ctypes.cast(self._called, ctypes.c_void_p).value or 0)
+
+    def _answer(self, _: int | None, __: float, ___: float) -> int:
+        if self.errors:
+            return 0
+        try:
+            return self.predict(self.inputs)
+        except BaseException as error:  # noqa: BLE001  # raised once compiled code has returned
+            self.errors.append(error)
+            return 0
+
+
+class PlayedNetwork(Reference):
+    """A reference to a `GreedyNetwork`.
+
+    Args:
+        held: the network.
+        oracle: what it asks.
+    """
+
+    def __init__(self, held: GreedyNetwork, oracle: Oracle) -> None:
+        super().__init__(held)
+        self.oracle = oracle
+        oracle.inputs = held.single
+
+
+class NetworkPlayer(NamedTuple):
+    """What the compiled loop asks.
+
+    Attributes:
+        network: a `PlayedNetwork`.
+        seen: how observations are read, of `agents.networks.observations`.
+        choose: the address of `choose_surely`.
+    """
+
+    network: Any
+    seen: Any
+    choose: np.uintp
+
+    @inlined
+    def act(self, env: Any, progress: Any) -> None:
+        """Take the best action."""
+        look(self.seen, env, BEFORE, self.network.single, self.network.layers.one_hot)
+        env.action = call(self.choose, self.network, 0.0, 0.0)
+
+    @inlined
+    def learn_from_step(self, envs: Any, progress: Any) -> None:
+        """Nothing is learnt; the next observations are there."""
+        for i in range(len(envs)):
+            move_on(self.seen, envs[i])
+
+    def check(self) -> None:
+        """Raise what the library's `predict` has raised."""
+        if errors := self.network.oracle.errors:
+            raise errors.pop()
+
+
+def network_player(network: Network, seen: Any, predict: Callable[[Inputs], int]) -> NetworkPlayer:
+    """A network as it is now, whose parameters are copied.
+
+    Args:
+        network: its largest output is the best action.
+        seen: how observations are read, of `agents.networks.observations`.
+        predict: the action for the first row of inputs, where two are close.
+    """
+    tensors, layers = FlatTensors([network]), network.layers
+    with th.no_grad():
+        for parameter, place in tensors.places:
+            place.copy_(parameter)
+    oracle, inputs = Oracle(predict), make_inputs(layers, 1)
+    outputs = make_outputs(layers, 1)
+    held = GreedyNetwork(layers, tensors.vector, inputs, outputs, oracle.address)
+    played = PlayedNetwork(held, oracle)
+    return NetworkPlayer(played, seen, address_of(choose_surely, played))

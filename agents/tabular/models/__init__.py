@@ -1,1 +1,0 @@
-"""Methods on tables that learn a model of the environment, and plan on it."""

@@ -1,0 +1,349 @@
+"""Tables of action values: acting on them, and moving entries towards targets."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from agents.common.exploration import GAUSSIAN_NOISE, choose_action, highest_value, random_action
+from agents.common.settings import step_size
+from agents.compiled.generators import generator_of, next_uniform
+from agents.compiled.loop import CompiledOnlyError, act, by_type, learn_from_step
+from agents.compiled.worlds import UNDECIDED
+from machine_code.compiling import inlined, kernel
+from mdp.array_types import Bools, Floats, Ints
+
+# What a tabular agent knows, as compiled functions see it, and room to work with it.
+
+
+class Room(NamedTuple):
+    """Where numbers are worked out; what it holds between two calls means nothing.
+
+    Attributes:
+        values: a number for each action that is allowed, shape (n,).
+        actions: which actions these are, in order, shape (n,).
+        draws: the random numbers of one choice, shape (draws_per_choice,).
+    """
+
+    values: Floats
+    actions: Ints
+    draws: Floats
+
+
+@by_type
+def room_at(tables: Any, obs: int, room: Room) -> Room:
+    """The room for the actions that are allowed at ``obs``."""
+    raise CompiledOnlyError
+
+
+@by_type
+def action_at(tables: Any, room: Room, k: int) -> int:
+    """The action whose number is ``room.values[k]``."""
+    raise CompiledOnlyError
+
+
+@by_type
+def with_mean_values(tables: Any, obs: int, room: Room) -> Room:
+    """The room, with the means of the tables' values of its actions, to be read and not changed."""
+    raise CompiledOnlyError
+
+
+@inlined
+def average_tables(tables: Any, obs: int, room: Room) -> Room:
+    """The room, in which those means are worked out."""
+    for k in range(len(room.values)):
+        action = action_at(tables, room, k)
+        room.values[k] = tables.values[0, obs, action]
+        if tables.values.shape[0] > 1:
+            room.values[k] = 0.5 * (room.values[k] + tables.values[1, obs, action])
+    return room
+
+
+@inlined
+def best_value(tables: Any, obs: int, room: Room) -> float:
+    """The highest of the mean values of the actions that are allowed at ``obs``."""
+    return highest_value(with_mean_values(tables, obs, room_at(tables, obs, room)).values)
+
+
+class Tables(NamedTuple):
+    """What an agent knows, in the memory of its policy, where all actions are allowed.
+
+    `MaskedTables` of no rows mean the same, and cost the compiled loop a sixth of its speed.
+
+    Attributes:
+        values: action values, shape (T, S, A).
+        visit_counts: updates of each entry so far, shape (T, S, A).
+    """
+
+    values: Floats
+    visit_counts: Ints
+
+    @inlined
+    def room_at(self, obs: int, room: Room) -> Room:
+        """All of it."""
+        return room
+
+    @inlined
+    def action_at(self, room: Room, k: int) -> int:
+        """The k-th of all."""
+        return k
+
+    @inlined
+    def with_mean_values(self, obs: int, room: Room) -> Room:
+        """A row of the table as it lies there, where there is only one."""
+        if self.values.shape[0] == 1:
+            return Room(self.values[0, obs], room.actions, room.draws)
+        return average_tables(self, obs, room)
+
+
+class MaskedTables(NamedTuple):
+    """What an agent knows, and what the environment allows.
+
+    Attributes:
+        values: as in `Tables`.
+        visit_counts: as in `Tables`.
+        allowed: what may be done at each observation, bool of shape (S, A); everything where a row
+            is False, which means that nothing is known, or where there are no rows.
+    """
+
+    values: Floats
+    visit_counts: Ints
+    allowed: Bools
+
+    @inlined
+    def room_at(self, obs: int, room: Room) -> Room:
+        """As much as there are allowed actions, which are listed in it."""
+        actions, n_allowed = room.actions, 0
+        if len(self.allowed) > 0:
+            for action in range(len(actions)):
+                if self.allowed[obs, action]:
+                    actions[n_allowed] = action
+                    n_allowed += 1
+        if n_allowed == 0:
+            n_allowed = len(actions)
+            for action in range(n_allowed):
+                actions[action] = action
+        return Room(room.values[:n_allowed], actions[:n_allowed], room.draws)
+
+    @inlined
+    def action_at(self, room: Room, k: int) -> int:
+        """The k-th that is allowed."""
+        return int(room.actions[k])
+
+    @inlined
+    def with_mean_values(self, obs: int, room: Room) -> Room:
+        """The means, worked out in the room."""
+        return average_tables(self, obs, room)
+
+
+# Acting on a table of action values, and moving its entries towards their targets.
+#
+# Compiled functions, shared by the interpreted and the compiled training loop. An update bootstraps
+# from ``values`` of shape (T, S, A): one table, or two for double Q-learning. Termination is folded
+# into the discount, which is 0 then, so that a truncated episode still bootstraps. What an
+# algorithm
+# adds is `next_value`, and `commit` where it decides on its next action before the update.
+#
+# Source: Sutton and Barto (2nd edition), chapter 6.
+
+
+class TabularAgent(NamedTuple):
+    """An agent as compiled functions see it.
+
+    Attributes:
+        settings: a record of the type that its class has.
+        tables: what it knows, `Tables` or `MaskedTables`.
+        room: for its work.
+        rng: a handle of its generator.
+        memory: arrays of its algorithm's own, by name; see `EpisodeKeeper`.
+    """
+
+    settings: Any
+    tables: Any
+    room: Room
+    rng: Any
+    memory: Any
+
+
+@by_type
+def next_value(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
+    """What follows the step, as the target of the update of ``table`` has it.
+
+    ``agent.room.values`` holds the values of that table in ``env.next_obs``, of the actions that
+    are allowed there, and ``agent.room.actions`` says which these are; ``env.uniform`` is a number
+    in [0, 1), uniform where there are several tables.
+    """
+    raise CompiledOnlyError
+
+
+@by_type
+def commit(agent: TabularAgent, env: Any, progress: Any) -> None:
+    """Decide on ``env.next_action``, or note what else is to be known before any table changes."""
+
+
+@inlined
+def no_commitment(agent: TabularAgent, env: Any, progress: Any) -> None:
+    """The next action is chosen when it is due."""
+
+
+@inlined
+def exploration_rate(agent: TabularAgent, progress: Any) -> float:
+    """How much to explore now: epsilon, temperature or standard deviation."""
+    if agent.settings.strategy == GAUSSIAN_NOISE:
+        return float(progress.exploration / (progress.episodes + 1))
+    return float(progress.exploration)
+
+
+@inlined
+def choose(agent: TabularAgent, obs: int, progress: Any) -> int:
+    """An allowed action by the mean of the tables' values."""
+    settings, tables = agent.settings, agent.tables
+    room = room_at(tables, obs, agent.room)
+    if settings.strategy == GAUSSIAN_NOISE:
+        for k in range(len(room.draws)):
+            room.draws[k] = generator_of(agent.rng).standard_normal()
+    else:
+        for k in range(len(room.draws)):
+            room.draws[k] = next_uniform(agent.rng)
+    rate = exploration_rate(agent, progress)
+    chosen = random_action(settings.strategy, len(room.values), rate, room.draws)
+    if chosen < 0:
+        values = with_mean_values(tables, obs, room).values
+        chosen = choose_action(settings.strategy, values, rate, settings.tie_scale, room.draws)
+    return action_at(tables, room, chosen)
+
+
+@inlined
+def act_on_values(agent: TabularAgent, env: Any, progress: Any) -> None:
+    """Do what was committed to, or choose."""
+    env.action = env.next_action
+    env.next_action = UNDECIDED
+    if env.action == UNDECIDED:
+        env.action = choose(agent, env.obs, progress)
+
+
+@inlined
+def values_at(agent: TabularAgent, obs: int, table: int) -> Room:
+    """The room, filled with a table's values of the actions that are allowed at ``obs``."""
+    room = room_at(agent.tables, obs, agent.room)
+    for k in range(len(room.values)):
+        room.values[k] = agent.tables.values[table, obs, action_at(agent.tables, room, k)]
+    return room
+
+
+@inlined
+def value_ahead(agent: TabularAgent, env: Any, progress: Any, table: int) -> float:
+    """`next_value`, with the room that it needs."""
+    room = values_at(agent, env.next_obs, table)
+    ahead = TabularAgent(agent.settings, agent.tables, room, agent.rng, agent.memory)
+    return float(next_value(ahead, env, progress, table))
+
+
+@inlined
+def count_visit(agent: TabularAgent, progress: Any, table: int, obs: int, action: int) -> float:
+    """Count an update of an entry, and return its step size."""
+    visit_counts = agent.tables.visit_counts
+    visit_counts[table, obs, action] += 1
+    count = visit_counts[table, obs, action]
+    return float(step_size(progress.learning_rate, agent.settings.averages_samples, count))
+
+
+@inlined
+def move_towards(
+    agent: TabularAgent, progress: Any, table: int, obs: int, action: int, target: float
+) -> float:
+    """Move one entry towards its target, and return by how much it was wrong."""
+    values = agent.tables.values
+    size = count_visit(agent, progress, table, obs, action)
+    error = target - values[table, obs, action]
+    values[table, obs, action] += size * error
+    return float(error)
+
+
+@inlined
+def update(agent: TabularAgent, env: Any, progress: Any) -> float:
+    """Move one entry towards its target, and return the TD error.
+
+    ``env.uniform`` decides which of two tables is updated.
+    """
+    table = int(env.uniform * agent.tables.values.shape[0])
+    discount = 0.0 if env.terminated else agent.settings.gamma
+    target = env.reward + discount * value_ahead(agent, env, progress, table)
+    td_error = move_towards(agent, progress, table, env.obs, env.action, target)
+    env.target, env.td_error = target, td_error
+    return float(td_error)
+
+
+@inlined
+def td_learning(agent: TabularAgent, envs: Any, progress: Any) -> None:
+    """All commitments, then all random numbers of the updates, then the updates in order."""
+    for i in range(len(envs)):
+        commit(agent, envs[i], progress)
+    if agent.tables.values.shape[0] > 1:
+        for i in range(len(envs)):
+            envs[i].uniform = next_uniform(agent.rng)
+    total_error = 0.0
+    for i in range(len(envs)):
+        env = envs[i]
+        if not (env.terminated and agent.settings.skip_terminal_update):
+            total_error += abs(update(agent, env, progress))
+        env.obs = env.new_obs
+        if env.done:
+            env.next_action = UNDECIDED
+    progress.mean_td_error = total_error if len(envs) == 1 else total_error / len(envs)
+
+
+# Python hands over arrays one by one, which costs it less than to take tuples of them apart.
+
+
+@kernel
+def act_in_all(
+    settings: Any,
+    envs: Any,
+    progress: Any,
+    values: Floats,
+    visit_counts: Ints,
+    allowed: Bools,
+    room: Floats,
+    actions: Ints,
+    draws: Floats,
+    rng: Any,
+    memory: Any,
+) -> int:
+    """`act` in each environment, for the interpreted loop.
+
+    Returns:
+        -1, or the number of an environment whose observation has no row in the tables; none acts
+        then.
+    """
+    for i in range(len(envs)):
+        if not 0 <= envs[i].obs < values.shape[1]:
+            return i
+    tables = MaskedTables(values, visit_counts, allowed)
+    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0], memory)
+    for i in range(len(envs)):
+        act(agent, envs[i], progress[0])
+    return -1
+
+
+@kernel
+def learn_from_all(
+    settings: Any,
+    envs: Any,
+    progress: Any,
+    values: Floats,
+    visit_counts: Ints,
+    allowed: Bools,
+    room: Floats,
+    actions: Ints,
+    draws: Floats,
+    rng: Any,
+    memory: Any,
+) -> int:
+    """`learn_from_step` of all environments, for the interpreted loop; returns as `act_in_all`."""
+    for i in range(len(envs)):
+        if not 0 <= envs[i].next_obs < values.shape[1]:
+            return i
+    tables = MaskedTables(values, visit_counts, allowed)
+    agent = TabularAgent(settings[0], tables, Room(room, actions, draws), rng[0], memory)
+    learn_from_step(agent, envs, progress[0])
+    return -1

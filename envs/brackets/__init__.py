@@ -1,1 +1,0 @@
-"""Between which returns the optimum lies where states are continuous, and how that was found."""

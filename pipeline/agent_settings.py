@@ -1,0 +1,335 @@
+"""Which agent fits an environment, and settings that are worked out from it (``auto``)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, get_args
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from agents import ALGORITHMS, fitting_algorithms, load_algorithm
+from agents.registry import is_bandit
+from envs.known_models import time_limit, transition_model
+from envs.wrappers import has_masks
+from pipeline.environments import make_single_env
+from pipeline.errors import UserError, shown, unknown
+from pipeline.settings.hyperparams import component_specs, split
+from pipeline.settings.values import algorithm_parameters
+from pipeline.train_spec import TrainSpec
+
+# Whether there is such an agent, and whether it can work with an environment.
+
+
+def check_algorithm(algo: str) -> None:
+    """Make sure that there is such an agent and that what it needs is installed.
+
+    Raises:
+        UserError: otherwise.
+    """
+    entry = ALGORITHMS.get(algo)
+    if entry is None and algo.lower() == "her":
+        raise UserError(
+            "hindsight experience replay is no agent but a replay buffer, for environments with "
+            "goals: --algo sac -params replay_buffer_class:HerReplayBuffer policy:MultiInputPolicy"
+        )
+    if entry is None:
+        raise unknown("unknown agent", algo, ALGORITHMS)
+    if not entry.is_installed:
+        raise UserError(
+            f"{algo} needs {entry.package}, which is not installed: {entry.install_command}"
+        )
+
+
+def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:
+    """The typed settings of an agent, with what ``--engine`` says; None where it says nothing.
+
+    Raises:
+        UserError: if the settings say something else, or the agent has no such engine.
+    """
+    if word is None or algo not in ALGORITHMS:
+        return dict(settings)
+    said = settings.get("engine", word)
+    if said != word:
+        raise UserError(f"--engine {word} and -params engine:{said} disagree: give one of them")
+    engines = _engines_of(algo)
+    if len(engines) > 1 and word in engines:
+        return {**settings, "engine": word}
+    if len(engines) < 2 and word in ("auto", *engines):
+        return dict(settings)
+    has = (
+        f"the engines {', '.join(engines)}" if len(engines) > 1 else "one engine, which auto means"
+    )
+    raise UserError(f"--engine {word}: {algo} has {has}")
+
+
+def _engines_of(algo: str) -> Sequence[str]:
+    """The engines of an agent; of one of the user's own, as its class has it."""
+    entry = ALGORITHMS[algo]
+    if entry.engines or entry.entry_point.startswith("agents."):
+        return entry.engines
+    parameter = algorithm_parameters(load_algorithm(algo)).get("engine")
+    return () if parameter is None else get_args(parameter.annotation)
+
+
+def check_fit(spec: TrainSpec) -> None:
+    """Make sure that the agent can work with the environment as it is wrapped for it.
+
+    Raises:
+        UserError: if it cannot; it names the agents that could.
+    """
+    env = make_single_env(spec, training=True)
+    misfit = ALGORITHMS[spec.algo].env_misfit(env)
+    fitting = fitting_algorithms(
+        env.observation_space, env.action_space, is_bandit(env), has_masks(env)
+    )
+    env.close()
+    if misfit:
+        others = f"fitting agents: {', '.join(fitting)}" if fitting else "no agent here fits"
+        raise UserError(f"{spec.algo} does not fit {spec.env_id}: {misfit}; {others}")
+
+
+# Settings of an entry that are worked out from the environment: what the word ``auto`` stands for.
+#
+# A number that suits one map does not suit the next: an entry that says ``auto`` holds for a family
+# of environments. The word is replaced by a number before anything else is made of the entry, so
+# that
+# agents, engines and model files know numbers alone. `TrainSpec.auto` keeps how each was found.
+
+AUTO = "auto"
+# Steps of training for each pair of an observation and an action, where only ``auto`` is said, and
+# the fewest pairs that are counted: a small map takes its time to be explored too.
+STEPS_PER_PAIR = 2500
+FEWEST_PAIRS = 100
+# A step size of 1 / n averages over the last n visits, about; where it begins, and may end.
+VISITS_AVERAGED = 10
+FIRST_STEP_SIZE = 0.3
+LAST_STEP_SIZES = (0.003, 0.05)
+_WORD = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
+
+Env = gym.Env[Any, Any]
+
+
+@dataclass(frozen=True)
+class Found:
+    """A number in the place of the word."""
+
+    value: Any  # the setting
+    how: str  # the formula with its numbers, for people
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A setting that says ``auto``."""
+
+    env: Env  # the environment that the agent is judged on
+    amount: str  # what follows the word, as in ``auto_1000``; empty for nothing
+    n_timesteps: int | None  # of the training, where that is known already
+    where: str  # begins every error message
+
+    def pairs(self) -> tuple[int, int]:
+        """The numbers of states and of actions."""
+        sizes = self.env.observation_space, self.env.action_space
+        if not all(isinstance(space, spaces.Discrete) for space in sizes):
+            raise UserError(f"{self.where}: auto needs Discrete observations and actions")
+        states, actions = (int(space.n) for space in sizes if isinstance(space, spaces.Discrete))
+        return states, actions
+
+
+def _budget(asked: _Asked) -> Found:
+    states, actions = asked.pairs()
+    steps, counted = int(asked.amount or STEPS_PER_PAIR), max(states * actions, FEWEST_PAIRS)
+    least = f", counted as {counted} pairs" if counted > states * actions else ""
+    how = f"auto: {steps:,} for each pair of {states:,} states and {actions:,} actions{least}"
+    return Found(steps * counted, how)
+
+
+def _discount(asked: _Asked) -> Found:
+    """So what lies a whole episode ahead still counts for 0.6."""
+    limit = time_limit(asked.env)
+    if limit is None:
+        raise UserError(f"{asked.where}: auto needs an environment with a time limit")
+    return Found(round(1 - 1 / (2 * limit), 7), f"auto: 1 - 1/(2 x time limit of {limit:,})")
+
+
+def _step_size(asked: _Asked) -> Found:
+    """In a short training the step size stays large: what is learnt late has far to go."""
+    states, actions = asked.pairs()
+    low, high = LAST_STEP_SIZES
+    if asked.n_timesteps is None:  # counted in episodes
+        return Found(f"exp_{FIRST_STEP_SIZE:g}_{high:g}", "auto")
+    last = min(max(VISITS_AVERAGED * states * actions / asked.n_timesteps, low), high)
+    how = f"auto: ends at {VISITS_AVERAGED} x states x actions / steps, within {low} and {high}"
+    return Found(f"exp_{FIRST_STEP_SIZE:g}_{last:.2g}", how)
+
+
+def _highest_value(asked: _Asked) -> Found:
+    """No return is higher where only the end of an episode is rewarded, as on FrozenLake."""
+    model = transition_model(asked.env)
+    if model is None:
+        raise UserError(f"{asked.where}: auto needs an environment whose model is known")
+    # Of cells that nobody comes to as well: to find these would take longer than all else here.
+    ends = model.terminated & (model.prob > 0)
+    if not ends.any():
+        raise UserError(f"{asked.where}: auto needs an environment whose episodes can end")
+    return Found(float(model.reward[ends].max()), "auto: the highest reward that ends an episode")
+
+
+# In this order: the step size goes by the number of steps.
+_RULES: Mapping[str, Callable[[_Asked], Found]] = {
+    "n_timesteps": _budget,
+    "gamma": _discount,
+    "learning_rate": _step_size,
+    "initial_q": _highest_value,
+    "value_bound": _highest_value,
+}
+
+
+def _scale(rewards: NDArray[np.floating[Any]]) -> Found:
+    largest = float(np.abs(rewards).max())
+    return Found(1 / largest if largest else 1.0, f"1 / the largest reward, {largest:g}")
+
+
+def _lowest_reward(rewards: NDArray[np.floating[Any]]) -> Found:
+    """A network that meets dear mistakes long before its goal learns to stand still."""
+    highest, lowest = float(rewards.max()), float(rewards.min())
+    if highest <= 0 or -highest / 10 < lowest:
+        return Found(lowest, f"{lowest:g}, the lowest reward")
+    return Found(-highest / 10, f"{-highest / 10:g}, a tenth of the highest reward below zero")
+
+
+_REWARD_RULES: Mapping[str, Callable[[NDArray[np.floating[Any]]], Found]] = {
+    "scale": _scale,
+    "min_reward": _lowest_reward,
+}
+
+
+def _wrappers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
+    """The wrappers of training with numbers in place of ``auto``; empty without the word.
+
+    What lies inside of a wrapper counts: it changes the rewards that it is handed.
+    """
+    wrappers = list(component_specs(raw.get("train_env_wrapper"), f"{where}: train_env_wrapper"))
+    told = []
+    for place, one in enumerate(wrappers):
+        for key in [key for key in _REWARD_RULES if one.kwargs.get(key) == AUTO]:
+            inner = replace(spec.hyperparams, train_env_wrapper=tuple(wrappers[:place]))
+            env = make_single_env(replace(spec, hyperparams=inner), training=True)
+            model = transition_model(env)
+            env.close()
+            if model is None:
+                raise UserError(f"{where}: {key}: auto needs an environment whose model is known")
+            found = _REWARD_RULES[key](model.reward[model.prob > 0])
+            wrappers[place] = replace(one, kwargs={**one.kwargs, key: found.value})
+            told.append(f"{key} auto: {found.how}")
+    if not told:
+        return {}
+    listed = [{one.name: one.kwargs} for one in wrappers]
+    spelt = listed if len(listed) > 1 else listed[0]
+    return {"train_env_wrapper": Found(spelt, "; ".join(told))}
+
+
+def without_auto(entry: Mapping[str, Any]) -> dict[str, Any]:
+    """The entry without the settings that say ``auto``."""
+    return {key: value for key, value in entry.items() if _word(key, value) is None}
+
+
+def training_follows(
+    entry: Mapping[str, Any], typed: Mapping[str, Any]
+) -> tuple[dict[str, Any], dict[str, str] | None]:
+    """Let arguments of the environment that somebody asked for hold in training too.
+
+    An entry may train on a variant, such as cheaper shelves. What was asked for wins.
+
+    Args:
+        entry: with ``typed`` in it.
+        typed: what was asked for beside the file's entry.
+
+    Returns:
+        The entry, and for `TrainSpec.origins` what gave way; None for nothing.
+    """
+    variant, own = entry.get("train_env_kwargs"), typed.get("train_env_kwargs")
+    asked = typed.get("env_kwargs")
+    if not (isinstance(variant, dict) and isinstance(asked, dict)):
+        return dict(entry), None
+    own = own if isinstance(own, dict) else {}
+    gone = {key: variant[key] for key in asked if key in variant and key not in own}
+    told = ", ".join(f"{key}: {value}" for key, value in gone.items() if value != asked[key])
+    kept = {key: value for key, value in variant.items() if key not in gone}
+    how = f"without {told}, since what is asked for of the environment holds in training too"
+    return {**entry, "train_env_kwargs": kept}, {"train_env_kwargs": how} if told else None
+
+
+def resolved_spec(
+    raw: Mapping[str, Any],
+    where: str = "hyperparameters",
+    origins: Mapping[str, str] | None = None,
+    **fields: Any,
+) -> TrainSpec:
+    """A spec with a number in place of each ``auto``.
+
+    - ``gamma: auto`` is 1 - 1/(2 x time limit) of the environment that the agent is judged on.
+    - ``n_timesteps: auto_K`` is K steps for each pair of state and action, of which 100 are counted
+      at least; ``auto`` is ``auto_2500``.
+    - ``learning_rate: auto`` falls from 0.3 to ten pairs by the steps, within 0.003 and 0.05.
+    - ``initial_q: auto`` and ``value_bound: auto`` are the highest reward that ends an episode.
+    - ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1 by the largest reward of training,
+      its sign aside; ``min_reward: auto`` a tenth of the highest reward, below zero.
+
+    In other settings the word is what it was, such as ``engine: auto``.
+
+    Args:
+        raw: an entry of hyperparameters.
+        where: begins every error message.
+        origins: what is known already for `TrainSpec.origins`.
+        fields: all others of `TrainSpec`.
+
+    Raises:
+        UserError: if a setting cannot be read, or the environment does not tell what it would be.
+    """
+    rest = without_auto(raw)
+    spec = TrainSpec(hyperparams=split(rest, where), saved_hyperparams=rest, **fields)
+    found = _wrappers(raw, spec, where)
+    if len(rest) < len(raw):
+        known = {**rest, **{key: one.value for key, one in found.items()}}
+        spec = replace(spec, hyperparams=split(known, where))
+        check_fit(spec)
+        found |= _answers(raw, spec, where)
+    if not found:
+        return replace(spec, origins=dict(origins) if origins else None)
+    numbers = {**raw, **{key: one.value for key, one in found.items()}}
+    told = {key: one.how for key, one in found.items()}
+    return replace(
+        spec,
+        hyperparams=split(numbers, where),
+        saved_hyperparams=numbers,
+        origins={**(origins or {}), **told},
+    )
+
+
+def _answers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, Found]:
+    """What each ``auto`` of an entry stands for; ``spec`` is without them."""
+    found: dict[str, Found] = {}
+    n_timesteps = spec.hyperparams.n_timesteps
+    env = make_single_env(spec)
+    for key, rule in _RULES.items():
+        match = _word(key, raw.get(key))
+        if match is not None:
+            found[key] = rule(_Asked(env, match[1] or "", n_timesteps, f"{where}: {key}"))
+            n_timesteps = found[key].value if key == "n_timesteps" else n_timesteps
+    env.close()
+    return found
+
+
+def _word(key: str, value: Any) -> re.Match[str] | None:
+    if key not in _RULES or not isinstance(value, str) or not value.startswith("auto"):
+        return None
+    match = _WORD.fullmatch(value)
+    if match is None or (match[1] and key != "n_timesteps"):
+        form = "auto, or auto_1000 with the steps for each pair of state and action"
+        raise UserError(f"{key}: {shown(value)} is not {form if key == 'n_timesteps' else 'auto'}")
+    return match

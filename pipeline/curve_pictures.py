@@ -1,0 +1,281 @@
+"""Pictures of a run: its learning curve and its pulls."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mdp.array_types import Floats
+from pipeline.callbacks import LAST_PULLS
+from pipeline.files import replacing
+from pipeline.runs import Run
+from safe_files.files import NO_LIMIT, read_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from pipeline.evaluation.sampled import Yardstick
+
+
+# Figures with a constrained layout, written as PNG and drawn once.
+
+
+def fix_layout(figure: Figure) -> None:
+    """Work the layout out now, by what is there: what is drawn later gets no room of its own."""
+    engine = figure.get_layout_engine()
+    assert engine is not None
+    engine.execute(figure)
+    figure.set_layout_engine("none")
+
+
+def write_png(figure: Figure, path: Path) -> None:
+    """Draw a figure, whose layout is fixed, into a file.
+
+    `Figure.savefig` would draw everything twice, the first time for the layout.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas: Any = FigureCanvasAgg(figure)
+    with replacing(path) as file:
+        canvas.print_png(file)
+
+
+# Pictures of a run.
+
+# Okabe and Ito's colours, told apart by colour-blind readers too.
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+GREY = "#9A9A9A"
+
+MOVING_AVERAGE_EPISODES = 100
+MAX_POINTS = 5000
+MOST_POWERS = 12  # of ten, that an axis goes over
+
+
+def read_monitors(folder: Path) -> tuple[Floats, Floats]:
+    """Training episodes of a run in the order in which they ended.
+
+    Args:
+        folder: the run folder, with one ``*.monitor.csv`` for each environment.
+
+    Returns:
+        Environment steps done by the end of each episode, counted over all environments, and its
+        return, both of shape (n_episodes,).
+    """
+    contents = [read_file(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
+    rows = [
+        np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
+        for content in contents
+        if content.count(b"\n") > 2
+    ]
+    if not rows:
+        return np.empty(0), np.empty(0)
+    # The environments of a run are stepped together: by the time that one of them has done so many
+    # steps, all of them have.
+    steps = np.concatenate([len(contents) * np.cumsum(table[:, 1]) for table in rows])
+    returns = np.concatenate([table[:, 0] for table in rows])
+    order = np.argsort(steps, kind="stable")
+    return steps[order], returns[order]
+
+
+def moving_average(values: Floats, width: int) -> Floats:
+    """Mean of the last ``width`` values at each position, or of as many as there are."""
+    sums = np.cumsum(np.insert(values, 0, 0.0))
+    ends = np.arange(1, len(values) + 1)
+    starts = np.maximum(ends - width, 0)
+    return np.asarray((sums[ends] - sums[starts]) / (ends - starts))
+
+
+def symlog_ticks(linear_up_to: float) -> list[float]:
+    """Where a symmetric logarithmic axis has its ticks.
+
+    At 0, at one place within the linear part, and at two for each power of ten beyond, on both
+    sides.
+    """
+    power = math.floor(math.log10(linear_up_to))
+    within = max(m for m in (1, 2, 5) if m * 10.0**power <= linear_up_to) * 10.0**power
+    beyond = [m * 10.0**k for k in range(power, power + MOST_POWERS) for m in (1, 3)]
+    sizes = [within, *(size for size in beyond if size > linear_up_to)]
+    return [-size for size in reversed(sizes)] + [0.0, *sizes]
+
+
+def _compress_outliers(axes: Axes, returns: Floats) -> None:
+    """Use a symmetric logarithmic axis where early returns dwarf those at the end."""
+    from matplotlib.ticker import FixedLocator, StrMethodFormatter
+
+    if not len(returns):
+        return
+    settled = max(float(np.abs(returns[-len(returns) // 4 :]).max()), 1.0)
+    if np.abs(returns).max() > 10 * settled:
+        axes.set_yscale("symlog", linthresh=settled)
+        axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(settled)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
+        axes.set_ylabel(f"{axes.get_ylabel()}\n(log beyond ±{settled:,.0f})")
+
+
+def _draw_training(axes: Axes, steps: Floats, returns: Floats, what: str) -> None:
+    if not len(steps):
+        return
+    n_averaged = min(MOVING_AVERAGE_EPISODES, len(returns))
+    smooth = moving_average(returns, n_averaged)
+    stride = max(len(steps) // MAX_POINTS, 1)
+    axes.plot(
+        steps[::stride],
+        returns[::stride],
+        ".",
+        color=GREY,
+        markersize=2,
+        alpha=0.4,
+        label=f"{what}, " + ("each episode" if stride == 1 else f"1 episode in {stride}"),
+    )
+    if n_averaged > 1:
+        label = f"{what}, mean of {n_averaged} episodes"
+        axes.plot(steps[::stride], smooth[::stride], color=ORANGE, label=label)
+
+
+def _evaluations(run: Run) -> tuple[Floats, Floats]:
+    """Steps and mean returns of the evaluations, each of shape (n_evaluations,)."""
+    if not run.evaluations_path.exists():
+        return np.empty(0), np.empty(0)
+    with np.load(BytesIO(read_file(run.evaluations_path, NO_LIMIT))) as evaluations:
+        return evaluations["timesteps"], evaluations["results"].mean(axis=1)
+
+
+def _draw_evaluations(axes: Axes, steps: Floats, means: Floats) -> None:
+    if len(steps):
+        label = "evaluation, mean return"
+        axes.plot(steps, means, "o-", color=BLUE, markersize=4, label=label)
+
+
+def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
+    least = yardstick.at_least
+    lines = [("optimum" if least is None else "optimum, at most", yardstick.optimum, "-")]
+    if least is not None:
+        lines.append(("optimum, at least", least, "--"))
+    lines.append(("best random or constant policy", yardstick.baseline, ":"))
+    for label, height, style in lines:
+        axes.axhline(height, color=GREEN, linestyle=style, linewidth=1.2, label=label, zorder=1)
+
+
+def _places(figure: Figure, *, apart: bool) -> tuple[Axes, Axes]:
+    """Axes for evaluations and for training: the same ones, or one above the other."""
+    if not apart:
+        axes = figure.subplots()
+        axes.set(xlabel="environment steps", ylabel="return of an episode")
+        return axes, axes
+    upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    upper.set_ylabel("return of an episode")
+    lower.set(xlabel="environment steps", ylabel="return there")
+    lower.set_title("training, on a variant of the environment", loc="left", fontsize=10)
+    return upper, lower
+
+
+def _add_legend(figure: Figure) -> None:
+    """Below, where it covers no episode."""
+    from matplotlib.lines import Line2D
+
+    legend = figure.legend(loc="outside lower left", ncols=3, frameon=False, fontsize=9)
+    for handle in legend.legend_handles:
+        if isinstance(handle, Line2D) and handle.get_color() == GREY:
+            handle.set(markersize=6, alpha=1)  # a dot as small as those drawn is hard to see
+
+
+def draw_learning_curve(
+    run: Run,
+    title: str,
+    first_step: int = 0,
+    yardstick: Yardstick | None = None,
+    *,
+    on_variant: bool = False,
+) -> None:
+    """Draw training and evaluation returns by environment steps into the run folder.
+
+    Args:
+        run: the run.
+        title: what stands above the picture.
+        first_step: environment steps that the agent had behind it when the run began.
+        yardstick: the returns to measure against, where they are known.
+        on_variant: whether training was on a variant of the environment, so that its returns are
+            not drawn on the scale of evaluations and yardstick.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
+
+    figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
+    steps, returns = read_monitors(run.path)
+    evaluated_at, means = _evaluations(run)
+    has_judgement = len(means) > 0 or yardstick is not None
+    apart = on_variant and len(steps) > 0 and has_judgement
+    judged, trained = _places(figure, apart=apart)
+    what = "training on a variant" if on_variant and not apart else "training"
+    _draw_training(trained, steps + first_step, returns, what)
+    _draw_evaluations(judged, evaluated_at, means)
+    if yardstick is not None:
+        _draw_yardstick(judged, yardstick)
+    _compress_outliers(trained, returns)
+    if apart:
+        _compress_outliers(judged, means)
+    judged.set_title(title, loc="left")
+    for axes in dict.fromkeys((judged, trained)):
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
+        _add_legend(figure)
+    fix_layout(figure)
+    write_png(figure, run.curve_path)
+
+
+# The picture of a training on a bandit.
+
+
+def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> None:
+    """Draw average reward, share of a best arm and cumulative regret by pull.
+
+    Args:
+        path: the picture, as PNG.
+        title: what stands above it.
+        pulls: arrays as `agents.bandits.runs.PullLog.arrays` gives them, of shape
+            (n_envs, pulls); drawn in the order in which they were pulled.
+    """
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter, PercentFormatter
+
+    # A pull that a log does not hold has no reward.
+    kept = pulls["matched"].T.ravel()
+    rewards, regrets = (pulls[name].T.ravel()[kept] for name in ("rewards", "regrets"))
+    if not len(rewards):
+        return
+    is_known = not np.isnan(regrets).any()
+    figure = Figure(figsize=(12 if is_known else 5, 4), dpi=120, layout="constrained")
+    panels = figure.subplots(1, 3 if is_known else 1, squeeze=False)[0]
+    _draw(panels[0], moving_average(rewards.astype(np.float64), LAST_PULLS), BLUE)
+    panels[0].set(ylabel=f"reward, mean of {LAST_PULLS} pulls")
+    if is_known:
+        optimal = (regrets == 0.0).astype(np.float64)
+        _draw(panels[1], moving_average(optimal, LAST_PULLS), GREEN)
+        panels[1].set(ylabel=f"best arm, share of {LAST_PULLS} pulls", ylim=(0, 1.02))
+        panels[1].yaxis.set_major_formatter(PercentFormatter(1))
+        _draw(panels[2], np.cumsum(regrets), ORANGE)
+        panels[2].set(ylabel="cumulative regret")
+    for axes in panels:
+        axes.set_xlabel("pulls" if kept.all() else "pulls that the log holds")
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
+    figure.suptitle(title, x=0.01, ha="left")
+    fix_layout(figure)
+    write_png(figure, path)
+
+
+def _draw(axes: Axes, values: Floats, colour: str) -> None:
+    shown = np.unique(np.linspace(0, len(values) - 1, MAX_POINTS).round().astype(np.int64))
+    axes.plot(shown + 1, values[shown], color=colour)

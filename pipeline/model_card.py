@@ -1,0 +1,286 @@
+"""The card of a pack: what a model hub reads, what a person wants to know, and how to play it."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+import gymnasium as gym
+import yaml
+
+from agents import ALGORITHMS
+from pipeline.errors import visible
+from pipeline.user_modules import copy_among
+
+# What stands around an environment, and a plain script would have to put there too.
+_WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
+_LIBRARIES = ("stable_baselines3", "sb3_contrib")
+_DEEP = {"dqn", "double_dqn", "deep_qlearning"}
+# Agents of this project whose model files are the library's, where they go by no action masks.
+_OF_THE_LIBRARY = {"dqn": "DQN", "ppo": "PPO", "a2c": "A2C"}
+
+
+def card(record: Mapping[str, Any], files: Collection[str]) -> str:
+    """The README.md of a pack.
+
+    Args:
+        record: its ``run.json``.
+        files: names of its other files.
+    """
+    spec = record["spec"]
+    algo, env_id = spec["algo"], spec["env_id"]
+    pictures = [name for name in ("value_map.png", "learning_curve.png") if name in files]
+    films = [name for name in files if name.startswith("replay.")]
+    sections = [
+        f"---\n{_front_matter(record)}---\n",
+        f"# {plain_text(algo)} on {plain_text(env_id)}\n",
+        _trained(record),
+        _figures(record),
+        *(
+            f"![{name.partition('.')[0].replace('_', ' ')}]({name})\n"
+            for name in [*films, *pictures]
+        ),
+        "## Play it\n",
+        _playing(record, files),
+        "## Settings\n",
+        fenced("yaml", str(yaml.safe_dump(spec["hyperparams"]))),
+        "## Versions\n",
+        "".join(
+            f"- {plain_text(name)} {plain_text(version)}\n"
+            for name, version in record["versions"].items()
+        ),
+    ]
+    return visible("\n".join(sections))
+
+
+def plain_text(value: object) -> str:
+    """A value as Markdown in which nothing is markup: the run may be anybody's."""
+    return re.sub(r"[\\`*<>|&\[\]]", lambda found: f"\\{found[0]}", " ".join(str(value).split()))
+
+
+def _trained(record: Mapping[str, Any]) -> str:
+    steps, seed = record["n_timesteps"], record["spec"]["seed"]
+    maker = "Trained with Yardstick (the Python package `rl-yardstick`)"
+    engine = f"; engine: {plain_text(record['engine'])}" if record.get("engine") else ""
+    return f"{maker} for {steps:,} environment steps, seed {plain_text(seed)}{engine}.\n"
+
+
+def _front_matter(record: Mapping[str, Any]) -> str:
+    spec, final = record["spec"], record.get("final") or {}
+    metrics = [
+        {"type": name, "value": value, "name": label, "verified": False}
+        for name, label, value in _metrics(final)
+    ]
+    env = str(spec["env_id"])
+    place = {
+        "task": {"type": "reinforcement-learning", "name": "reinforcement-learning"},
+        "dataset": {"name": env, "type": env},
+        "metrics": metrics,
+    }
+    return str(
+        yaml.safe_dump(
+            {
+                "library_name": "stable-baselines3",
+                "tags": [env, *_kind(spec), "reinforcement-learning", "stable-baselines3"],
+                "model-index": [{"name": spec["algo"], "results": [place]}],
+            },
+            sort_keys=False,
+        )
+    )
+
+
+def _kind(spec: Mapping[str, Any]) -> list[str]:
+    """What hubs call agents with networks."""
+    is_deep = spec["algo"] in _DEEP or plain_class(spec) is not None
+    return ["deep-reinforcement-learning"] if is_deep else []
+
+
+def _metrics(final: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
+    """Type, name and value of each figure; the first as hubs write it, the others exact."""
+    if not final:
+        return []
+    told = f"{final['mean_return']:.2f} +/- {final['std_return']:.2f}"
+    names = {"mean_return": "mean return", **_measured(final), "success_rate": "success rate"}
+    exact = [(name, label, final.get(name)) for name, label in names.items()]
+    return [("mean_reward", "mean_reward", told), *(row for row in exact if row[2] is not None)]
+
+
+def _figures(record: Mapping[str, Any]) -> str:
+    final = record.get("final")
+    if not final:
+        return _bandit_figures(record)
+    if final["exact"]:
+        how = "computed exactly, from the model of the environment; no episode was sampled"
+    else:
+        how = f"mean of {final['n_episodes']} sampled episodes of the greedy policy"
+    rows = [
+        ("mean return", final["mean_return"]),
+        ("its standard deviation over episodes", final["std_return"]),
+        ("mean length of an episode", final["mean_length"]),
+        ("success rate", final.get("success_rate")),
+        ("best random or constant policy", final.get("baseline")),
+        *((label, final.get(name)) for name, label in _measured(final).items()),
+    ]
+    return _table([*rows, ("how", how)])
+
+
+def _measured(final: Mapping[str, Any]) -> dict[str, str]:
+    """What the figures are called that hold the return against the optimum."""
+    if "optimum_at_least" not in final:
+        return {
+            "optimum": "optimum",
+            "gap": "gap to the optimum",
+            "score": "score (1: optimum, 0: best random or constant policy)",
+        }
+    return {
+        "optimum_at_least": "optimum, bracketed: what a policy was shown to reach",
+        "optimum": "optimum, bracketed: what no policy exceeds",
+        "gap_at_least": "gap to the bracket's lower end",
+        "gap": "gap to the bracket's upper end",
+        "score": "score (1: the bracket's upper end, 0: best random or constant policy)",
+        "score_at_most": "score with 1 at the bracket's lower end",
+    }
+
+
+def _bandit_figures(record: Mapping[str, Any]) -> str:
+    pulls = record.get("pulls") or {}
+    return _table([(name.replace("_", " "), value) for name, value in pulls.items()])
+
+
+def _table(rows: list[tuple[str, Any]]) -> str:
+    told = [
+        f"| {plain_text(name)} | {plain_text(value)} |\n"
+        for name, value in rows
+        if value is not None
+    ]
+    return "".join(["| figure | value |\n", "|---|---|\n", *told])
+
+
+def _playing(record: Mapping[str, Any], files: Collection[str]) -> str:
+    spec = record["spec"]
+    modules = to_type(spec, files)
+    parts = [
+        "With Yardstick, in this folder (nothing in it is run, but for modules that you type):\n"
+        if modules
+        else "With Yardstick, from this folder or its zip (nothing in it is run):\n",
+        fenced("sh", f"yardstick enjoy .{_flag(modules)}\n"),
+    ]
+    text = script(record, files)
+    if text is not None:
+        parts += ["In Python:\n", fenced("python", text)]
+    if plain_class(spec) is not None:
+        place = shlex.quote(f"{spec['algo']}/{record['env_name']}_1")
+        packages = [*(spec.get("gym_packages") or []), *([] if _is_known(spec) else ["envs"])]
+        words = (
+            f"{shlex.join(['--algo', spec['algo'], '--env', spec['env_id']])}{_flag(packages)} -f ."
+        )
+        copying = f"mkdir -p {shlex.quote(spec['algo'])} && cp -r PACK {place}\n"
+        parts += [
+            "With rl_zoo3, which finds agents by the names of folders (this one is `PACK`):\n",
+            fenced("sh", f"{copying}python -m rl_zoo3.enjoy {words}\n"),
+        ]
+    return "\n".join(parts)
+
+
+def _flag(packages: Sequence[str]) -> str:
+    return f" --gym-packages {shlex.join(packages)}" if packages else ""
+
+
+def _is_known(spec: Mapping[str, Any]) -> bool:
+    """Whether the environment is one of Gymnasium's own."""
+    registered = gym.registry.get(spec["env_id"])
+    return registered is not None and str(registered.entry_point).startswith("gymnasium.")
+
+
+def to_type(spec: Mapping[str, Any], files: Collection[str]) -> list[str]:
+    """What to type after ``--gym-packages``: the copy of a module in the pack, or else its name."""
+    return [copy_among(files, str(name)) or str(name) for name in spec.get("gym_packages") or []]
+
+
+def plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:
+    """Library and class that load an agent's zip without this project; None where none does."""
+    algo = spec["algo"]
+    if spec["hyperparams"].get("mask_actions"):
+        return None
+    if algo in _OF_THE_LIBRARY:
+        return "stable_baselines3", _OF_THE_LIBRARY[algo]
+    entry = ALGORITHMS[algo].entry_point if algo in ALGORITHMS else ""
+    module, _, name = entry.partition(":")
+    library = module.partition(".")[0]
+    return (library, name) if library in _LIBRARIES else None
+
+
+def script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
+    """A script that plays the agent without its commands; None where that takes more than a script.
+
+    Args:
+        record: the pack's ``run.json``.
+        files: names of its other files.
+    """
+    spec, env_name = record["spec"], record["env_name"]
+    settings = spec["hyperparams"]
+    if any(settings.get(name) for name in _WRAPPERS) or spec.get("gym_packages"):
+        return None
+    env_id = spec["env_id"]
+    given = {**(settings.get("env_kwargs") or {}), **(settings.get("eval_env_kwargs") or {})}
+    statistics = f"{env_name}/vecnormalize.pkl"
+    lines = [
+        *_imports(spec),
+        "from stable_baselines3.common.env_util import make_vec_env",
+        "from stable_baselines3.common.evaluation import evaluate_policy",
+        *(
+            ["from stable_baselines3.common.vec_env import VecNormalize"]
+            if statistics in files
+            else []
+        ),
+        "",
+        f"env = make_vec_env({env_id!r}, env_kwargs={given!r}, seed=0)",
+    ]
+    if statistics in files:
+        lines += [
+            f"env = VecNormalize.load({statistics!r}, env)",
+            "env.training = env.norm_reward = False",
+        ]
+    lines += [
+        f"model = {_loading(spec)}.load({env_name + '.zip'!r})",
+        "mean, std = evaluate_policy(model, env, n_eval_episodes=10)",
+        'print(f"return {mean:.2f} +/- {std:.2f}")',
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _imports(spec: Mapping[str, Any]) -> list[str]:
+    lines = [] if _is_known(spec) else ["import envs  # Yardstick's environments"]
+    plain = plain_class(spec)
+    if plain is None:
+        return [*lines, "from agents import load_algorithm  # Yardstick's agents"]
+    return [*lines, f"from {plain[0]} import {plain[1]}"]
+
+
+def _loading(spec: Mapping[str, Any]) -> str:
+    plain = plain_class(spec)
+    return f"load_algorithm({spec['algo']!r})" if plain is None else plain[1]
+
+
+def fenced(language: str, text: str) -> str:
+    """A text as a block of code, with a fence that the text does not hold."""
+    longest = max((len(run) for run in re.findall(r"`+", text)), default=0)
+    fence = "`" * max(3, longest + 1)
+    return f"{fence}{language}\n{text}{fence}\n"
+
+
+def results(record: Mapping[str, Any]) -> str | None:
+    """The ``results.json`` that rl_zoo3 has beside a model on a hub; None without evaluation."""
+    final = record.get("final")
+    if not final:
+        return None
+    told = {
+        "mean_reward": final["mean_return"],
+        "std_reward": final["std_return"],
+        "is_deterministic": True,
+        "n_eval_episodes": final["n_episodes"],
+    }
+    return json.dumps(told, indent=2) + "\n"

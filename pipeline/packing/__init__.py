@@ -1,1 +1,0 @@
-"""A finished run as a pack for others: model, settings, figures, and a card for a model hub."""

@@ -1,1 +1,0 @@
-"""Pictures of a run: its learning curve, its pulls, its policy on the map."""

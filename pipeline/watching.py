@@ -1,0 +1,541 @@
+"""What a training looks like step by step, kept while it goes on, for a page that plays it."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+from agents.common.algorithm import true_outcome
+from agents.common.callbacks import BlockCallback, Horizon
+from agents.compiled.learning_algorithm import LearningAlgorithm
+from mdp.array_types import Floats, Ints
+from pipeline.errors import UserError
+from pipeline.evaluation.exact import ExactEvaluator
+from pipeline.evaluation.value_maps import MAX_STATES, best_actions_of
+from pipeline.finite_numbers import NotFiniteError, check_model
+from pipeline.train_spec import TrainSpec
+
+# Records that are appended one by one, and lie in one array.
+
+_FIRST_CAPACITY = 256
+
+
+class GrowingRows:
+    """Records of one type, as many as come.
+
+    A list of tuples would hold the same; a state of the training is saved with it now and then, and
+    an array is saved at once.
+
+    Args:
+        kind: the type of a record.
+    """
+
+    def __init__(self, kind: np.dtype[np.void]) -> None:
+        self._rows: NDArray[np.void] = np.zeros(_FIRST_CAPACITY, dtype=kind)
+        self._n = 0
+
+    def __len__(self) -> int:
+        return self._n
+
+    @property
+    def rows(self) -> NDArray[np.void]:
+        """All that was appended, shape (n,)."""
+        return self._rows[: self._n]
+
+    def append(self, *fields: Any) -> None:
+        """Append one record."""
+        self.extend(np.array([fields], dtype=self._rows.dtype))
+
+    def extend(self, records: NDArray[np.void]) -> None:
+        """Append records, shape (n,)."""
+        end = self._n + len(records)
+        if end > len(self._rows):
+            larger = np.zeros(2 * end, dtype=self._rows.dtype)
+            larger[: self._n] = self.rows
+            self._rows = larger
+        self._rows[self._n : end] = records
+        self._n = end
+
+    def keep(self, chosen: NDArray[np.bool_]) -> None:
+        """Forget all records but the chosen ones; bool of shape (n,)."""
+        kept = self.rows[chosen]
+        self._rows[: len(kept)] = kept
+        self._n = len(kept)
+
+
+# Keeps what an agent does in every state as it learns, and what its logger says beside it.
+#
+# Of more maps than a page has room for, every second one is kept, then every fourth, and so on.
+
+MOST_MAPS = 1000
+MOST_FIGURES = 200_000  # of all maps together
+FEWEST_MAPS = 2  # the first and the last
+
+# What the library's agents log of a training, by the names that it has here.
+LOGGED = {
+    "loss": "train/loss",
+    "policy_loss": "train/policy_loss",
+    "value_loss": "train/value_loss",
+    "entropy_loss": "train/entropy_loss",
+}
+
+
+class MapRecorder(BaseCallback):
+    """Keeps the greedy policy and what each state is worth under it, at many moments.
+
+    Args:
+        evaluator: of the environment that the agent is judged on.
+
+    Attributes:
+        unit: what a map is kept after.
+        moments: records of the type that `moment_type` makes.
+        stride: of how many units one is kept.
+        n_units: how many there were.
+    """
+
+    unit: ClassVar[str]
+
+    def __init__(self, evaluator: ExactEvaluator) -> None:
+        super().__init__()
+        n_states = evaluator.model.n_states
+        self.evaluator = evaluator
+        self.moments = GrowingRows(moment_type(n_states))
+        self.most = min(max(MOST_FIGURES // (2 * n_states), FEWEST_MAPS), MOST_MAPS)
+        self.stride = 1
+        self.n_units = 0
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there is anything to show."""
+        return len(self.moments) > 0
+
+    def _on_training_start(self) -> None:
+        if not self.has_begun:
+            self._append()
+
+    def finish(self) -> None:
+        """Keep what the agent does at the end, unless that was kept already or is no number."""
+        with suppress(NotFiniteError):
+            check_model(self.model)
+            self._keep_end()
+
+    def _keep_end(self) -> None:
+        rows = self.moments.rows
+        is_kept = len(rows) and (rows["number"][-1], rows["timesteps"][-1]) == (
+            self.n_units,
+            self.model.num_timesteps,
+        )
+        if not is_kept:
+            self._append()
+
+    def _count(self) -> None:
+        """Another one is over: keep its map if it is one of those to be kept."""
+        self.n_units += 1
+        if self.n_units % self.stride:
+            return
+        self._append()
+        if len(self.moments) > self.most:
+            self.stride *= 2
+            self.moments.keep(self.moments.rows["number"] % self.stride == 0)
+
+    def _append(self) -> None:
+        policy = best_actions_of(self.evaluator, self.model)
+        if policy is None:
+            return
+        values = self.evaluator.values(policy)
+        log = self.model.logger.name_to_value if self.n_units else {}
+        self.moments.append(
+            self.n_units,
+            self.model.num_timesteps,
+            _exploration(self.model),
+            *(log.get(name, math.nan) for name in LOGGED.values()),
+            _training_return(self.model),
+            values,
+            policy[0],
+        )
+
+
+class EvaluationMaps(MapRecorder):
+    """Told after every evaluation, it keeps a map then."""
+
+    unit = "evaluation"
+
+    def _on_step(self) -> bool:
+        self._count()
+        return True
+
+
+class UpdateMaps(MapRecorder, BlockCallback):
+    """Keeps a map after every training on what was collected: what an agent of the library learns.
+
+    It acts where a rollout begins, so that compiled networks train as with any callback that does.
+    """
+
+    unit = "update"
+
+    def __init__(self, evaluator: ExactEvaluator) -> None:
+        super().__init__(evaluator)
+        self._seen = 0  # updates, as the agent counts them: several in a training
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self._seen = _n_updates(self.model)
+
+    def _on_rollout_start(self) -> None:
+        if (seen := _n_updates(self.model)) != self._seen:
+            self._seen = seen
+            self._count()
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _keep_end(self) -> None:
+        self._on_rollout_start()  # the last training comes after the last rollout
+        super()._keep_end()
+
+
+def moment_type(n_states: int) -> np.dtype[np.void]:
+    """The type of what is kept of a moment."""
+    return np.dtype(
+        [
+            ("number", np.int64),  # of the unit that it follows; 0 before the training
+            ("timesteps", np.int64),
+            ("exploration", np.float64),  # nan where the agent has no such rate
+            *((name, np.float64) for name in LOGGED),  # of the last training; nan for none
+            ("training_return", np.float64),  # mean of the last episodes, nan for none
+            ("values", np.float64, (n_states,)),
+            ("actions", np.int64, (n_states,)),
+        ]
+    )
+
+
+def tells_updates(agent: Any) -> bool:
+    """Whether callbacks hear of each of its trainings."""
+    return isinstance(agent, OnPolicyAlgorithm | OffPolicyAlgorithm)
+
+
+def can_be_mapped(evaluator: ExactEvaluator) -> bool:
+    """Whether there are few enough states to look at."""
+    return evaluator.model.n_states <= MAX_STATES
+
+
+def _n_updates(agent: Any) -> int:
+    return int(agent._n_updates)
+
+
+def _exploration(agent: Any) -> float:
+    """What the agent's schedule of exploration says now; its rate is set with the first step."""
+    schedule = getattr(agent, "exploration_schedule", None)
+    return math.nan if schedule is None else float(schedule(agent._current_progress_remaining))
+
+
+def _training_return(agent: Any) -> float:
+    episodes = [episode["r"] for episode in agent.ep_info_buffer or ()]
+    return float(np.mean(episodes)) if episodes else math.nan
+
+
+# Keeps every step of an agent that learns in tables, while the return of its policy rises.
+#
+# Which entries have moved is seen by holding the tables before an update against those after it, so
+# that a rule may move one entry or many, in any of its tables. Target and TD error are those that
+# the
+# update worked with, where the agent tells them.
+
+# All that a page of three megabytes can hold, and what it holds where nobody says how much.
+MOST_MOVES = 20_000
+MOST_CHANGES = 60_000
+MOVES_UNASKED = 5_000
+MOST_ENTRIES = 100_000
+# For the rise of the return so many steps are looked through, and the policy is judged so often.
+MOVES_SEARCHED = 50_000
+CHANGES_SEARCHED = 1_000_000
+STEPS_BETWEEN_RETURNS = 100
+# It has risen where so much of the way to the highest return is behind.
+FIRST_OF_RISE, LAST_OF_RISE = 0.1, 0.9
+STEPS_AROUND = 500  # that are kept before and after it
+
+# What ended with a step.
+GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
+NO_STATE = -1
+
+# One step of all environments.
+STEP = np.dtype(
+    [
+        ("timesteps", np.int64),  # after it, over all environments
+        ("exploration", np.float64),
+        ("learning_rate", np.float64),  # nan where it is no number of the schedule's
+    ]
+)
+# What one environment did in it.
+MOVE = np.dtype(
+    [
+        ("step", np.int64),  # number of the step
+        ("env", np.int64),
+        ("episode", np.int64),  # of this environment, from 0 on
+        ("obs", np.int64),  # `NO_STATE` where observations are no numbers
+        ("action", np.int64),
+        ("reward", np.float64),
+        ("next_obs", np.int64),  # before any reset
+        ("end", np.int64),
+        ("target", np.float64),  # nan where nothing was learnt, or the agent does not tell
+        ("td_error", np.float64),
+        ("episode_return", np.float64),  # sum of the rewards so far
+    ]
+)
+# An entry that moved in it.
+CHANGE = np.dtype(
+    [
+        ("step", np.int64),
+        ("table", np.int64),
+        ("entry", np.int64),  # place in the table as one row
+        ("after", np.float64),
+    ]
+)
+
+
+class TableRecorder(BlockCallback):
+    """Records steps of a training; it changes nothing of it.
+
+    Args:
+        n_episodes: the first so many, over all environments; 0 for the steps in which the return of
+            the greedy policy rises, or the first 5000 where that is not known.
+        exact: computes that return.
+
+    Attributes:
+        names: of the tables.
+        has_actions: whether the first of them has a number for each state and action.
+        initial: the tables before the first step, by their names.
+        steps, moves, changes: records of types `STEP`, `MOVE` and `CHANGE`.
+        is_cut: whether there were more steps in these episodes than are kept.
+    """
+
+    def __init__(self, n_episodes: int, exact: ExactEvaluator | None = None) -> None:
+        super().__init__()
+        self.n_episodes = n_episodes
+        self.exact = None if n_episodes else exact
+        self._greedy_returns: list[float] = []  # one after each `STEPS_BETWEEN_RETURNS` steps
+        self.names: list[str] = []
+        self.has_actions = False
+        self.initial: dict[str, Floats] = {}
+        self.steps = GrowingRows(STEP)
+        self.moves = GrowingRows(MOVE)
+        self.changes = GrowingRows(CHANGE)
+        self.is_full = False
+        self.is_cut = False
+        self._tables: list[Floats] = []  # as they were last
+        self._obs: Any = None
+        self._returns = np.zeros(0)
+        self._episodes = np.zeros(0, dtype=np.int64)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there is anything to show."""
+        return len(self.steps) > 0
+
+    def horizon(self) -> Horizon:
+        """After each step, as long as steps are kept."""
+        return Horizon() if self.is_full else Horizon(calls=1)
+
+    def _on_rollout_start(self) -> None:
+        if self.is_full:
+            return
+        if not self.initial:
+            self.initial = {name: table.copy() for name, table in tables_of(self.model).items()}
+            self.names = [*self.initial]
+            self.has_actions = has_actions(self.model, self.initial[self.names[0]])
+            self._tables = [table.copy() for table in self.initial.values()]
+            self._returns = np.zeros(self.model.n_envs)
+            self._episodes = np.zeros(self.model.n_envs, dtype=np.int64)
+            self._note_return()
+        self._obs = np.array(self.model._last_obs)
+        told = getattr(self.model, "last_steps", None)
+        if told is not None:  # so that no number of an earlier step is taken for one of the next
+            told["target"] = told["td_error"] = np.nan
+
+    def _on_step(self) -> bool:
+        if not self.is_full:
+            self._note_moves()
+        return True
+
+    def _note_moves(self) -> None:
+        """What was done; what is learnt from it comes afterwards."""
+        agent: Any = self.model
+        told = self.locals
+        next_obs, terminated = true_outcome(told["new_obs"], told["dones"], told["infos"])
+        self._returns += told["rewards"]
+        moves = np.zeros(agent.n_envs, dtype=MOVE)
+        moves["step"], moves["env"] = len(self.steps), np.arange(agent.n_envs)
+        moves["episode"], moves["episode_return"] = self._episodes, self._returns
+        moves["obs"], moves["next_obs"] = self._numbers(self._obs), self._numbers(next_obs)
+        moves["action"], moves["reward"] = told["actions"], told["rewards"]
+        moves["end"] = np.where(told["dones"], np.where(terminated, TERMINATED, TRUNCATED), GOES_ON)
+        moves["target"] = moves["td_error"] = np.nan
+        self.steps.append(self.num_timesteps, agent.exploration_rate, _learning_rate(agent))
+        self.moves.extend(moves)
+        self._returns[told["dones"]] = 0.0
+        self._episodes[told["dones"]] += 1
+
+    def _on_rollout_end(self) -> None:
+        if self.is_full or not len(self.steps):
+            return
+        agent: Any = self.model
+        told = getattr(agent, "last_steps", None)
+        if told is not None:
+            last = self.moves.rows[-agent.n_envs :]
+            last["target"], last["td_error"] = told["target"], told["td_error"]
+        for number, now in enumerate(tables_of(agent).values()):
+            before = self._tables[number]
+            moved = np.flatnonzero(before != now)
+            if len(moved):
+                self._note_changes(number, moved, before, now)
+        if len(self.steps) % STEPS_BETWEEN_RETURNS == 0:
+            self._note_return()
+        self._look_whether_full()
+
+    def _note_changes(self, number: int, moved: Ints, before: Floats, now: Floats) -> None:
+        # What was nan and is so still differs from itself.
+        stays = np.isnan(before.reshape(-1)[moved]) & np.isnan(now.reshape(-1)[moved])
+        moved = moved[~stays]
+        changes = np.zeros(len(moved), dtype=CHANGE)
+        changes["step"], changes["table"] = len(self.steps) - 1, number
+        changes["entry"], changes["after"] = moved, now.reshape(-1)[moved]
+        self.changes.extend(changes)
+        before.reshape(-1)[moved] = changes["after"]
+
+    def _look_whether_full(self) -> None:
+        if self.n_episodes and self._episodes.sum() >= self.n_episodes:
+            self.is_full = True
+            return
+        if self.exact is not None:
+            self.is_full = self._has_risen() or len(self.moves) > MOVES_SEARCHED
+            self.is_full |= len(self.changes) > CHANGES_SEARCHED
+            self.is_cut = self.is_full
+            return
+        most = MOST_MOVES if self.n_episodes else MOVES_UNASKED
+        has_room = len(self.moves) + self.model.n_envs <= most
+        self.is_full = not has_room or len(self.changes) > MOST_CHANGES
+        self.is_cut = self.is_full
+
+    def _note_return(self) -> None:
+        if self.exact is not None:
+            self._greedy_returns.append(self.exact(self.model).mean_return)
+
+    def _has_risen(self) -> bool:
+        """Whether there is enough after the policy came near the best that is possible."""
+        assert self.exact is not None
+        first, best = self._greedy_returns[0], self.exact.yardstick.optimum
+        near = first + LAST_OF_RISE * (best - first)
+        risen = next((i for i, one in enumerate(self._greedy_returns) if one >= near), None)
+        if risen is None or len(self.moves) < MOVES_UNASKED:
+            return False
+        return len(self.steps) >= STEPS_BETWEEN_RETURNS * risen + STEPS_AROUND
+
+    def window(self) -> tuple[int, int]:
+        """The steps to show, from the first up to but not including the last, by their numbers.
+
+        They begin with an episode of the first environment, before the return of the greedy policy
+        rises, and end after it has risen; where it rises for longer than there is room, they are
+        the last that there is room for.
+        """
+        n, n_envs = len(self.steps), self.model.n_envs
+        returns = np.array(self._greedy_returns)
+        if self.exact is None or not len(returns):
+            return 0, n
+        fewest, most = MOVES_UNASKED // n_envs, MOST_MOVES // n_envs
+        way = float(returns.max() - returns[0])
+        if way <= 0:
+            return 0, min(n, fewest)
+        behind = (returns - returns[0]) / way
+        last = int(np.argmax(behind >= LAST_OF_RISE))
+        first = int(np.flatnonzero(behind[:last] <= FIRST_OF_RISE)[-1])
+        end = min(n, max(STEPS_BETWEEN_RETURNS * last + STEPS_AROUND, fewest))
+        begin = min(STEPS_BETWEEN_RETURNS * first - STEPS_AROUND, end - fewest)
+        moves = self.moves.rows
+        of_first = moves[moves["env"] == 0]
+        episodes = np.append(0, of_first["step"][of_first["end"] != GOES_ON] + 1)
+        before = int(episodes[episodes <= max(begin, 0)][-1])
+        if end - before > most:
+            later = episodes[(episodes >= end - most) & (episodes < end)]
+            before = int(later[0]) if len(later) else end - most
+        return before, end
+
+    def _numbers(self, observations: Any) -> Any:
+        is_number = isinstance(self.model.observation_space, spaces.Discrete)
+        return observations if is_number else NO_STATE
+
+
+def tables_of(agent: BaseAlgorithm) -> dict[str, Floats]:
+    """The tables that an agent learns in, by name, in the agent's own memory.
+
+    First comes one with a number for each state (or for all as one) and action, if there is one.
+    """
+    tables = {
+        name: buffer.numpy()
+        for name, buffer in agent.policy.named_buffers()
+        if buffer.is_floating_point() and buffer.numel() > 0
+    }
+    return dict(sorted(tables.items(), key=lambda item: not has_actions(agent, item[1])))
+
+
+def has_actions(agent: BaseAlgorithm, table: Floats) -> bool:
+    """Whether a table has a row for each state, or one for all, with a number for each action."""
+    states, actions = agent.observation_space, agent.action_space
+    if not isinstance(states, spaces.Discrete) or not isinstance(actions, spaces.Discrete):
+        return False
+    return table.ndim > 1 and table.shape[-1] == actions.n and table.shape[-2] in (states.n, 1)
+
+
+def _learning_rate(agent: Any) -> float:
+    """What its schedule says; nan for agents that go by no schedule."""
+    if agent.averages_samples or agent.learning_rate == 0.0:
+        return math.nan
+    return float(agent.lr_schedule(agent._current_progress_remaining))
+
+
+# How the learning of an agent can be watched: step by step in its tables, or from far.
+
+Watch = TableRecorder | MapRecorder
+
+
+def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None) -> Watch | None:
+    """What records the learning; None where nobody asked for it.
+
+    Args:
+        spec: what is asked for.
+        agent: the agent, before its training.
+        exact: what evaluates it, where that is exact.
+
+    Raises:
+        UserError: if there is nothing to look at.
+    """
+    if spec.watch_learning is None:
+        return None
+    if isinstance(agent, LearningAlgorithm) and (tables := tables_of(agent)):
+        n_entries = sum(table.size for table in tables.values())
+        if n_entries > MOST_ENTRIES:
+            raise UserError(
+                f"--watch-learning shows tables of up to {MOST_ENTRIES:,} entries; those of "
+                f"{spec.algo} on {spec.env_id} have {n_entries:,}"
+            )
+        is_known = exact is not None and can_be_mapped(exact)
+        return TableRecorder(spec.watch_episodes, exact if is_known else None)
+    if exact is None or not can_be_mapped(exact) or best_actions_of(exact, agent) is None:
+        raise UserError(
+            f"--watch-learning shows tables, or what an agent does in up to 2,500 known states: "
+            f"{spec.algo} on {spec.env_id} has neither"
+        )
+    if spec.watch_episodes:
+        raise UserError(
+            f"--watch-episodes is for agents with tables: {spec.algo} is shown at each "
+            f"{'update' if tells_updates(agent) else 'evaluation'}"
+        )
+    return UpdateMaps(exact) if tells_updates(agent) else EvaluationMaps(exact)

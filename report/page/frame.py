@@ -1,0 +1,267 @@
+"""What pages have in common: templates, data for scripts, sections."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from envs.layout import GridLayout
+from experiments.analysis import StudyAnalysis
+from experiments.plan import PlannedRun
+from pipeline.errors import visible
+from pipeline.progress import Tell, tell_nobody
+from report.ranking import bar
+from report.series import StudySeries
+from report.words import interval_alone, number, optimum_words
+from verdicts import Estimate
+
+# From data to text that a browser can be handed: templates, JSON, inline scripts.
+
+_WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
+
+STYLES = ("templates/parts.css", "templates/page.css", "templates/paper.css")
+# Scripts that sections build on, before their own.
+SHARED = ("core.js", "exports.js", "figures.js", "tables.js")
+
+SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
+
+
+def templates() -> Environment:
+    """The templates; whatever they are filled with is escaped, and control characters are."""
+    environment = Environment(
+        loader=PackageLoader("report.page"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=StrictUndefined,
+        finalize=lambda value: visible(value) if type(value) is str else value,
+    )
+    environment.filters.update(
+        number=number,
+        optimum=optimum_words,
+        interval=interval_alone,
+        p_value=p_value,
+        bar=bar,
+        breakable=breakable,
+    )
+    return environment
+
+
+def template_file(name: str) -> str | None:
+    """The text of a file beside the templates, or None where there is none."""
+    file = files("report.page") / "templates" / name
+    return file.read_text(encoding="utf-8") if file.is_file() else None
+
+
+def package_file(name: str) -> str:
+    """The text of a file of this package."""
+    return (files("report.page") / name).read_text(encoding="utf-8")
+
+
+def plain(value: Any) -> Any:
+    """The value as JSON knows it: rounded, and None in place of what is not finite."""
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        return float(f"{value:.{SIGNIFICANT}g}") if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    return value
+
+
+def as_json(value: Any) -> str:
+    """The value as `plain` makes it, in as few letters as can be."""
+    return json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
+
+
+def data_uri(kind: str, content: bytes) -> str:
+    """A file inside the page.
+
+    Args:
+        kind: its MIME type.
+        content: its bytes.
+    """
+    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+
+
+def packed(text: str) -> str:
+    """A text as letters that take a third of its room: gzip in base64."""
+    return base64.b64encode(gzip.compress(text.encode("utf-8"), mtime=0)).decode("ascii")
+
+
+def inline_script(text: str) -> Markup:
+    """A script as the content of its element.
+
+    Raises:
+        ValueError: if the text would end the element.
+    """
+    if "</script" in text.lower() or "<!--" in text:
+        raise ValueError("a script that is put into a page may not hold </script or <!--")
+    return Markup(text)  # noqa: S704  # ours or the library's, and checked above
+
+
+def script_hash(text: str) -> str:
+    """How a content security policy names an inline script."""
+    digest = hashlib.sha256(text.encode("utf-8")).digest()
+    return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
+
+
+def frame(own: str) -> dict[str, str]:
+    """What every page has: its styles, its scripts, and the policy that admits these alone.
+
+    Args:
+        own: the page's own script.
+    """
+    from plotly.offline import get_plotlyjs
+
+    early, start = package_file("templates/theme.js"), package_file("templates/start.js")
+    plotly = get_plotlyjs()
+    return {
+        "style": Markup("\n".join(package_file(name) for name in STYLES)),  # noqa: S704  # our own
+        "early": inline_script(early),
+        "plotly": packed(plotly),
+        "own": inline_script(own),
+        "start": inline_script(start),
+        "policy": " ".join(map(script_hash, [early, plotly, own, start])),
+    }
+
+
+def p_value(value: float) -> str:
+    """A p-value with as many digits as mean something."""
+    if math.isnan(value):
+        return "-"
+    return "< 0.001" if value < 0.001 else f"{value:.3f}"
+
+
+def breakable(label: str) -> Markup:
+    """A label that may go over several lines where its words end: "Frozen|Lake8x8-|v1"."""
+    return Markup("<wbr>").join(_WORD_ENDS.split(label))
+
+
+def setting(value: Any) -> str:
+    """A hyperparameter as its YAML file has it."""
+    return value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
+
+
+# What the page and its sections have in common.
+
+
+@dataclass(frozen=True)
+class LearningPage:
+    """The page that plays the first training of an agent.
+
+    Attributes:
+        agent: its label.
+        environment: that of the environment.
+        seed: of the training.
+        place: the file, seen from the folder of the study; empty where there is none.
+        words: what it shows, or why there is none.
+        size: of the file, in bytes.
+    """
+
+    agent: str
+    environment: str
+    seed: int
+    place: str
+    words: str
+    size: int = 0
+
+    @property
+    def link(self) -> str:
+        """The place as an address."""
+        return quote(self.place)
+
+
+@dataclass(frozen=True)
+class Report:
+    """What a page is made from.
+
+    Attributes:
+        series: the numbers that its figures show.
+        command: the command that reproduces the study.
+        tell: told how far the slow parts are.
+        learning: the pages that play trainings, where they were asked for.
+    """
+
+    series: StudySeries
+    command: str
+    tell: Tell = tell_nobody
+    learning: Sequence[LearningPage] = ()
+
+    @property
+    def analysis(self) -> StudyAnalysis:
+        """The study."""
+        return self.series.analysis
+
+
+@dataclass(frozen=True)
+class Section:
+    """One part of the page.
+
+    Attributes:
+        name: that of its template and script, and its anchor.
+        title: its heading.
+        context: what its template is filled with.
+        data: what its script works with, to be written as JSON; None where there is no such thing.
+        places: likewise what it works with on each environment, in their order, read when that is
+            chosen; None for one that it has nothing on.
+        by_environment: whether it shows the environment that is chosen at the top of the page.
+            Its template marks what belongs to environment i by ``data-environment="i"``.
+    """
+
+    name: str
+    title: str
+    context: Mapping[str, Any] = field(default_factory=dict)
+    data: Any = None
+    places: Sequence[Any] = ()
+    by_environment: bool = False
+
+
+def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
+    """The first run of each agent that has finished, for each environment.
+
+    A batch leaves no agent.
+    """
+    first: dict[tuple[str, str], PlannedRun] = {}
+    for run in analysis.results.finished:
+        is_new = (run.agent, run.environment) not in first
+        if is_new and not run.is_batch:
+            first[run.agent, run.environment] = run
+    return [
+        [
+            first[agent.agent, environment.environment]
+            for agent in environment.agents
+            if (agent.agent, environment.environment) in first
+        ]
+        for environment in analysis.environments
+    ]
+
+
+def estimate_data(estimate: Estimate) -> dict[str, float]:
+    """A figure and its interval, for scripts."""
+    return {"point": estimate.point, "low": estimate.low, "high": estimate.high}
+
+
+def layout_data(layout: GridLayout) -> dict[str, Any]:
+    """Where states lie on a map, for scripts."""
+    return {
+        "rows": layout.rows,
+        "moves": layout.moves,
+        "names": dict(layout.names),
+        "layers": [layout.collected_in(layer) for layer in range(layout.n_layers)],
+    }

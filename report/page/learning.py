@@ -1,0 +1,489 @@
+"""The page that plays a training step by step."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+from collections.abc import Iterator, Mapping
+from concurrent.futures import Executor
+from dataclasses import replace
+from functools import cache, partial
+from hashlib import sha256
+from importlib.resources import files
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from jinja2 import ChoiceLoader, PackageLoader
+from markupsafe import Markup
+from numpy.typing import NDArray
+from rich.console import Console
+
+from envs.known_models import observations_of_states
+from envs.layout import GridLayout, action_names, grid_layout
+from experiments.analysis import StudyAnalysis
+from experiments.child_processes import TaskFailedError, local_executor, supervise
+from experiments.plan import PlannedRun
+from experiments.run_files import difference
+from experiments.run_limits import RunLimits
+from mdp.array_types import Floats
+from pipeline.environments import make_single_env
+from pipeline.errors import UserError
+from pipeline.evaluation.value_maps import MAX_STATES
+from pipeline.files import write_json, write_text
+from pipeline.progress import Tell, tell_nobody
+from pipeline.train_spec import TrainSpec, is_plain
+from pipeline.training import carry_out, prepare
+from pipeline.unfinished_runs import SaveInterval, StateKeeping
+from pipeline.user_modules import import_again
+from pipeline.watching import LOGGED, MapRecorder, TableRecorder
+from report.page.frame import (
+    LearningPage,
+    first_runs,
+    inline_script,
+    layout_data,
+    package_file,
+    packed,
+    script_hash,
+    templates,
+)
+from safe_files.files import NO_LIMIT, UnsafeFileError, hold, read_file
+
+# What the page says of itself: what it shows, and what it leaves out.
+
+NO_WORDS = {"kind": "", "extent": "", "note": ""}
+
+
+def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
+    """The words that depend on what is shown, by the names that the template has for them."""
+    return _words_of_steps(spec, data) if data["kind"] == "steps" else _words_of_maps(data)
+
+
+def _words_of_steps(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
+    n_steps = len(data["steps"]["timesteps"])
+    n_episodes = int(np.count_nonzero(data["moves"]["end"]))
+    note = ""
+    if data["is_cut"] and spec.watch_episodes:
+        asked = _count(spec.watch_episodes, "episode")
+        note = f"a page has room for {n_steps:,} steps, and ends before the first {asked} do"
+    elif data["begin"]:
+        first = int(data["steps"]["timesteps"][0])
+        note = f"from step {first:,} on, as the return of the greedy policy rises"
+    elif data["is_longer"] and not spec.watch_episodes:
+        note = "the beginning of a longer training"
+    return {
+        "kind": "step by step",
+        "extent": f"{_count(n_steps, 'step')}, {_count(n_episodes, 'whole episode')}",
+        "note": note,
+    }
+
+
+def _words_of_maps(data: Mapping[str, Any]) -> dict[str, str]:
+    unit, stride, n_units = data["unit"], data["stride"], data["n_units"]
+    extent = _count(n_units, unit)
+    if stride > 1:
+        extent += f", one in {stride:,} of which is shown"
+    note = ""
+    if unit == "update":
+        note = "an update: all that is learnt from one rollout, at the end of it"
+    return {"kind": f"from {unit} to {unit}", "extent": extent, "note": note}
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number:,} {word}" if number == 1 else f"{number:,} {word}s"
+
+
+# What the page plays, as data: the steps, where states lie on a map, and what actions are called.
+#
+# Numbers are written with all their digits: what the page shows is what the agent computed.
+
+
+def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
+    """Steps of an agent that learns in tables.
+
+    Args:
+        recorder: what was kept of it.
+        most_steps: how many of them: of the first episodes the first, else the last, since there
+            the return has risen.
+    """
+    begin, end = recorder.window()
+    if recorder.n_episodes:
+        end = min(end, begin + most_steps)
+    else:
+        begin = max(begin, end - most_steps)
+    steps = recorder.steps.rows[begin:end]
+    moves, changes = (
+        _between(kept.rows, begin, end) for kept in (recorder.moves, recorder.changes)
+    )
+    return {
+        "kind": "steps",
+        "tables": [_table(name, table) for name, table in _tables_before(recorder, begin).items()],
+        "steps": _columns(steps),
+        "moves": _columns(moves),
+        "changes": _columns(changes),
+        "begin": begin,
+        "is_cut": recorder.is_cut or end - begin < len(recorder.steps),
+        "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
+    }
+
+
+def _between(rows: NDArray[np.void], begin: int, end: int) -> NDArray[np.void]:
+    """Those of some steps, of which the first has the number 0."""
+    chosen = rows[(rows["step"] >= begin) & (rows["step"] < end)].copy()
+    chosen["step"] -= begin
+    return chosen
+
+
+def _tables_before(recorder: TableRecorder, step: int) -> dict[str, Floats]:
+    """The tables as they were before a step."""
+    tables = {name: recorder.initial[name].copy() for name in recorder.names}
+    earlier = recorder.changes.rows[recorder.changes.rows["step"] < step]
+    for number, table in enumerate(tables.values()):
+        moved = earlier[earlier["table"] == number]
+        table.reshape(-1)[moved["entry"]] = moved["after"]  # of several the last
+    return tables
+
+
+def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
+    """What an agent did in every state as it learnt, and what each state was worth then.
+
+    Args:
+        recorder: what was kept of it.
+        stride: of how many updates or evaluations one is shown, and the last in any case.
+    """
+    evaluator, rows = recorder.evaluator, recorder.moments.rows
+    is_shown = rows["number"] % stride == 0
+    is_shown[-1] = True
+    shown = rows[is_shown]
+    optimal = evaluator.optimum[0][evaluator.model.reachable]
+    return {
+        "kind": "maps",
+        "unit": recorder.unit,
+        "n_units": recorder.n_units,
+        "stride": stride,
+        "moments": {
+            **_columns(shown),
+            "values": np.where(evaluator.model.reachable, shown["values"], np.nan),
+            "return": shown["values"] @ evaluator.model.initial,
+        },
+        "logged": LOGGED,
+        "optimum": evaluator.yardstick.optimum,
+        "optimal_range": [optimal.min(), optimal.max()],
+    }
+
+
+def place_data(spec: TrainSpec, recorder: TableRecorder | MapRecorder) -> dict[str, Any]:
+    """Where states lie, and what actions are called."""
+    if isinstance(recorder, MapRecorder):
+        evaluator = recorder.evaluator
+        return _place(spec, (evaluator.model.n_states, evaluator.model.n_actions), evaluator.layout)
+    has_rows = recorder.has_actions
+    shape = recorder.initial[recorder.names[0]].shape if has_rows else (0, 0)
+    return _place(spec, (shape[-2], shape[-1]))
+
+
+def exact_json(value: Any) -> str:
+    """The value as JSON: every number to its last digit, null for nan, and infinity as a word."""
+    return json.dumps(_plain(value), separators=(",", ":"), allow_nan=False)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        value = value.tolist()
+    if isinstance(value, float):
+        if math.isnan(value):
+            return None
+        if math.isinf(value):
+            return "Infinity" if value > 0 else "-Infinity"
+        return int(value) if value.is_integer() and abs(value) < 2**53 else value
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def _columns(rows: NDArray[np.void]) -> dict[str, Any]:
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def _table(name: str, values: Floats) -> dict[str, Any]:
+    fill = values.reshape(-1)[0]
+    is_even = bool((values == fill).all())
+    initial = {"fill": float(fill)} if is_even else {"values": values.reshape(-1)}
+    return {"name": name, "shape": values.shape, **initial}
+
+
+def _place(
+    spec: TrainSpec, shape: tuple[int, int], layout: GridLayout | None = None
+) -> dict[str, Any]:
+    n_states, n_actions = shape
+    env = make_single_env(spec, training=True)
+    try:
+        layout = layout or _layout_of(env, n_states)
+        names = action_names(env)
+        n_arms = int(getattr(env.action_space, "n", n_actions))
+    finally:
+        env.close()
+    if len(names) < n_arms:
+        names = tuple(f"action {action}" for action in range(n_arms))
+    return {
+        "n_states": n_states,
+        "actions": names[:n_arms],
+        "layout": None if layout is None else layout_data(layout),
+        "is_drawn": 1 < n_states <= MAX_STATES,
+    }
+
+
+def _layout_of(env: Any, n_states: int) -> GridLayout | None:
+    """The map, where the agent observes the number of the state."""
+    layout = grid_layout(env)
+    if layout is None or layout.n_states != n_states:
+        return None
+    seen = observations_of_states(env)
+    is_number = seen is not None and np.array_equal(seen, np.arange(n_states))
+    return layout if is_number else None
+
+
+# The page as one file: it needs nothing else and no network.
+
+MOST_BYTES = 2_900_000
+SCRIPTS = (
+    "learning_replay.js",
+    "learning_board.js",
+    "learning_readout.js",
+    "learning_curves.js",
+    "learning_steps.js",
+    "learning_maps.js",
+    "learning_player.js",
+)
+
+
+def write_learning_page(
+    spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path, title: str = ""
+) -> str:
+    """Write the page of a training.
+
+    Args:
+        spec: of the training.
+        recorder: what was kept of it.
+        path: the file, which is replaced.
+        title: what the training is called; by default the names of agent and environment.
+
+    Returns:
+        What it shows, in words.
+    """
+    place = place_data(spec, recorder)
+    title = title or f"{spec.algo} on {spec.env_id}"
+    for data in _ever_less(recorder):
+        words = page_words(spec, data)
+        text = _render({"title": title, "seed": spec.seed, **words}, {**data, **place})
+        if len(text.encode()) <= MOST_BYTES:
+            break
+    write_text(path, text)
+    return f"{words['kind']}, {words['extent']}"
+
+
+@cache
+def page_version() -> str:
+    """A digest of all that a page is made of but the data."""
+    return sha256(_render({"title": "", "seed": 0, **NO_WORDS}, {}).encode()).hexdigest()
+
+
+def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]]:
+    """What was kept, then three quarters or half of that, and so on as long as there is any."""
+    if isinstance(recorder, MapRecorder):
+        recorder.finish()
+        stride = recorder.stride
+        while stride < 2 * max(recorder.n_units, recorder.stride):
+            yield maps_data(recorder, stride)
+            stride *= 2
+        return
+    begin, end = recorder.window()
+    n_steps = end - begin
+    while n_steps:
+        yield steps_data(recorder, n_steps)
+        n_steps = n_steps * 3 // 4
+
+
+def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
+    early = package_file("templates/theme.js")
+    own = "\n".join(_file(name) for name in SCRIPTS)
+    style = "\n".join([package_file("templates/page.css"), _file("learning.css")])
+    environment = templates()
+    environment.loader = ChoiceLoader(
+        [PackageLoader("report.page", "templates/learning"), PackageLoader("report.page")]
+    )
+    return environment.get_template("learning.html").render(
+        **words,
+        data=packed(exact_json(data)),
+        style=Markup(style),  # noqa: S704  # our own
+        early=inline_script(early),
+        own=inline_script(own),
+        policy=" ".join(map(script_hash, [early, own])),
+    )
+
+
+def _file(name: str) -> str:
+    return (files("report.page") / "templates" / "learning" / name).read_text(encoding="utf-8")
+
+
+# Pages of learning in the folder of a study, each with a note of what it was made from.
+
+FOLDER = "learning"
+LONGEST_WORDS = 300
+_MOST_NOTED = 10_000  # bytes
+
+
+def page_path(root: Path, run: PlannedRun) -> Path:
+    """Where the page of a run is written."""
+    return root / _place_in_study(run)
+
+
+def without_page(run: PlannedRun, reason: str) -> LearningPage:
+    """A run that cannot be shown."""
+    return LearningPage(run.agent, run.environment, run.seed, "", reason[:LONGEST_WORDS])
+
+
+def note_page(root: Path, run: PlannedRun, words: str) -> LearningPage:
+    """Note what the page that has just been written was made from."""
+    content = read_file(page_path(root, run), NO_LIMIT)
+    write_json(_note_path(root, run), {"words": words, **_made_from(run, content)})
+    return _page(run, words, content)
+
+
+def kept_page(root: Path, run: PlannedRun) -> LearningPage | None:
+    """The page of a run that an earlier command has left; None if it is none of this very run."""
+    try:
+        content = read_file(page_path(root, run), 2 * MOST_BYTES)
+        note = json.loads(read_file(_note_path(root, run), _MOST_NOTED))
+    except (OSError, ValueError, RecursionError, UnsafeFileError):
+        return None
+    words = note.pop("words", None) if isinstance(note, dict) else None
+    if not isinstance(words, str) or len(words) > LONGEST_WORDS:
+        return None
+    made_from = _made_from(run, content)
+    return _page(run, words, content) if made_from["agent"] and note == made_from else None
+
+
+def _made_from(run: PlannedRun, content: bytes) -> dict[str, str]:
+    """What decides what a page shows; the agent is empty where its run recorded no digests."""
+    digests = run.run.files.digests or {}
+    return {
+        "agent": digests.get(run.run.model_path.name, ""),
+        "page": sha256(content).hexdigest(),
+        "version": page_version(),
+    }
+
+
+def _page(run: PlannedRun, words: str, content: bytes) -> LearningPage:
+    place = _place_in_study(run).as_posix()
+    return LearningPage(run.agent, run.environment, run.seed, place, words, len(content))
+
+
+def _place_in_study(run: PlannedRun) -> PurePosixPath:
+    return PurePosixPath(FOLDER, run.path.parent.name, f"{run.path.name}.html")
+
+
+def _note_path(root: Path, run: PlannedRun) -> Path:
+    return page_path(root, run).with_suffix(".json")
+
+
+# The first training of each agent of a study, done again to be played.
+
+BATCH = "its runs were done as one batch, which leaves no agent"
+WITHOUT_STATES = StateKeeping(SaveInterval(is_off=True))
+
+
+def write_first_pages(
+    analysis: StudyAnalysis, n_workers: int, tell: Tell = tell_nobody
+) -> list[LearningPage]:
+    """Write a page for the first run of each agent, into ``learning``; those that fit stay.
+
+    Args:
+        analysis: the study.
+        n_workers: trainings at once; each is done in a child process.
+        tell: told how far it is.
+
+    Returns:
+        The pages, and of agents that cannot be shown the reason.
+    """
+    root, study = analysis.results.root, analysis.study
+    runs = [run for group in first_runs(analysis) for run in group]
+    kept = {run.path: kept_page(root, run) for run in runs}
+    to_do = [run for run in runs if kept[run.path] is None]
+    if to_do:
+        limits = RunLimits(study.run_timeout, study.run_memory)
+        with local_executor(n_workers) as executor:
+            kept |= _trained_again(executor, root, to_do, limits, tell)
+    pages = [page for page in kept.values() if page is not None]
+    return pages + _without_run(analysis, pages)
+
+
+def _without_run(analysis: StudyAnalysis, pages: list[LearningPage]) -> list[LearningPage]:
+    """The agents of which there is no run that could be trained again."""
+    there = {(page.agent, page.environment) for page in pages}
+    batches = {(run.agent, run.environment) for run in analysis.results.finished if run.is_batch}
+    without = [
+        (agent.agent, one.environment)
+        for one in analysis.environments
+        for agent in one.agents
+        if (agent.agent, one.environment) not in there
+    ]
+    return [
+        LearningPage(*names, 0, "", BATCH if names in batches else "no run of it has finished")
+        for names in without
+    ]
+
+
+def _trained_again(
+    executor: Executor, root: Path, runs: list[PlannedRun], limits: RunLimits, tell: Tell
+) -> Iterator[tuple[Path, LearningPage]]:
+    futures = [executor.submit(_watched, root, run, limits) for run in runs]
+    for n, (run, future) in enumerate(zip(runs, futures, strict=True), start=1):
+        tell(f"training again to be watched, {n} of {len(runs)}: {run.agent} on {run.environment}")
+        yield run.path, future.result()
+
+
+def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
+    """The page of a run, written by a child process."""
+    path = page_path(root, run)
+    with TemporaryDirectory(prefix="yardstick-learning-", ignore_cleanup_errors=True) as folder:
+        try:
+            words = supervise(
+                _train_again,
+                run,
+                path,
+                Path(folder),
+                clean_up=partial(shutil.rmtree, folder, ignore_errors=True),
+                limits=limits,
+                shares_process=is_plain(run.spec),
+            )
+        except TaskFailedError as error:
+            path.unlink(missing_ok=True)
+            return without_page(run, str(error))
+    return note_page(root, run, words)
+
+
+def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:
+    """Train in ``folder`` and write the page of it; what that shows, in words.
+
+    Raises:
+        UserError: if the agent cannot be watched, or has become another one than that of the run.
+    """
+    hold(path.parents[2])  # the study
+    import_again(planned.spec.user_modules)
+    spec = replace(planned.spec, log_folder=folder, tensorboard_log=None, watch_learning=path)
+    training = prepare(spec, Console(quiet=True), {}, "", keeping=WITHOUT_STATES)
+    carry_out(training)
+    what = difference(planned.run, training.run)
+    if what:
+        raise UserError(
+            f"{what} came out otherwise than in the run, as with another version or processor"
+        )
+    assert training.watch is not None
+    path.parent.mkdir(parents=True, exist_ok=True)
+    title = f"{planned.agent} on {planned.environment}"
+    return write_learning_page(spec, training.watch, path, title)

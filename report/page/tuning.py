@@ -1,0 +1,404 @@
+"""The page of a tuning: what was found, how, and what it cost."""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from jinja2 import ChoiceLoader, PackageLoader
+
+from pipeline.files import write_text
+from report.page.frame import SHARED, as_json, frame, packed, setting, template_file, templates
+from report.words import number
+
+if TYPE_CHECKING:
+    from optuna.distributions import BaseDistribution
+
+
+# The trials of a tuning, as its record holds them.
+
+COMPLETE, PRUNED, FAILED = "judged on all seeds", "ended early", "failed"
+
+
+@dataclass(frozen=True)
+class Trials:
+    """What a tuning has tried.
+
+    Attributes:
+        record: what the tuning wrote down, see `tuning.retesting`.
+        ended: the trials that have ended, in their order, as they stand there.
+    """
+
+    record: Mapping[str, Any]
+    ended: tuple[Mapping[str, Any], ...]
+
+    @property
+    def is_cost(self) -> bool:
+        """Whether the lower figure is the better."""
+        return bool(self.record["lower_is_better"])
+
+    @property
+    def judged(self) -> list[Mapping[str, Any]]:
+        """Those with a figure on one seed at least."""
+        return [trial for trial in self.ended if trial["value"] is not None and trial["figures"]]
+
+    @property
+    def best_first(self) -> list[Mapping[str, Any]]:
+        """Those that have all their seeds, the best first, the earlier where they are equal."""
+        whole = [trial for trial in self.judged if kind(trial) == COMPLETE]
+        sign = 1 if self.is_cost else -1
+        return sorted(whole, key=lambda trial: (sign * trial["value"], trial["number"]))
+
+    @property
+    def n_runs(self) -> int:
+        """How many runs the search has judged."""
+        return sum(len(trial["figures"]) for trial in self.ended)
+
+    @property
+    def seconds(self) -> float:
+        """What these took, one after the other."""
+        return float(sum(trial["seconds"] for trial in self.ended))
+
+    @property
+    def wall_seconds(self) -> float | None:
+        """From the first trial's beginning to the last one's end; None without any."""
+        began = [datetime.fromisoformat(t["began"]) for t in self.ended if t["began"]]
+        ended = [datetime.fromisoformat(t["ended"]) for t in self.ended if t["ended"]]
+        return (max(ended) - min(began)).total_seconds() if began and ended else None
+
+    def distributions(self) -> dict[str, BaseDistribution]:
+        """What each parameter was drawn from."""
+        from optuna.distributions import json_to_distribution
+
+        space = (self.record.get("asked") or {}).get("search_space", {})
+        return {name: json_to_distribution(text) for name, text in space.items()}
+
+
+def trials_of(record: Mapping[str, Any]) -> Trials:
+    """The trials of a record that have ended."""
+    ended = tuple(t for t in record["trials"] if t["state"] in {"complete", "pruned", "fail"})
+    return Trials(record, ended)
+
+
+def kind(trial: Mapping[str, Any]) -> str:
+    """How a trial ended."""
+    if trial["failure"] or trial["state"] == "fail":
+        return FAILED
+    return COMPLETE if trial["state"] == "complete" else PRUNED
+
+
+def importances(trials: Trials) -> dict[str, float]:
+    """How much of what makes a trial one of the best tenth each parameter explains.
+
+    Trials that were ended early count too, by the seeds that they had: those that were not are few,
+    and good all of them.
+
+    Returns:
+        Shares by parameter, which sum to 1, the largest first; empty where trials are too few or
+        all alike.
+
+    Source: PED-ANOVA, Watanabe et al. (2023), "PED-ANOVA: Efficiently quantifying hyperparameter
+        importance in arbitrary subspaces", IJCAI, as Optuna computes it.
+    """
+    import optuna
+
+    ranges = trials.distributions()
+    judged = trials.judged
+    if len({trial["value"] for trial in judged}) < 2 or not ranges:
+        return {}
+    directions = optuna.study.StudyDirection
+    direction = directions.MINIMIZE if trials.is_cost else directions.MAXIMIZE
+    study = optuna.create_study(direction=direction, sampler=optuna.samplers.RandomSampler(0))
+    for trial in judged:
+        params = {name: value for name, value in trial["params"].items() if name in ranges}
+        study.add_trial(
+            optuna.create_trial(
+                value=trial["value"],
+                params=params,
+                distributions={name: ranges[name] for name in params},
+            )
+        )
+    evaluator = optuna.importance.PedAnovaImportanceEvaluator()
+    with warnings.catch_warnings():
+        # Of parameters that few trials have; the page says that few trials say little.
+        warnings.filterwarnings("ignore", "Some regimes for parameter")
+        found = optuna.importance.get_param_importances(study, evaluator=evaluator)
+    return {name: share for name, share in found.items() if share > 0}
+
+
+# The numbers behind the figures of a tuning's page.
+
+# Trials so far from the best that the others could not be told apart are drawn at the edge.
+_SHOWN = 0.8
+# Lines of as many strengths as ranks are told apart by.
+_GROUPS = 5
+
+
+def history(trials: Trials) -> dict[str, Any]:
+    """Value by trial, the best so far, and what the shipped settings have."""
+    best, steps = None, []
+    better = min if trials.is_cost else max
+    for trial in trials.ended:
+        if kind(trial) == COMPLETE and trial["value"] is not None:
+            best = trial["value"] if best is None else better(best, trial["value"])
+        steps.append(best)
+    shipped = next((t["value"] for t in trials.ended if t["number"] == 0), None)
+    return {
+        "isCost": trials.is_cost,
+        "figure": trials.record["figure"],
+        "edge": _edge(trials),
+        "shipped": shipped,
+        "numbers": [trial["number"] for trial in trials.ended],
+        "best": steps,
+        "values": {
+            name: [_value(trial) if kind(trial) == name else None for trial in trials.ended]
+            for name in (COMPLETE, PRUNED)
+        },
+        "texts": [_text(trial) for trial in trials.ended],
+        "failed": [t["number"] for t in trials.ended if _value(t) is None],
+    }
+
+
+def _value(trial: Mapping[str, Any]) -> float | None:
+    value = trial["value"] if trial["figures"] else None
+    return value if value is not None and math.isfinite(value) else None
+
+
+def _text(trial: Mapping[str, Any]) -> str:
+    n_seeds = len(trial["figures"])
+    seeds = f"{n_seeds} seed{'' if n_seeds == 1 else 's'}"
+    return f"trial {trial['number']}: {number(_value(trial))} on {seeds}"
+
+
+def _edge(trials: Trials) -> float | None:
+    """Where the axis of values ends on the side of the worst; None where all are shown."""
+    values = np.array([v for t in trials.ended if (v := _value(t)) is not None])
+    if not values.size:
+        return None
+    sign = -1.0 if trials.is_cost else 1.0
+    goods = np.sort(sign * values)
+    worst, best = float(goods[0]), float(goods[-1])
+    least = float(goods[math.ceil((1 - _SHOWN) * (goods.size - 1))])
+    edge = least - 0.15 * (best - least)
+    return sign * edge if edge - worst > best - edge else None
+
+
+def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
+    """Each trial as a line through its parameters, the most important ones first."""
+    ranges = trials.distributions()
+    names = [*shares, *(name for name in ranges if name not in shares)]
+    ranked = sorted(trials.judged, key=lambda t: t["value"], reverse=trials.is_cost)
+    return {
+        "axes": [{"name": name, "ticks": _ticks(ranges[name])} for name in names],
+        "lines": [
+            {
+                "number": trial["number"],
+                "group": min(_GROUPS - 1, rank * _GROUPS // len(ranked)),
+                "text": _text(trial),
+                "at": [_place(ranges[name], trial["params"].get(name, _ABSENT)) for name in names],
+                "said": [_said(trial["params"].get(name, _ABSENT)) for name in names],
+            }
+            for rank, trial in enumerate(ranked)
+        ],
+        "groups": _GROUPS,
+    }
+
+
+_ABSENT = object()
+
+
+def _place(ends: BaseDistribution, value: Any) -> float | None:
+    """Where a value lies between the ends, from 0 to 1; None for a parameter that is not there."""
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if value is _ABSENT:
+        return None
+    if isinstance(ends, CategoricalDistribution):
+        return (ends.choices.index(value) + 0.5) / len(ends.choices)
+    assert isinstance(ends, FloatDistribution | IntDistribution)
+    low, high, at = float(ends.low), float(ends.high), float(value)
+    if ends.log:
+        low, high, at = math.log(low), math.log(high), math.log(at)
+    return 0.5 if low == high else (at - low) / (high - low)
+
+
+def _ticks(ends: BaseDistribution) -> list[tuple[float | None, str]]:
+    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
+
+    if isinstance(ends, CategoricalDistribution):
+        return [(_place(ends, word), _said(word)) for word in ends.choices]
+    assert isinstance(ends, FloatDistribution | IntDistribution)
+    return [(_place(ends, end), number(end)) for end in (ends.low, ends.high)]
+
+
+def _said(value: Any) -> str:
+    if value is _ABSENT:
+        return "not there"
+    if value is None:
+        return "null"
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number(value) if is_number else str(value).lower() if value in (True, False) else value
+
+
+# The tables of a tuning's page: the re-test, what changed, the cost, all trials.
+
+LEFT_OUT = "-"
+
+
+@dataclass(frozen=True)
+class Change:
+    """A setting that the winner has otherwise than what shipped.
+
+    Attributes:
+        name: of the setting.
+        shipped, found: its values, as a file has them.
+    """
+
+    name: str
+    shipped: str
+    found: str
+
+
+def changes(trials: Trials, winner: int) -> list[Change]:
+    """What a trial has otherwise than the settings that the search began with."""
+    settings = {trial["number"]: trial["settings"] or {} for trial in trials.ended}
+    before, after = settings.get(0, {}), settings.get(winner, {})
+    return [
+        Change(name, _setting_said(before, name), _setting_said(after, name))
+        for name in dict.fromkeys([*before, *after])
+        if _setting_said(before, name) != _setting_said(after, name)
+    ]
+
+
+def _setting_said(settings: Mapping[str, Any], name: str) -> str:
+    return setting(settings[name]) if name in settings else LEFT_OUT
+
+
+def cost(trials: Trials) -> list[tuple[str, str]]:
+    """What the search took."""
+    record = trials.record
+    n_seeds = len(record["seeds"])
+    kinds = Counter(kind(trial) for trial in trials.ended)
+    whole = len(trials.ended) * n_seeds
+    saved = f"{1 - trials.n_runs / whole:.0%}" if whole else LEFT_OUT
+    retest = (record["retest"] or {}).get("settings", [])
+    return [
+        ("Trials", f"{len(trials.ended):,} of {record['n_trials']:,}"),
+        *((name[0].upper() + name[1:], f"{count:,}") for name, count in sorted(kinds.items())),
+        ("Runs", f"{trials.n_runs:,} of at most {whole:,}"),
+        ("Runs saved by ending trials early", saved),
+        ("Processor time of all runs", _duration(trials.seconds)),
+        ("From the first trial to the end of the last", _duration(trials.wall_seconds)),
+        ("Runs of the re-test", f"{sum(each['n_runs'] for each in retest):,}"),
+    ]
+
+
+def _duration(seconds: float | None) -> str:
+    if seconds is None:
+        return LEFT_OUT
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    minutes, hours = seconds / 60, seconds / 3600
+    return f"{minutes:.0f} min" if minutes < 90 else f"{hours:.1f} h"
+
+
+def rows(trials: Trials) -> list[dict[str, Any]]:
+    """All trials, the best first, then those that have not all their seeds."""
+    ranked = [*trials.best_first]
+    rest = [trial for trial in trials.ended if trial not in ranked]
+    return [
+        {
+            "number": trial["number"],
+            "kind": kind(trial),
+            "is_whole": kind(trial) == COMPLETE,
+            "value": trial["value"] if trial["figures"] else None,
+            "n_seeds": len(trial["figures"]),
+            "seconds": trial["seconds"],
+            "failure": trial["failure"] or "",
+            "params": ", ".join(
+                f"{name} {_param(value)}" for name, value in trial["params"].items()
+            ),
+        }
+        for trial in [*ranked, *rest]
+    ]
+
+
+def _param(value: Any) -> str:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    return number(value) if is_number else setting(value)
+
+
+# The page of a tuning as one file, in the frame of a study's page.
+
+_SCRIPT = Path(__file__).resolve().parent / "templates" / "tuning" / "tuning.js"
+
+
+class Part(NamedTuple):
+    """A section of the page: its anchor and its heading."""
+
+    name: str
+    title: str
+
+
+def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = "") -> None:
+    """Write the page of a tuning, one file that needs nothing else and no network.
+
+    Args:
+        record: what the tuning wrote down, see `tuning.retesting`.
+        path: the file, which is replaced.
+        retest_page: the page of the re-test as seen from there; empty where there is none.
+    """
+    trials = trials_of(record)
+    shares = importances(trials)
+    parts = [Part("verdict", "What was found"), Part("history", "History")]
+    if trials.judged and record["asked"]:
+        parts.append(Part("parallel", "Settings tried"))
+    if shares:
+        parts.append(Part("importances", "What matters"))
+    parts += [Part("cost", "Cost"), Part("trials", "All trials")]
+    write_text(path, _render(trials, parts, shares, retest_page))
+
+
+def _render(
+    trials: Trials, parts: list[Part], shares: Mapping[str, float], retest_page: str
+) -> str:
+    record = trials.record
+    asked = record["asked"] or {}
+    environment = templates()
+    environment.loader = ChoiceLoader(
+        [PackageLoader("report.page", "templates/tuning"), PackageLoader("report.page")]
+    )
+    retest = record["retest"]
+    again = retest["settings"] if retest else []
+    winner = next((each for each in again if each["label"] == retest["winner"]), None)
+    data: dict[str, Any] = {
+        "page": {"agents": [], "environments": []},
+        "history": history(trials),
+        "parallel": {**parallel(trials, shares), "winner": winner and winner["number"]},
+        "importances": {"names": [*shares], "shares": [*shares.values()]},
+    }
+    shared = [template_file(name) or "" for name in SHARED]
+    own = [_SCRIPT.read_text(encoding="utf-8"), template_file("paper.js") or ""]
+    return environment.get_template("tuning.html").render(
+        title=f"{asked.get('algo', 'an agent')} on {asked.get('env', 'an environment')}",
+        record=record,
+        asked=asked,
+        sections=parts,
+        retest=retest,
+        retest_page=retest_page,
+        winner=winner,
+        changes=[] if winner is None else changes(trials, winner["number"]),
+        n_params=len(trials.distributions()),
+        cost=cost(trials),
+        rows=rows(trials),
+        shares=shares,
+        data={name: packed(as_json(item)) for name, item in data.items()},
+        **frame("\n".join([*shared, *own])),
+    )

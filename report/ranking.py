@@ -1,0 +1,275 @@
+"""The columns of the ranking, for the terminal and for the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Generic, Literal, TypeVar
+
+import numpy as np
+
+from experiments.analysis import AgentAnalysis, EnvironmentAnalysis
+from experiments.bandits import QUANTILES, PullStatistics
+from experiments.study import COSTS, StudySpec
+from report.words import interval, interval_alone, number
+from verdicts import Estimate, ThresholdSummary
+
+# Figures as cells of the ranking: what stands there, and what it is sorted by.
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell.
+
+    Attributes:
+        text: the figure.
+        value: what it is sorted by; None puts it last.
+        note: what the page has below it in small print.
+        in_line: what the terminal has in place of the text, where it has something else.
+        aside: what the page says where the pointer rests on it.
+        bar: low end, point and high end, each between 0 and 1, of a bar to draw; or None.
+    """
+
+    text: str
+    value: float | None
+    note: str = ""
+    in_line: str = ""
+    aside: str = ""
+    bar: tuple[float, float, float] | None = None
+
+
+def bar(score: Estimate) -> tuple[float, float, float]:
+    """Low end, point and high end of a score, cut to what lies between 0 and 1."""
+    low, high = (score.low, score.high) if score.has_interval else (score.point, score.point)
+    return (_share(low), _share(score.point), _share(high))
+
+
+def _share(value: float) -> float:
+    return 0.0 if math.isnan(value) else round(min(max(value, 0.0), 1.0), 4)
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def estimate_cell(estimate: Estimate) -> Cell:
+    """A figure with its interval."""
+    return Cell(
+        number(estimate.point),
+        _known(estimate.point),
+        interval_alone(estimate),
+        interval(estimate),
+    )
+
+
+def threshold_cell(stays: ThresholdSummary | None) -> Cell | None:
+    """From when on the median run stays at the threshold, and how many runs do."""
+    if stays is None:
+        return None
+    median, share = stays.median.point, stays.share_reached.point
+    note = "" if math.isnan(share) else f"{share:.0%} of runs"
+    return Cell(number(median), _known(median), note)
+
+
+def crossing(first: ThresholdSummary | None) -> str:
+    """When a curve that may have fallen again was at the threshold for the first time."""
+    if first is None or math.isnan(first.median.point):
+        return ""
+    share = f"{first.share_reached.point:.0%} of runs are there at some evaluation"
+    return f"{share}, the median run first at step {number(first.median.point)}"
+
+
+def number_cell(value: float) -> Cell:
+    """A figure without an interval."""
+    return Cell(number(value), _known(value))
+
+
+# What the ranking says of an agent: one list of columns, for the terminal and for the page.
+#
+# A new statistic is one more entry of `COLUMNS`.
+
+Order = Literal["ascending", "descending"]
+
+
+@dataclass(frozen=True)
+class Row:
+    """What a row of the ranking is about: an agent on an environment."""
+
+    agent: AgentAnalysis
+    environment: EnvironmentAnalysis
+
+
+@dataclass(frozen=True)
+class BanditRow(Row):
+    """An agent on a bandit, with its figures by pull."""
+
+    pulls: PullStatistics
+
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Column(Generic[AnyRow]):
+    """One column. A heading that is empty leaves it out there.
+
+    Attributes:
+        cell: what it says on an agent; None where it does not apply.
+        page: its heading on the page.
+        help: what stands below that heading; ``{threshold}`` is the environment's.
+        terminal: its heading in the terminal.
+        caption: what the terminal explains below the table, likewise; ``{variants}`` explains the
+            mark of agents that were trained on a variant of the environment.
+        best_first: the order that puts the best first; None for that of the study's metric.
+    """
+
+    cell: Callable[[AnyRow], Cell | None]
+    page: str = ""
+    help: str = ""
+    terminal: str = ""
+    caption: str = ""
+    best_first: Order | None = None
+
+    def order(self, study: StudySpec) -> Order:
+        """The order that puts the best first in a study."""
+        return self.best_first or ("ascending" if study.metric in COSTS else "descending")
+
+
+def filled(
+    columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]
+) -> list[tuple[Column[AnyRow], list[Cell]]]:
+    """The columns that apply to some row, each with a cell for every row."""
+    found = [(column, [column.cell(row) for row in rows]) for column in columns]
+    return [
+        (column, [cell or Cell("-", None) for cell in cells])
+        for column, cells in found
+        if any(cell is not None for cell in cells)
+    ]
+
+
+def _score(row: Row) -> Cell | None:
+    if row.agent.score is None:
+        return None
+    mean = row.agent.score.mean
+    return replace(estimate_cell(mean), bar=None if math.isnan(mean.point) else bar(mean))
+
+
+def _gap(row: Row) -> Cell | None:
+    optimum, final = row.environment.optimum, row.agent.final
+    if optimum is None:
+        return None
+    at_least = row.environment.optimum_at_least
+    # Of a bracket the gap's interval goes from the lower end to the upper one.
+    low, high = (optimum if at_least is None else at_least) - final.high, optimum - final.low
+    return estimate_cell(replace(final, point=optimum - final.point, low=low, high=high))
+
+
+def _success(row: Row) -> Cell | None:
+    rate = row.agent.success_rate
+    if rate is None:
+        return None
+    if math.isnan(rate.point):
+        return Cell("-", None)
+    note = f"{rate.low:.0%} to {rate.high:.0%}" if interval_alone(rate) else ""
+    return Cell(f"{rate.point:.1%}", rate.point, note)
+
+
+def _solved(row: Row) -> Cell | None:
+    summary = row.agent.steps_to_stay
+    if summary is None:
+        return None
+    share = summary.share_reached.point
+    return Cell("-", None) if math.isnan(share) else Cell(f"{share:.0%}", share)
+
+
+def _stays_from(row: Row) -> Cell | None:
+    cell = threshold_cell(row.agent.steps_to_stay)
+    return None if cell is None else replace(cell, aside=crossing(row.agent.steps_to_threshold))
+
+
+def _seconds(row: Row) -> Cell | None:
+    seconds = row.agent.seconds
+    if math.isnan(seconds.point):
+        return None
+    return replace(estimate_cell(seconds), in_line=f"{number(seconds.point)} s")
+
+
+def _training(row: Row) -> Cell:
+    cell = estimate_cell(row.agent.last_episodes)
+    return replace(cell, in_line=f"{cell.in_line} *") if row.agent.on_variant else cell
+
+
+def _runs(row: Row) -> Cell:
+    missing = f"{row.agent.n_missing} missing" if row.agent.n_missing else ""
+    return Cell(f"{row.agent.n_runs}", row.agent.n_runs, missing)
+
+
+def _spread(row: BanditRow) -> Cell:
+    low, *_, high = np.quantile(row.pulls.total_regret, QUANTILES)
+    return Cell(f"{number(low)} to {number(high)}", float(high))
+
+
+COLUMNS: tuple[Column[Row], ...] = (
+    Column(
+        page="Mean",
+        help="over seeds",
+        terminal="mean",
+        cell=lambda row: estimate_cell(row.agent.metric.mean),
+    ),
+    Column(
+        page="IQM",
+        help="middle half",
+        terminal="IQM",
+        cell=lambda row: estimate_cell(row.agent.metric.iqm),
+    ),
+    Column(
+        page="Median", help="over seeds", cell=lambda row: estimate_cell(row.agent.metric.median)
+    ),
+    Column(
+        page="Score", help="1 is optimal", terminal="score", best_first="descending", cell=_score
+    ),
+    Column(page="Gap", help="to the optimum", best_first="ascending", cell=_gap),
+    Column(
+        terminal="training",
+        caption="return of the last 100 training episodes{variants}",
+        cell=_training,
+    ),
+    Column(page="Success", help="in the end", best_first="descending", cell=_success),
+    Column(
+        page="Stays from",
+        help="step, at {threshold}",
+        terminal="stays from",
+        caption="step from which on the median run stays at a return of {threshold}",
+        best_first="ascending",
+        cell=_stays_from,
+    ),
+    Column(
+        page="Episodes",
+        help="to stay at {threshold}",
+        best_first="ascending",
+        cell=lambda row: threshold_cell(row.agent.episodes_to_stay),
+    ),
+    Column(terminal="solved", best_first="descending", cell=_solved),
+    Column(
+        page="CPU time",
+        help="seconds of training",
+        terminal="CPU time",
+        best_first="ascending",
+        cell=_seconds,
+    ),
+    Column(page="Runs", help="finished", best_first="descending", cell=_runs),
+)
+
+# In the terminal, bandits have a table of their own; on the page, a section.
+BANDIT_COLUMNS: tuple[Column[BanditRow], ...] = (
+    Column(terminal="mean regret", cell=lambda row: estimate_cell(row.agent.regret)),
+    Column(terminal=f"{QUANTILES[0]:.0%} to {QUANTILES[-1]:.0%} of runs", cell=_spread),
+    Column(terminal="simple regret", cell=lambda row: number_cell(row.pulls.simple_regret[-1])),
+    Column(terminal="reward", cell=lambda row: number_cell(row.pulls.reward[-1])),
+    Column(
+        terminal="best arm",
+        cell=lambda row: Cell(f"{row.pulls.optimal[-1]:.1%}", float(row.pulls.optimal[-1])),
+    ),
+    Column(terminal="CPU time", cell=_seconds),
+)

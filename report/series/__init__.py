@@ -1,1 +1,0 @@
-"""The numbers that figures show, computed once for those on paper and those on the page."""

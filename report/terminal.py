@@ -1,0 +1,346 @@
+"""A study in the terminal."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeVar
+
+import pandas as pd
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+
+from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
+from experiments.off_policy.estimators import difference_in_value, mean_reward
+from experiments.off_policy.logged_policies import (
+    Comparison,
+    Judged,
+)
+from experiments.plan import tuning_seeds
+from experiments.study import METRIC_WORDS, StudySpec
+from report.conclusions import conclusion, seeds_of
+from report.ranking import BANDIT_COLUMNS, COLUMNS, BanditRow, Cell, Column, Row, filled
+from report.words import enumeration, number, optimum_words, seed_sentence
+from verdicts import Estimate, Verdict
+
+# All verdicts on an environment at a glance: a row and a column for each agent.
+
+SIGNS: dict[Verdict, str] = {"better": ">", "worse": "<", "equivalent": "=", "undecided": "?"}
+PHRASES: dict[Verdict, str] = {
+    "better": "is better than",
+    "worse": "is worse than",
+    "equivalent": "is equivalent to",
+    "undecided": "is undecided against",
+}
+LEGEND = "> better than the agent of the column, < worse, = equivalent, ? undecided"
+
+
+def verdict_matrix(environment: EnvironmentAnalysis) -> list[list[Verdict | None]]:
+    """By row and column, the verdict on the row's agent against the column's; None on itself."""
+    verdicts: dict[tuple[str, str], Verdict] = {}
+    for pair in environment.pairs:
+        for seen in (pair, pair.swapped()):
+            verdicts[seen.first, seen.second] = seen.verdict
+    names = [agent.agent for agent in environment.agents]
+    return [[verdicts.get((row, column)) for column in names] for row in names]
+
+
+def says_more(environment: EnvironmentAnalysis) -> bool:
+    """Whether there is more to be seen than a sentence says: three agents or more, and verdicts."""
+    decided = [pair for pair in environment.pairs if pair.verdict != "undecided"]
+    return len(environment.agents) > 2 and bool(decided)
+
+
+# A study in the terminal.
+
+MOST_AGENT_WIDTH = 20
+UNBOUNDED = 10_000  # columns
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+# Where a table is wider than the terminal it goes without these, in this order; the page has all.
+FIRST_LEFT_OUT = (
+    *("training", "IQM", "solved", "stays from"),
+    *("simple regret", "reward", "CPU time", "score", "best arm"),
+)
+
+
+def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
+    """Print a table for each environment and what it says in words, then what seeds these are."""
+    for environment in analysis.environments:
+        console.print()
+        _print_ranking(console, analysis, environment)
+        _print_conclusion(console, analysis.study, environment)
+    console.print()
+    origin = seed_sentence(analysis.study.seeds, tuning_seeds(analysis.study))
+    console.print(origin, highlight=False)
+
+
+def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
+    """The verdict in a line, the pairs as a matrix where they are many, and what else there is."""
+    said = conclusion(study, environment)
+
+    def say(text: str) -> None:
+        console.print(text, highlight=False)
+
+    say(said.lead)
+    if says_more(environment):
+        console.print(_matrix(environment))
+        say(LEGEND)
+        if said.failed:
+            say(said.failed)
+    elif len(environment.agents) == 2:
+        for sentence in said.pairs:
+            say(sentence)
+    for sentence in said.notes:
+        say(sentence)
+
+
+def _matrix(environment: EnvironmentAnalysis) -> Table:
+    names = [agent.agent for agent in environment.agents]
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    table.add_column("")
+    table.add_column("", overflow="fold", max_width=MOST_AGENT_WIDTH)
+    numbers = [str(place) for place in range(1, len(names) + 1)]
+    for place in numbers:
+        table.add_column(place, justify="right", no_wrap=True)
+    for place, name, row in zip(numbers, names, verdict_matrix(environment), strict=True):
+        signs = ["·" if verdict is None else SIGNS[verdict] for verdict in row]
+        table.add_row(place, name, *signs)
+    return table
+
+
+def _print_ranking(
+    console: Console, analysis: StudyAnalysis, environment: EnvironmentAnalysis
+) -> None:
+    pulls, label = analysis.results.pulls, environment.environment
+    on_bandit = [
+        BanditRow(agent, environment, pulls[agent.agent, label])
+        for agent in environment.agents
+        if (agent.agent, label) in pulls
+    ]
+    if on_bandit:
+        left_out = _print_fitting(console, label, BANDIT_COLUMNS, on_bandit)
+        explained = _bandit_caption(analysis.study, left_out)
+    else:
+        rows = [Row(agent, environment) for agent in environment.agents]
+        columns = [column for column in COLUMNS if column.terminal]
+        left_out = _print_fitting(console, _title(environment), columns, rows)
+        explained = _caption(analysis.study, environment, left_out)
+    if left_out:
+        explained.append(f"a wider terminal shows {enumeration(left_out)} too")
+    # As wide as the terminal, and not as the table, which may be narrow.
+    console.print("; ".join(explained), style="italic dim", highlight=False)
+
+
+def _print_fitting(
+    console: Console, title: str, columns: Sequence[Column[AnyRow]], rows: Sequence[AnyRow]
+) -> list[str]:
+    """Print a table with as many columns as there is room for; the headings of the others."""
+    shown = filled(columns, rows)
+    left_out: list[str] = []
+    table = _table(title, shown, rows)
+    for heading in FIRST_LEFT_OUT:
+        if _width(console, table) <= console.width:
+            break
+        if heading in [column.terminal for column, _ in shown]:
+            shown = [(column, cells) for column, cells in shown if column.terminal != heading]
+            left_out.append(heading)
+            table = _table(title, shown, rows)
+    console.print(table)
+    return left_out
+
+
+def _table(
+    title: str, shown: Sequence[tuple[Column[AnyRow], list[Cell]]], rows: Sequence[AnyRow]
+) -> Table:
+    table = Table(title=title, title_justify="left")
+    names = [row.agent.marked for row in rows]
+    # Longer names go over several lines.
+    width = min(max(map(len, names)), MOST_AGENT_WIDTH)
+    table.add_column("agent", overflow="fold", min_width=width, max_width=MOST_AGENT_WIDTH)
+    for column, _ in shown:
+        table.add_column(column.terminal, justify="right")
+    for place, name in enumerate(names):
+        cells = [cells[place] for _, cells in shown]
+        table.add_row(name, *(cell.in_line or cell.text for cell in cells))
+    return table
+
+
+def _title(environment: EnvironmentAnalysis) -> str:
+    title = environment.environment
+    if environment.optimum is not None:
+        title += f": optimum {optimum_words(environment.optimum, environment.optimum_at_least)}"
+        title += f", best random or constant policy {number(environment.baseline)}"
+    return title
+
+
+def _caption(
+    study: StudySpec, environment: EnvironmentAnalysis, left_out: Sequence[str]
+) -> list[str]:
+    n_seeds = seeds_of(study, environment)
+    metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals over {n_seeds}"
+    rows = [Row(agent, environment) for agent in environment.agents]
+    explained = [
+        column
+        for column in COLUMNS
+        if column.terminal and column.caption and column.terminal not in left_out
+    ]
+    on_variant = any(agent.on_variant for agent in environment.agents)
+    words = {
+        "threshold": number(environment.threshold),
+        "variants": " (*: on a variant of the environment)" if on_variant else "",
+    }
+    means = ", ".join(name for name in ("mean", "IQM") if name not in left_out)
+    return [
+        f"{means}: {metric}",
+        *(
+            f"{column.terminal}: {column.caption.format(**words)}"
+            for column, _ in filled(explained, rows)
+        ),
+    ]
+
+
+def _bandit_caption(study: StudySpec, left_out: Sequence[str]) -> list[str]:
+    explained = [
+        f"regret: sum over the pulls of a run, with 95 % intervals over {study.n_seeds} runs"
+    ]
+    if "simple regret" not in left_out:
+        explained.append("simple regret: of recommending the arm pulled most")
+    last = [name for name in ("reward", "best arm") if name not in left_out]
+    return [*explained, f"{', '.join(last)}: at the last pulls"] if last else explained
+
+
+def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> None:
+    """Print the table of `episodes_table`, agents side by side, as many as there is room for."""
+    for environment, rows in table.groupby("environment", sort=False):
+        title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
+        left = list(dict.fromkeys(rows["agent"]))
+        while left:
+            shown = len(left)
+            while shown > 1 and _width(console, _episodes(title, rows, left[:shown])) > (
+                console.width
+            ):
+                shown -= 1
+            console.print()
+            console.print(_episodes(title, rows, left[:shown]))
+            left = left[shown:]
+
+
+def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
+    printed = Table(title=title, title_justify="left")
+    printed.add_column("episode", justify="right")
+    for agent in agents:
+        printed.add_column(str(agent), justify="right", overflow="fold")
+    by_episode = rows.set_index(["episode", "agent"])
+    for episode in sorted(set(rows["episode"])):
+        cells = []
+        for agent in agents:
+            if (episode, agent) not in by_episode.index:
+                cells.append("-")
+                continue
+            row = by_episode.loc[(episode, agent)]
+            cells.append("  ".join(number(row[c]) for c in ("average", "minimum", "maximum")))
+        printed.add_row(f"{episode:,}", *cells)
+    return printed
+
+
+def _width(console: Console, table: Table) -> int:
+    return Measurement.get(console, console.options.update(width=UNBOUNDED), table).maximum
+
+
+# ``compare.py --logged``: policies on a log as a table, and what it says in words.
+
+# Where an estimate rests on fewer pulls, its interval is hardly one.
+FEW_PULLS = 100
+SHORT, MOST_DECIMALS = 3, 6
+
+
+def print_comparison(console: Console, comparison: Comparison) -> None:
+    """Print the table, what it says in sentences, and the notes."""
+    console.print(_off_policy_table(comparison))
+    for sentence in [*sentences(comparison), *comparison.notes]:
+        console.print(f"  {sentence}")
+
+
+def _off_policy_table(comparison: Comparison) -> Table:
+    data = comparison.data
+    table = Table(
+        title=f"{data.source}: {len(data):,} pulls, {data.n_arms} arms",
+        caption="mean reward a pull, ± half the 95 % interval; effective: pulls of its own that "
+        "the log is worth; differences below: 95 % intervals that hold together",
+        title_justify="left",
+        caption_justify="left",
+    )
+    table.add_column("policy", overflow="fold", min_width=12)
+    for heading in ("IPS", "self-normalised", "direct", "doubly robust", "effective"):
+        table.add_column(heading, justify="right")
+    for row in comparison.rows:
+        terms = row.terms
+        columns = (terms.ips, terms.snips, terms.direct, terms.doubly_robust)
+        cells = [shown(mean_reward(column)) for column in columns]
+        table.add_row(row.name, *cells, f"{terms.effective:,.0f}")
+    return table
+
+
+def sentences(comparison: Comparison) -> list[str]:
+    """Doubly robust: each policy asked about against the best alternative, and among themselves.
+
+    Which alternative and which policy is best the same log has said. So the intervals are such as
+    hold together for all pairs that could have been picked.
+    """
+    given = [row for row in comparison.rows if row.is_given]
+    alternatives = [row for row in comparison.rows if not row.is_given]
+    alternative, leader = max(alternatives, key=_value), max(given, key=_value)
+    n_pairs = len(given) * len(alternatives) + math.comb(len(given), 2)
+    pairs = [(row, alternative) for row in given]
+    pairs += [(leader, row) for row in given if row is not leader]
+    result = [_difference(*pair, n_pairs) for pair in pairs]
+    result += [
+        f"{row.name} rests on {row.terms.effective:.0f} effective pulls: too few to rely on its "
+        "intervals"
+        for row in given
+        if row.terms.effective < FEW_PULLS
+    ]
+    return result
+
+
+def _difference(first: Judged, second: Judged, n_pairs: int) -> str:
+    difference = difference_in_value(first.terms, second.terms, n_pairs)
+    if difference.low == difference.high == 0:
+        return f"{first.name} and {second.name} do the same on this log"
+    decimals = _decimals(difference)
+    point, low, high = (
+        f"{value:+.{decimals}f}" for value in (difference.point, difference.low, difference.high)
+    )
+    return (
+        f"{first.name} against {second.name}: {point} [{low}, {high}] a pull, {verdict(difference)}"
+    )
+
+
+def verdict(difference: Estimate) -> str:
+    """What the interval of a difference says."""
+    if difference.low > 0:
+        return "better"
+    return "worse" if difference.high < 0 else "undecided"
+
+
+def shown(estimate: Estimate) -> str:
+    """A figure and half its interval, which is symmetric."""
+    decimals = _decimals(estimate)
+    half = (estimate.high - estimate.low) / 2
+    return f"{estimate.point:.{decimals}f} ± {half:.{decimals}f}"
+
+
+def _decimals(estimate: Estimate) -> int:
+    """As many as give half the interval two significant digits."""
+    half = (estimate.high - estimate.low) / 2
+    if not half > 0:
+        return SHORT
+    return min(max(1 - math.floor(math.log10(half)), 0), MOST_DECIMALS)
+
+
+def _value(row: Judged) -> float:
+    return float(row.terms.doubly_robust.mean())

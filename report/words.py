@@ -1,0 +1,166 @@
+"""Figures as a reader wants them, and sentences on seeds and looks."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import pairwise
+
+from experiments.looks import Look, Looks
+from experiments.plan import Seeds, TuningSeeds
+from verdicts import Estimate
+
+# Figures as a reader wants them, and words in a row.
+
+SIGNIFICANT = 4  # digits
+
+_ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
+
+
+def number(value: float | None) -> str:
+    """A figure with four significant digits, or a dash where there is none."""
+    if value is None or math.isnan(value):
+        return "-"
+    if math.isinf(value):
+        return "never" if value > 0 else "-∞"
+    if value == 0 or abs(value) >= 10 ** (SIGNIFICANT - 1):
+        return f"{value:,.0f}"
+    digits = SIGNIFICANT - 1 - math.floor(math.log10(abs(value)))
+    text = f"{value:.{min(max(digits, 0), SIGNIFICANT)}f}".rstrip("0").rstrip(".")
+    return "0" if text == "-0" else text
+
+
+def interval(estimate: Estimate) -> str:
+    """A figure with its interval in brackets, where it has one."""
+    if math.isnan(estimate.low) or estimate.low == estimate.high:
+        return number(estimate.point)
+    return f"{number(estimate.point)} [{number(estimate.low)}, {number(estimate.high)}]"
+
+
+def interval_alone(estimate: Estimate) -> str:
+    """The interval of a figure, empty where it has none."""
+    if math.isnan(estimate.low) or estimate.low == estimate.high:
+        return ""
+    return f"{number(estimate.low)} to {number(estimate.high)}"
+
+
+def optimum_words(optimum: float | None, at_least: float | None) -> str:
+    """The optimum; where it is bracketed, its ends with as many digits as tell them apart."""
+    if at_least is None or optimum is None:
+        return number(optimum)
+    ends = [number(at_least), number(optimum)]
+    if ends[0] == ends[1]:
+        ends = [f"{at_least:,.3f}", f"{optimum:,.3f}"]
+    return f"{ends[0]} to {ends[1]} (bracketed)"
+
+
+def enumeration(words: Sequence[str]) -> str:
+    """Words joined by commas, the last by "and"."""
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 2 else words)
+
+
+def seeds(*counts: int) -> str:
+    """So many seeds, or from so many to so many."""
+    least, most = min(counts), max(counts)
+    return f"{'' if least == most else f'{least:,} to '}{most:,} seed{'s' if most != 1 else ''}"
+
+
+def ordinal(n: int) -> str:
+    """Which of several, in a word where there is a short one."""
+    if n <= len(_ORDINALS):
+        return _ORDINALS[n - 1]
+    ending = "th" if 10 < n % 100 < 20 else {1: "st", 2: "nd", 3: "rd"}.get(n % 10, "th")
+    return f"{n:,}{ending}"
+
+
+# On which seeds the settings of a study were tuned, in one line.
+
+MOST_NAMES = 6
+
+
+def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
+    """Say which of the seeds that agents are judged on their settings were tuned on.
+
+    Args:
+        seeds: of the study.
+        tuning: what is known of its settings.
+    """
+    parts = [
+        *_tuned(seeds, tuning.shipped, "the shipped settings of"),
+        *_tuned(seeds, tuning.files, "the settings in"),
+    ]
+    these = "these" if len(seeds) > 1 else "it"
+    if tuning.elsewhere:
+        names = _names(tuning.elsewhere)
+        parts.append(f"the settings of {names} were tuned with other arguments of the environment")
+    if not parts and not tuning.unknown:
+        parts = [f"nothing was tuned on {these}"]
+    elif not parts and (tuning.shipped or tuning.files):
+        parts = [f"nothing is known to have been tuned on {these}"]
+    if tuning.unknown:
+        names = _names(tuning.unknown)
+        parts.append(f"what the study's own settings of {names} were tuned on is not known")
+    return f"{'Seeds' if len(seeds) > 1 else 'Seed'} {spans(seeds)}: {'; '.join(parts)}."
+
+
+def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str) -> list[str]:
+    """Those that were tuned on the same of the seeds in one clause."""
+    groups: dict[Seeds, list[str]] = {}
+    for name, shared in found.items():
+        if shared:
+            groups.setdefault(shared, []).append(name)
+    return [
+        f"{whose} {_names(names)} were tuned on {_which(seeds, shared)}"
+        for shared, names in groups.items()
+    ]
+
+
+def _which(seeds: range, shared: Seeds) -> str:
+    if len(shared) == len(seeds):
+        return "these" if len(seeds) > 1 else "it"
+    return f"{spans(shared)} of these"
+
+
+def _names(names: Sequence[str]) -> str:
+    more = len(names) - MOST_NAMES
+    return enumeration([*names[:MOST_NAMES], f"{more:,} more"] if more > 0 else names)
+
+
+def spans(numbers: Iterable[int]) -> str:
+    """Whole numbers, those that follow each other as a span: "0 to 4, 7"."""
+    ordered = sorted(numbers)
+    ends = [one for one, two in pairwise(ordered) if two != one + 1] + ordered[-1:]
+    starts = ordered[:1] + [two for one, two in pairwise(ordered) if two != one + 1]
+    pairs = zip(starts, ends, strict=True)
+    return ", ".join(f"{low} to {high}" if low != high else str(low) for low, high in pairs)
+
+
+# How often the runs on an environment have been looked at, and with which seeds.
+
+
+def look_sentences(looks: Looks) -> list[str]:
+    """Say how many looks there were, and then of each its date, its seeds and its level."""
+    if not looks.taken:
+        return []
+    n = len(looks.taken)
+    times = {1: "once", 2: "twice"}.get(n, f"{n:,} times")
+    told = [f"These runs have been looked at {times}."]
+    if looks.design is not None:
+        sizes = [f"{size:,}" for size in looks.design.sizes]
+        told.append(f"Fixed before the first of them: looks at {enumeration(sizes)} seeds.")
+    return [*told, *map(_on, looks.taken)]
+
+
+def _on(look: Look) -> str:
+    level = f"{100 * look.level:.2g} %"
+    return f"{look.date[:10]}: {'; '.join(_seeds(look))}; claims at {level}."
+
+
+def _seeds(look: Look) -> Iterable[str]:
+    """Agents with the same seeds in one clause, without their names where all have them."""
+    first = look.question.first_seed
+    for count in sorted({*look.seeds.values()}):
+        seeds = range(first, first + count)
+        names = [name for name, n in look.seeds.items() if n == count]
+        whose = f"{enumeration(names)}, " if len(names) < len(look.seeds) else ""
+        yield f"{whose}seed{'s' if count != 1 else ''} {spans(seeds)}"

@@ -1,0 +1,321 @@
+"""Scores, their means and medians, and intervals by resampling seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import stats
+
+# Names for the kinds of arrays that judgements take and return.
+
+Floats = NDArray[np.float64]
+
+# How often something was drawn.
+Counts = NDArray[np.int64]
+
+
+# Resampling of seeds, within each environment apart from the others.
+#
+# A resample is kept as how often it drew each seed. Sums over resamples are then matrix products,
+# and
+# sorting is done once and not once per resample.
+
+# The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would vary too much.
+N_RESAMPLES = 10_000
+# Those over many seeds lie further in, and need fewer.
+ENOUGH_RESAMPLES = 1_000
+_MOST_DRAWS = 2_000_000
+
+
+def as_columns(scores: ArrayLike) -> Floats:
+    """Scores as a table with one environment per column.
+
+    Args:
+        scores: shape (n_seeds,) or (n_seeds, n_envs).
+
+    Raises:
+        ValueError: for another shape, or where there is nothing.
+    """
+    table = np.asarray(scores, dtype=np.float64)
+    if table.ndim not in {1, 2} or table.size == 0:
+        raise ValueError(
+            f"scores have shape {table.shape}, they must have (n_seeds,) or (n_seeds, n_envs)"
+        )
+    return table[:, None] if table.ndim == 1 else table
+
+
+def check_confidence(confidence: float) -> None:
+    """Refuse a confidence that is no share, as 95 would be.
+
+    Raises:
+        ValueError: unless it lies strictly between 0 and 1.
+    """
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence is {confidence}, it must lie between 0 and 1, as 0.95 does")
+
+
+def resample_counts(n: int, n_resamples: int, rng: np.random.Generator) -> Counts:
+    """How often each of ``n`` seeds occurs in each resample, shape (n_resamples, n)."""
+    drawn = rng.integers(n, size=(n_resamples, n)) + n * np.arange(n_resamples)[:, None]
+    return np.bincount(drawn.ravel(), minlength=n_resamples * n).reshape(n_resamples, n)
+
+
+def enough_resamples(n_resamples: int, n_seeds: int) -> int:
+    """So many resamples as are asked for, or fewer where there are many seeds to draw."""
+    return min(n_resamples, max(ENOUGH_RESAMPLES, _MOST_DRAWS // n_seeds))
+
+
+def interval_tail(strata: Sequence[Floats], confidence: float) -> float:
+    """The share of resamples that an interval leaves out on each side.
+
+    Percentiles of the bootstrap distribution are too narrow for few seeds: it uses the variance
+    with n in the denominator instead of n - 1, and the normal instead of the t distribution. The
+    share is widened for both, so that the interval for a mean is about as long as the t interval;
+    over several environments, with the degrees of freedom of Welch and Satterthwaite.
+
+    Args:
+        strata: the values of each environment that the statistic varies with, one per seed.
+        confidence: of the interval.
+
+    Returns:
+        The share; NaN where an environment has fewer than two seeds, so that there is no interval.
+
+    Source: Hesterberg (2015), "What teachers should know about the bootstrap", The American
+    Statistician 69(4), the expanded percentile interval.
+    """
+    check_confidence(confidence)
+    sizes = np.array([len(values) for values in strata])
+    if sizes.min() < 2:
+        return float("nan")
+    tail = (1 - confidence) / 2
+    variances = np.array([values.var(ddof=1) for values in strata]) / sizes
+    if not variances.any():
+        return tail
+    variances /= variances.max()
+    degrees = variances.sum() ** 2 / (variances**2 / (sizes - 1)).sum()
+    widening = np.sqrt(variances.sum() / (variances * (sizes - 1) / sizes).sum())
+    return float(stats.norm.sf(widening * stats.t.isf(tail, degrees)))
+
+
+def percentile_interval(resampled: Floats, tail: float) -> tuple[Floats, Floats]:
+    """The quantiles ``tail`` and 1 - ``tail`` over the first axis, NaN where ``tail`` is."""
+    if np.isnan(tail):
+        nothing = np.full(resampled.shape[1:], np.nan)
+        return nothing, nothing
+    low, high = np.quantile(resampled, [tail, 1 - tail], axis=0)
+    return low, high
+
+
+# Mean, median and interquartile mean of scores, with their intervals over seeds.
+
+Statistic = Literal["mean", "median", "iqm"]
+
+# How many of n sorted values each statistic leaves out at each end, before it takes the mean.
+_CUTS: dict[Statistic, Callable[[int], int]] = {
+    "mean": lambda n: 0,
+    "median": lambda n: (n - 1) // 2,
+    "iqm": lambda n: n // 4,
+}
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A figure and how sure it is.
+
+    Attributes:
+        point: the figure; NaN where there is nothing to compute it from.
+        low, high: the ends of its interval; both NaN where there is none, as with a single seed.
+        n: the number of values that it is computed from.
+        n_missing: the number of values left out, from runs that failed.
+    """
+
+    point: float
+    low: float
+    high: float
+    n: int
+    n_missing: int = 0
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether there were seeds enough for an interval."""
+        return not np.isnan(self.low)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Where the scores of an agent lie.
+
+    Attributes:
+        mean: what the next run is expected to score.
+        median: what half of the runs exceed.
+        iqm: the interquartile mean: the mean of the middle half of the runs.
+    """
+
+    mean: Estimate
+    median: Estimate
+    iqm: Estimate
+
+
+def summarise(
+    scores: ArrayLike, *, seed: int, confidence: float = 0.95, n_resamples: int = N_RESAMPLES
+) -> Summary:
+    """The three statistics of an agent's scores.
+
+    Over several environments the runs are pooled, each environment weighing the same, also where
+    runs of it are missing. Seeds are resampled within each environment by itself. The median is
+    therefore that of the runs, and not that of the environments' means.
+
+    Args:
+        scores: shape (n_seeds,), or (n_seeds, n_envs) on a scale that the environments share. What
+            is not finite counts as missing. Where an environment has no score at all the figures
+            are NaN: leave it out for every agent, or say what a failed run is worth.
+        seed: of the resampling.
+        confidence: of the intervals.
+        n_resamples: how many resamples they come from; fewer with hundreds of seeds.
+
+    Raises:
+        ValueError: for arguments out of range or of another shape.
+
+    Source: Agarwal et al. (2021), "Deep reinforcement learning at the edge of the statistical
+    precipice", NeurIPS. The intervals are widened for few seeds, see ``interval_tail``.
+    """
+    resampled = _resample(scores, seed, confidence, n_resamples)
+    return Summary(
+        resampled.estimate("mean"), resampled.estimate("median"), resampled.estimate("iqm")
+    )
+
+
+def estimate(
+    scores: ArrayLike,
+    statistic: Statistic,
+    *,
+    seed: int,
+    confidence: float = 0.95,
+    n_resamples: int = N_RESAMPLES,
+) -> Estimate:
+    """One of the statistics alone; all else as in ``summarise``."""
+    return _resample(scores, seed, confidence, n_resamples).estimate(statistic)
+
+
+@dataclass(frozen=True)
+class _Resampled:
+    """Pooled scores in order, and how much each resample weighs them.
+
+    Attributes:
+        values: ascending, shape (n,).
+        weights: cumulated over ``values``, shape (1 + n_resamples, n), the scores as they are
+            first. A row ends at n.
+        tail: what an interval leaves out on each side.
+        n_missing: scores left out.
+    """
+
+    values: Floats
+    weights: Floats
+    tail: float
+    n_missing: int
+
+    def estimate(self, statistic: Statistic) -> Estimate:
+        n = len(self.values)
+        if not self.weights.size:
+            return Estimate(np.nan, np.nan, np.nan, n, self.n_missing)
+        means = _trimmed_means(self.values, self.weights, _CUTS[statistic](n))
+        low, high = percentile_interval(means[1:], self.tail)
+        return Estimate(float(means[0]), float(low), float(high), n, self.n_missing)
+
+
+def _resample(scores: ArrayLike, seed: int, confidence: float, n_resamples: int) -> _Resampled:
+    columns = as_columns(scores)
+    strata = [column[np.isfinite(column)] for column in columns.T]
+    tail = interval_tail(strata, confidence)
+    values = np.concatenate(strata)
+    n_missing = columns.size - values.size
+    if any(len(stratum) == 0 for stratum in strata):
+        return _Resampled(values, np.empty((0, 0)), tail, n_missing)
+    n_resamples = enough_resamples(n_resamples, max(map(len, strata)))
+    if values.min() == values.max():
+        n_resamples = 1  # all are alike
+    sizes = tuple(map(len, strata))
+    counts = [
+        np.vstack([np.ones(n, dtype=np.int64), drawn]) * (len(values) / (len(strata) * n))
+        for n, drawn in zip(sizes, _drawn(sizes, n_resamples, seed), strict=True)
+    ]
+    order = np.argsort(values)
+    return _Resampled(values[order], np.hstack(counts)[:, order].cumsum(axis=1), tail, n_missing)
+
+
+# Agents of a study have as many seeds, and several figures each.
+@lru_cache(maxsize=1)
+def _drawn(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[Counts, ...]:
+    """Resamples of each stratum; nobody changes them."""
+    rng = np.random.default_rng(seed)
+    return tuple(resample_counts(n, n_resamples, rng) for n in sizes)
+
+
+def _trimmed_means(values: Floats, weights: Floats, cut: int) -> Floats:
+    """The mean of each resample's values without ``cut`` of them at either end.
+
+    Args:
+        values: ascending, shape (n,).
+        weights: cumulated over ``values``, shape (n_resamples, n).
+        cut: weight to leave out at each end.
+    """
+    n = len(values)
+    below = np.clip(weights[:, :-1], cut, n - cut)
+    # The weighted sum, by parts. Counting from the smallest value keeps equal values exact.
+    above_smallest = (n - cut) * (values[-1] - values[0]) - below @ np.diff(values)
+    return np.asarray(values[0] + above_smallest / (n - 2 * cut))
+
+
+# How low a mean can be, for sure: of bounded values, whatever their distribution.
+
+
+def least_mean(values: Floats, low: float, high: float, level: float) -> float:
+    """A number that is above the mean that values are drawn with in at most ``level`` of all cases.
+
+    It takes nothing for granted but that no value lies outside ``low`` and ``high``: not even that
+    what was never seen among so many is rare.
+
+    Args:
+        values: drawn independently, shape (n,) with n > 1.
+        low: the least that a value can be.
+        high: the greatest.
+        level: how often the bound may be too high.
+
+    Source: Maurer and Pontil (2009), "Empirical Bernstein bounds and sample variance penalization",
+    theorem 4.
+    """
+    n, doubt = len(values), math.log(2 / level)
+    by_spread = math.sqrt(2 * float(values.var(ddof=1)) * doubt / n)
+    by_range = 7 * (high - low) * doubt / (3 * (n - 1))
+    return float(np.mean(values)) - by_spread - by_range
+
+
+# Returns measured against the best possible and the best random or constant policy.
+#
+# The same scale as `pipeline.evaluation.sampled.Yardstick`, for arrays.
+
+
+def gap_to_optimum(returns: ArrayLike, optimum: float) -> Floats:
+    """How far returns stay behind the optimum, elementwise."""
+    return optimum - np.asarray(returns, dtype=np.float64)
+
+
+def optimum_score(returns: ArrayLike, optimum: float, baseline: float) -> Floats:
+    """Returns on a scale where 1 is the optimum and 0 the baseline, elementwise.
+
+    Args:
+        returns: expected returns, of any shape; NaN stays.
+        optimum: the highest expected return of any policy.
+        baseline: that of the best random or constant policy. Where no policy beats it,
+            a return scores 1 if it reaches the optimum, and else 0.
+    """
+    figures = np.asarray(returns, dtype=np.float64)
+    if optimum == baseline:
+        return np.where(np.isnan(figures), np.nan, figures >= optimum)
+    return (figures - baseline) / (optimum - baseline)
