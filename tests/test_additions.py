@@ -156,7 +156,7 @@ def test_an_index_of_a_bandit_is_one_file(train):
     assert lines_of(INDEX) <= 30
     record = train("moss", INDEX, "--env", "BernoulliBandit-v0", "--algo", "moss", "-n", "200")
     assert record["final"]["exact"]
-    assert record["regret"]["pulls"] == 200 if "regret" in record else True
+    assert 0 < record["regret"] < 100  # of 200 pulls, each of which can cost half a click
 
 
 def test_a_grid_world_is_one_file(train):
