@@ -6,10 +6,9 @@ import inspect
 import math
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
-import sb3_contrib
 import stable_baselines3
 import torch as th
 from gymnasium import spaces
@@ -23,9 +22,8 @@ from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 from stable_baselines3.dqn.policies import QNetwork
 from torch import nn
 from torch.nn.functional import mse_loss
-from torch.nn.utils import clip_grad_norm_, parameters_to_vector
+from torch.nn.utils import clip_grad_norm_
 
-from agents.common.callbacks import tell_safe_moment
 from agents.common.masks import check_masks_exist, checked_masks, present_masks
 from agents.common.settings import full_signature
 from agents.networks.engine_setting import (
@@ -426,67 +424,3 @@ class A2C(CompiledPolicyGradient, stable_baselines3.A2C):
 
 PPO.__signature__ = full_signature(PPO)
 A2C.__signature__ = full_signature(A2C)
-
-
-# Augmented random search, under the same callbacks as every other agent.
-
-
-class _TrainingStoppedError(Exception):
-    """A callback asks for the end, in the midst of a candidate's episodes."""
-
-    def __init__(self, callback: BaseCallback) -> None:
-        super().__init__()
-        self.callback = callback
-
-
-class ARS(sb3_contrib.ARS):
-    """Augmented random search (Mania, Guy and Recht, 2018), as sb3-contrib has it.
-
-    Arguments are those of `sb3_contrib.ARS`. What differs lies around the algorithm: callbacks are
-    told what each step brought, are called once for it and can end the training; an agent that was
-    loaded goes on from its weights, where ``zero_policy`` is off too; its schedules go on as well.
-    """
-
-    _last_dones: Any = None
-    # Its rollouts begin in the midst of an update, whose directions are drawn by then.
-    tells_safe_moments = True
-
-    def _do_one_update(self, callback: BaseCallback, async_eval: Any) -> None:
-        tell_safe_moment(callback)
-        super()._do_one_update(callback, async_eval)
-
-    def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
-        """As `sb3_contrib.ARS.learn`, but for callbacks that ask for the end."""
-        try:
-            return super().learn(total_timesteps, *args, **kwargs)
-        except _TrainingStoppedError as stopped:
-            stopped.callback.on_training_end()
-            return self
-
-    def _trigger_callback(
-        self,
-        _locals: dict[str, Any],
-        _globals: dict[str, Any],
-        callback: BaseCallback,
-        n_envs: int,
-    ) -> None:
-        """Called after a step for each environment whose episode counts; act on the first call."""
-        if _locals["dones"] is self._last_dones:
-            return
-        self._last_dones = _locals["dones"]
-        self.num_timesteps += n_envs
-        callback.update_locals(_locals)
-        if not callback.on_step():
-            raise _TrainingStoppedError(callback)
-
-    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
-        # What a callback or an earlier training changed about the total counts here too.
-        super()._update_current_progress_remaining(num_timesteps, self._total_timesteps)
-
-    def set_parameters(self, *args: Any, **kwargs: Any) -> None:
-        """As in the library; the search goes on around what was set."""
-        super().set_parameters(*args, **kwargs)
-        self.weights = parameters_to_vector(self.policy.parameters()).detach()  # type: ignore[assignment]
-
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_last_dones"]

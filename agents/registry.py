@@ -181,44 +181,36 @@ def _mabwiser(name: str, summary: str, observations: tuple[str, ...] = DISCRETE)
 
 
 ALGORITHMS: dict[str, AlgorithmEntry] = {
-    "qlearning": _tabular("q_learning:QLearning", "Q-learning on a table"),
-    "sarsa": _tabular("sarsa:SARSA", "SARSA on a table"),
-    "expected_sarsa": _tabular("expected_sarsa:ExpectedSARSA", "Expected SARSA on a table"),
-    "double_qlearning": _tabular(
-        "double_q_learning:DoubleQLearning", "double Q-learning on two tables"
-    ),
-    "n_step_sarsa": _tabular("episodes.n_step_sarsa:NStepSARSA", "n-step SARSA on a table"),
-    "n_step_tree_backup": _tabular(
-        "episodes.tree_backup:NStepTreeBackup", "n-step tree backup on a table"
-    ),
-    "sarsa_lambda": _tabular(
-        "episodes.sarsa_lambda:SARSALambda", "SARSA(lambda): traces on a table"
-    ),
-    "q_lambda": _tabular("episodes.q_lambda:QLambda", "Watkins's Q(lambda): traces on a table"),
-    "monte_carlo": _tabular("episodes.monte_carlo:MonteCarlo", "on-policy Monte Carlo on a table"),
+    "qlearning": _tabular("one_step:QLearning", "Q-learning on a table"),
+    "sarsa": _tabular("one_step:SARSA", "SARSA on a table"),
+    "expected_sarsa": _tabular("one_step:ExpectedSARSA", "Expected SARSA on a table"),
+    "double_qlearning": _tabular("one_step:DoubleQLearning", "double Q-learning on two tables"),
+    "n_step_sarsa": _tabular("n_step:NStepSARSA", "n-step SARSA on a table"),
+    "n_step_tree_backup": _tabular("n_step:NStepTreeBackup", "n-step tree backup on a table"),
+    "sarsa_lambda": _tabular("traces:SARSALambda", "SARSA(lambda): traces on a table"),
+    "q_lambda": _tabular("traces:QLambda", "Watkins's Q(lambda): traces on a table"),
+    "monte_carlo": _tabular("monte_carlo:MonteCarlo", "on-policy Monte Carlo on a table"),
     "off_policy_monte_carlo": _tabular(
-        "episodes.off_policy_monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
+        "monte_carlo:OffPolicyMonteCarlo", "off-policy Monte Carlo on a table"
     ),
-    "dyna_q": _tabular("models.dyna_q:DynaQ", "Q-learning that plans on a learnt model"),
-    "dyna_q_plus": _tabular(
-        "models.dyna_q_plus:DynaQPlus", "Dyna-Q with a bonus for actions not tried for long"
-    ),
+    "dyna_q": _tabular("dyna:DynaQ", "Q-learning that plans on a learnt model"),
+    "dyna_q_plus": _tabular("dyna:DynaQPlus", "Dyna-Q with a bonus for actions not tried for long"),
     "prioritized_sweeping": _tabular(
-        "models.prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
+        "prioritized_sweeping:PrioritizedSweeping", "planning first where values change most"
     ),
-    "r_max": _tabular("models.r_max:RMax", "planning that assumes the best of everything unknown"),
-    "qlearning_ucb": _tabular(
-        "q_learning_ucb:QLearningUCB", "Q-learning with upper confidence bounds"
-    ),
+    "r_max": _tabular("optimism:RMax", "planning that assumes the best of everything unknown"),
+    "qlearning_ucb": _tabular("optimism:QLearningUCB", "Q-learning with upper confidence bounds"),
     "semi_gradient_sarsa": _tiled(
-        "semi_gradient_sarsa:SemiGradientSARSA", "SARSA on tile coding (or a table)"
+        "action_values:SemiGradientSARSA", "SARSA on tile coding (or a table)"
     ),
     "semi_gradient_q": _tiled(
-        "semi_gradient_q:SemiGradientQ", "Q-learning on tile coding (or a table)"
+        "action_values:SemiGradientQ", "Q-learning on tile coding (or a table)"
     ),
-    "actor_critic": _tiled("actor_critic:ActorCritic", "one-step actor-critic on tiles or a table"),
+    "actor_critic": _tiled(
+        "policy_gradients:ActorCritic", "one-step actor-critic on tiles or a table"
+    ),
     "reinforce": _tiled(
-        "reinforce:Reinforce", "REINFORCE on tiles or a table, with or without a baseline"
+        "policy_gradients:Reinforce", "REINFORCE on tiles or a table, with or without a baseline"
     ),
     "dqn": _deep(
         "agents.library:DQN", "deep Q-network (Stable-Baselines3)", engines=LIBRARY_ENGINES
@@ -261,7 +253,7 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         "sb3_contrib:TRPO", "trust-region policy optimisation", POLICY_GRADIENT_OUTPUTS
     ),
     "ars": _contrib(
-        "agents.library:ARS",
+        "agents.random_search:ARS",
         "augmented random search",
         (*CONTINUOUS, *DISCRETE),
         VECTOR_INPUTS,
@@ -312,10 +304,10 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     ),
     "epsilon_greedy": _bandit("value_bandits:EpsilonGreedy", "bandit: epsilon-greedy"),
     "boltzmann": _bandit("value_bandits:Boltzmann", "bandit: softmax of the estimates"),
-    "ucb": _bandit("ucb:UCB", "bandit: upper confidence bounds"),
-    "kl_ucb": _bandit("kl_ucb:KLUCB", "bandit: upper bounds by Kullback-Leibler divergence"),
-    "gradient_bandit": _bandit("gradient_bandit:GradientBandit", "bandit: gradient on preferences"),
-    "exp3": _bandit("exp3:Exp3", "bandit: exponential weights against an adversary"),
+    "ucb": _bandit("upper_bounds:UCB", "bandit: upper confidence bounds"),
+    "kl_ucb": _bandit("upper_bounds:KLUCB", "bandit: upper bounds by Kullback-Leibler divergence"),
+    "gradient_bandit": _bandit("preferences:GradientBandit", "bandit: gradient on preferences"),
+    "exp3": _bandit("preferences:Exp3", "bandit: exponential weights against an adversary"),
     "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),
     "linucb": _linear("LinUCB", "contextual bandit: linear upper confidence bounds"),
     "lin_thompson": _linear("LinThompson", "contextual bandit: linear Thompson sampling"),

@@ -221,7 +221,7 @@ def test_saving_changes_nothing():
         Side(0),
         range(1, 9, 2),
     ],
-    ids=repr,
+    ids=lambda value: getattr(value, "__name__", repr(value)),  # never an address
 )
 def test_values(tmp_path, value):
     found = again(value, tmp_path)
