@@ -91,6 +91,7 @@ VOLATILE = (
     (re.compile(r"\b[0-9a-f]{40,64}\b"), "SHA"),
     (re.compile(r"\b\d[\d.,]* ?(ms|s|min|minutes?|seconds?|h|hours?)\b(?!\w)"), "TIME"),
     (re.compile(r"(about|less than) TIME"), "TIME"),
+    (re.compile(r"start_time +\d+"), "start_time TIME"),
     (re.compile(r"\([\d.,]+ steps/s\)"), "(SPEED)"),
     (re.compile(r"\b\d+\.\d+(\.\d+)+(\+\w+)?"), "VERSION"),
     (re.compile(r"\b\d[\d.,]* ?[kKMG]?i?B\b"), "SIZE"),
