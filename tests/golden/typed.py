@@ -91,6 +91,7 @@ VOLATILE = (
     (re.compile(r"\b[0-9a-f]{40,64}\b"), "SHA"),
     (re.compile(r"\b\d[\d.,]* ?(ms|s|min|minutes?|seconds?|h|hours?)\b(?!\w)"), "TIME"),
     (re.compile(r"(about|less than) TIME"), "TIME"),
+    (re.compile(r"\bdata +[\d,]+ bytes"), "data SIZE"),  # of which some are times
     (re.compile(r"start_time +\d+"), "start_time TIME"),
     (re.compile(r"\([\d.,]+ steps/s\)"), "(SPEED)"),
     (re.compile(r"\b\d+\.\d+(\.\d+)+(\+\w+)?"), "VERSION"),
@@ -302,7 +303,7 @@ def written(root: Path, path: Path) -> list[str]:
     if not path.is_file():
         return ["no such file"]
     if path.suffix == ".html":
-        return page(path)
+        return [line.replace(f"{root}/", "") for line in page(path)]
     text = path.read_text(encoding="utf-8").replace(f"{root}/", "")
     if path.suffix == ".csv":
         rows = list(csv.DictReader(io.StringIO(text)))
