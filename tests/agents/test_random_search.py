@@ -9,7 +9,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from torch.nn.utils import parameters_to_vector
 
 from agents.common.callbacks import EpisodeBudget
-from agents.library import ARS
+from agents.random_search import ARS
 
 
 class Watch(BaseCallback):
