@@ -170,7 +170,7 @@ def _linear(name: str, summary: str) -> AlgorithmEntry:
 
 def _mabwiser(name: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
     return AlgorithmEntry(
-        f"agents.bandits.mabwiser:{name}",
+        f"agents.mabwiser:{name}",
         f"{summary} (MABWiser)",
         observations,
         DISCRETE,

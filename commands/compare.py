@@ -35,7 +35,7 @@ from commands.terminal import LiveProgress, say, table_console
 from pipeline.errors import UserError, unknown
 from pipeline.failures import exits_as_mistakes
 from pipeline.library_loading import loading_libraries
-from pipeline.progress import doing, duration
+from pipeline.signs_of_life import doing, duration
 from pipeline.stopping import stops_noticed
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from experiments.results import LeftOut, StudyResults
     from experiments.run_limits import RunLimits
     from experiments.study import StudySpec
-    from pipeline.progress import Activity
+    from pipeline.signs_of_life import Activity
     from report.page.frame import LearningPage
 
 # --- flags ----------------------------------------------------------------------------------------

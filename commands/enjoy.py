@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pipeline.models.choose import ChosenModel, ModelRequest
     from pipeline.models.find import Which
     from pipeline.playing import ActionFigures, FrameTaker, RenderMode, Repetition
-    from pipeline.progress import Activity
+    from pipeline.signs_of_life import Activity
     from pipeline.train_spec import TrainSpec
 
 # --- flags ----------------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def _play_found(args: argparse.Namespace, wanted: ModelRequest) -> None:
         flags = f"--algo {error.algo} --env {error.env_id} -f {error.log_folder}"
         raise UserError(f"{error}: train one with: {called_as('train')} {flags}") from error
     from commands.terminal import TextConsole, say
-    from pipeline.progress import doing
+    from pipeline.signs_of_life import doing
 
     console = TextConsole(highlight=False, quiet=args.verbose < 1)
     place = args.model if wanted.zipped_in is not None else found.path
@@ -233,7 +233,7 @@ def play(console: Console, chosen: ChosenModel, args: argparse.Namespace) -> Non
     from pipeline.environments import lacking_packages_told
     from pipeline.models.load import load_to_play, with_normalised_rewards
     from pipeline.playing import FrameTaker, Repetition, play_episodes, playing_env, write_film
-    from pipeline.progress import Activity, can_move, doing
+    from pipeline.signs_of_life import Activity, can_move, doing
 
     if args.num_threads > 0:
         th.set_num_threads(args.num_threads)
@@ -307,7 +307,7 @@ def _print_exact(console: Console, spec: TrainSpec, model: Any, deterministic: b
     from commands.terminal import describe, print_refusal
     from pipeline.evaluation.exact import exact_evaluator, model_refusal
     from pipeline.evaluation.policies import why_not_exact
-    from pipeline.progress import doing
+    from pipeline.signs_of_life import doing
 
     with doing(console, "working out what the policy is worth"):
         evaluator = exact_evaluator(spec)

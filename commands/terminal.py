@@ -16,7 +16,7 @@ from rich.segment import Segment
 from rich.text import Text
 
 from pipeline.errors import visible
-from pipeline.progress import (
+from pipeline.signs_of_life import (
     SECONDS_BETWEEN_LINES,
     SECONDS_BETWEEN_LOOKS,
     Heartbeat,

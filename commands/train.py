@@ -187,7 +187,7 @@ def main() -> int:
 
 def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     from commands.terminal import TextConsole, print_refusal, say
-    from pipeline.progress import doing
+    from pipeline.signs_of_life import doing
 
     go_on_unread()
     console = TextConsole(quiet=spec.verbose < 1, force_terminal=spec.progress or None)
@@ -252,8 +252,8 @@ def _resumed(args: argparse.Namespace) -> tuple[Run, TrainSpec]:
 def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopRequest) -> int:
     """Carry out the rest of a run, from its newest state on; the exit code."""
     from commands.terminal import TextConsole, say
-    from pipeline.progress import doing
     from pipeline.runs import at_work_on, check_left, remove_states
+    from pipeline.signs_of_life import doing
     from pipeline.unfinished_runs import go_on, is_finished, tell_changes
 
     spec = replace(spec, verbose=args.verbose, progress=args.progress)
@@ -581,7 +581,7 @@ def _write_watched(console: Console, training: Training) -> None:
     if training.watch is None or path is None or not training.watch.has_begun:
         return
     from commands.terminal import say
-    from pipeline.progress import doing
+    from pipeline.signs_of_life import doing
     from report.page.learning import write_learning_page
 
     with doing(console, "writing the page that plays the training"):

@@ -34,7 +34,7 @@ from commands.compare import RunContext, conclude, do_missing, give_way, read, r
 from commands.terminal import LiveProgress, say, search_line, table_console
 from pipeline.errors import UserError, unknown
 from pipeline.failures import exits_as_mistakes
-from pipeline.progress import doing, duration
+from pipeline.signs_of_life import doing, duration
 from pipeline.stopping import stops_noticed
 from tuning.pruning import PRUNERS
 from tuning.tuning_spec import AUTO, FIGURES, OBJECTIVES, SAMPLERS, SHIPPED, TuningSpec

@@ -25,7 +25,7 @@ from mdp.array_types import Floats
 from pipeline.environments import training_changes, trains_on_variant
 from pipeline.errors import UserError
 from pipeline.evaluation import FAILED, NEARLY_ALL
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from pipeline.train_spec import TrainSpec
 from verdicts import (
     FEWEST_SEEDS,

@@ -26,7 +26,7 @@ from experiments.run_files import (
 from experiments.study import StudySpec
 from mdp.array_types import Floats
 from pipeline.digests import DamagedFileError
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import (
     Band,
     area_under_curve,

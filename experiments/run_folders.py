@@ -25,8 +25,8 @@ from pipeline.digests import STATE_FOLDER, DamagedFileError
 from pipeline.errors import UserError, shown
 from pipeline.files import portable_name, put_in_place, settle, sync_together
 from pipeline.locks import seconds_silent
-from pipeline.progress import Tell, tell_nobody
 from pipeline.runs import has_state
+from pipeline.signs_of_life import Tell, tell_nobody
 
 if TYPE_CHECKING:
     from experiments.results import LeftOut

@@ -17,8 +17,8 @@ from experiments.run_folders import (
 from pipeline.errors import UserError
 from pipeline.failures import is_of_the_machine
 from pipeline.locks import SECONDS_BETWEEN_SIGNS, give_sign
-from pipeline.progress import Heartbeat
 from pipeline.runs import Run, remove_states
+from pipeline.signs_of_life import Heartbeat
 from pipeline.training import train
 from pipeline.unfinished_runs import StateKeeping, go_on
 from pipeline.user_modules import import_again

@@ -13,7 +13,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from agents.common.callbacks import EpisodeBudget
 from agents.compiled.worlds import NotCompilable
 from agents.networks.engine_setting import CompiledNetworks, EnginePlan, Work
-from agents.networks.observations import network_world
+from agents.networks.network_worlds import network_world
 from pipeline.environments import make_training_env
 from pipeline.preparation import algorithm_kwargs, make_model
 from pipeline.settings import components

@@ -30,7 +30,7 @@ from typing import Any
 
 from pipeline.digests import LOCK
 from pipeline.errors import UserError, visible
-from pipeline.progress import Heartbeat
+from pipeline.signs_of_life import Heartbeat
 from safe_files.files import NEW, NO_LIMIT, UnsafeFileError, open_number, opened, read_file
 
 _BOOT = "/proc/sys/kernel/random/boot_id"

@@ -45,7 +45,7 @@ from pipeline.models.choose import (
     statistics_to_continue,
 )
 from pipeline.models.load import ModelFile, agent_class, take_over, telling_masks
-from pipeline.progress import ProgressDisplay, can_move
+from pipeline.progress import ProgressDisplay
 from pipeline.runs import Run, environment_name
 from pipeline.settings.components import (
     action_noise,
@@ -55,6 +55,7 @@ from pipeline.settings.components import (
     needs_policy,
 )
 from pipeline.settings.values import algorithm_parameters
+from pipeline.signs_of_life import can_move
 from pipeline.state_saver import StateSaver, resumed_logger
 from pipeline.stopping import close_environments, end_workers_after_stop
 from pipeline.train_spec import TrainSpec

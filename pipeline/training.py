@@ -34,7 +34,6 @@ from pipeline.map_pictures import draw_value_map
 from pipeline.models.find import final_replay_buffer_path
 from pipeline.models.load import save_model, save_normalization, save_replay_buffer
 from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
-from pipeline.progress import Activity, doing
 from pipeline.runs import (
     FINISHED,
     INTERRUPTED,
@@ -48,6 +47,7 @@ from pipeline.runs import (
     write_arguments,
     write_settings,
 )
+from pipeline.signs_of_life import Activity, doing
 from pipeline.state_saver import IterationInterval, iterations_before
 from pipeline.stopping import current, deaths_told
 from pipeline.train_spec import TrainSpec

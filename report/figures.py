@@ -29,7 +29,7 @@ from experiments.study import COSTS, METRIC_WORDS, file_name
 from mdp.array_types import Floats, Ints
 from pipeline.curve_pictures import symlog_ticks
 from pipeline.files import replacing
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.series import (
     COLOURS,
     DASHES,

@@ -20,7 +20,7 @@ from experiments.study import file_name
 from pipeline.environments import MISTAKES
 from pipeline.errors import UserError, one_line
 from pipeline.files import replacing, write_json
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from safe_files.files import read_file
 
 if TYPE_CHECKING:

@@ -20,7 +20,7 @@ from experiments.run_files import read_episodes
 from experiments.study import AgentSpec, StudySpec, symbol
 from mdp.array_types import Floats, Ints
 from pipeline.environments import make_single_env
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from verdicts import Estimate
 
 # One colour and one line style for each agent, the same in every figure of a study.

@@ -23,7 +23,7 @@ from urllib.parse import urlsplit
 from pipeline import locks
 from pipeline.errors import UserError, one_line, shown
 from pipeline.locks import FolderGoneError, FolderInUseError, folder_lock, is_gone
-from pipeline.progress import Heartbeat
+from pipeline.signs_of_life import Heartbeat
 
 # Optuna takes long to load, and a mistake on the command line is told before.
 if TYPE_CHECKING:

@@ -45,13 +45,8 @@ from agents.linear.tiles import (
     tiles_of_all,
     vectors_of,
 )
-from agents.networks.observations import (
-    BEFORE,
-    NetworkEnvStates,
-    move_on,
-    network_playground,
-    network_world,
-)
+from agents.networks.network_worlds import NetworkEnvStates, network_playground, network_world
+from agents.networks.observations import BEFORE, move_on
 from agents.networks.q_learner import best_of
 from machine_code.compiling import called
 from mdp.array_types import Floats, Ints

@@ -27,7 +27,8 @@ from agents.compiled.greedy_play import COMPENSATED_SUM, Playground
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import learn_from_last_step, run_block
 from agents.compiled.records import Episodes
-from agents.networks.observations import NetworkEnvStates, Numbers, network_playground
+from agents.networks.network_worlds import NetworkEnvStates, network_playground
+from agents.networks.observations import Numbers
 from agents.networks.torch_bridge import Reference, SharedTensors, address_of
 
 # Telling callbacks where rollouts begin and end, which blocks of compiled steps may pass over.

@@ -32,7 +32,8 @@ from agents.common.settings import check_option
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.worlds import NotCompilable
 from agents.networks.engine import NetworkEngine, NetworkTraining, RolloutEvents
-from agents.networks.observations import Numbers, OwnVectors, network_world
+from agents.networks.network_worlds import network_world
+from agents.networks.observations import Numbers, OwnVectors
 from agents.networks.perceptron import Inputs, one_thread
 from agents.networks.playing import NetworkPlayer, network_player
 from agents.networks.torch_bridge import Network, in_rows

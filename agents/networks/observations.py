@@ -1,26 +1,19 @@
-"""What networks are shown of compiled environments."""
+"""What networks are shown of compiled environments.
+
+Environments keep numbers of states; CartPole, whose states nobody counts, keeps vectors. Networks
+and their buffers want rows. Which of the kinds applies is looked up by type
+(`agents.compiled.loop`).
+"""
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv
 
-from agents.compiled.greedy_play import VECTOR_STATES, EnvStates
-from agents.compiled.loop import by_type, reset, step
-from agents.compiled.worlds import CartPole, MountainCar, NotCompilable, compile_envs, env_dtype
+from agents.compiled.loop import by_type
 from agents.networks.perceptron import Inputs, Singles
-from envs.known_models import observations_of_states
 from machine_code.compiling import inlined
-
-# What networks are shown of compiled environments.
-#
-# Environments keep numbers of states; CartPole, whose states nobody counts, keeps vectors. Networks
-# and their buffers want rows. Which of the kinds applies is looked up by type
-# (`agents.compiled.loop`).
 
 # Before a step; after it, also where it has ended the episode; and after the reset that followed.
 BEFORE, AFTER, NOW = range(3)
@@ -130,135 +123,3 @@ class OwnVectors(NamedTuple):
         """All of the vector changes."""
         for j in range(self.n):
             env.vector[j] = env.new_vector[j]
-
-
-# Compiled environments as networks see them.
-
-# What acting leaves for learning.
-_ESTIMATES = (("value", np.float64), ("log_probability", np.float64))
-
-_FINITE_ENV = env_dtype(("state", np.int64), *_ESTIMATES)
-
-
-class InFull(NamedTuple):
-    """CartPole or MountainCar, showing its state.
-
-    Attributes:
-        time_limit: steps after which an episode is truncated, or 0 for never.
-        dynamics: what moves it.
-    """
-
-    time_limit: int
-    dynamics: CartPole | MountainCar
-
-    @inlined
-    def step(self, env: Any, handle: Any) -> None:
-        """Push as ``env.action`` says."""
-        step(self.dynamics, env, handle)
-        write_state(self.dynamics, env, env.next_vector)
-        write_state(self.dynamics, env, env.new_vector)
-
-    @inlined
-    def reset(self, env: Any, handle: Any) -> None:
-        """Draw a state."""
-        reset(self.dynamics, env, handle)
-        write_state(self.dynamics, env, env.new_vector)
-
-
-@by_type
-def write_state(world: Any, env: Any, vector: Any) -> None:
-    """Write the state of an environment into a vector."""
-
-
-@lru_cache(maxsize=4)
-def _record_in_full(names: tuple[str, ...]) -> np.dtype[np.void]:
-    """The record of an environment with a state of these numbers, which networks see."""
-    vectors: Any = [
-        (name, np.float32, (len(names),)) for name in ("vector", "next_vector", "new_vector")
-    ]
-    return env_dtype(*((name, np.float64) for name in names), *_ESTIMATES, *vectors)
-
-
-def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
-    """The compiled counterpart of environments, and how networks see it.
-
-    Returns:
-        What `agents.compiled.loop` steps, and one of the kinds of `agents.networks.observations`.
-
-    Raises:
-        NotCompilable: where there is none; the message says why.
-    """
-    world = compile_envs(vec_env)
-    space = vec_env.observation_space
-    if isinstance(space, spaces.Discrete):
-        return world, Numbers(int(space.n))
-    if isinstance(world, CartPole | MountainCar):
-        names, _ = VECTOR_STATES[type(world)]
-        return InFull(world.time_limit, world), OwnVectors(len(names))
-    observed = observations_of_states(vec_env.envs[0])  # type: ignore[attr-defined]
-    if observed is None or observed.ndim < 2:
-        raise NotCompilable("the observations of the states are not known")
-    return world, StateVectors(np.ascontiguousarray(observed.reshape(len(observed), -1), "f4"))
-
-
-class NetworkEnvStates(EnvStates):
-    """Environments of a training whose observations networks see.
-
-    Args:
-        vec_env: the environments.
-        world: their compiled counterpart.
-        seen: how networks see them.
-    """
-
-    def __init__(self, vec_env: Any, world: Any, seen: Any) -> None:
-        self.seen = seen
-        super().__init__(vec_env, getattr(world, "dynamics", world))
-
-    def record_type(self) -> np.dtype[np.void]:
-        """With room for what networks expect, and for vectors."""
-        return _record_in_full(self.vector_state) if self.vector_state else _FINITE_ENV
-
-    def observation(self, i: int) -> Any:
-        """What environment ``i`` shows, in the shape that it has in the environment's space."""
-        return self.observations(self.records[i : i + 1], "")[0]
-
-    def observations(self, records: Any, prefix: str) -> Any:
-        """What environments show now (no prefix), before (``next_``) or after a reset (``new_``).
-
-        Returns:
-            Observations of shape (n, ...).
-        """
-        if isinstance(self.seen, Numbers):
-            return records[f"{prefix}obs"].copy()
-        if isinstance(self.seen, OwnVectors):
-            return records[f"{prefix}vector"].copy()
-        shape = self.vec_env.observation_space.shape
-        assert shape is not None
-        return self.seen.table[records[f"{prefix}obs"]].reshape(len(records), *shape)
-
-    def take_observations(self, last_obs: Any) -> None:
-        """Let the records begin with these observations, shape (n, ...)."""
-        if isinstance(self.seen, Numbers):
-            self.records["obs"] = last_obs
-        elif isinstance(self.seen, OwnVectors):
-            self.records["vector"] = last_obs
-        else:
-            for record, shown in zip(self.records, last_obs, strict=True):
-                record["obs"] = self._state_of(shown.ravel(), int(record["state"]))
-
-    def _state_of(self, shown: Any, state: int) -> int:
-        """The state that looks like that: the present one, or one that the agent has stayed at."""
-        table = self.seen.table
-        if np.array_equal(table[state], shown):
-            return state
-        return int(np.argmax((table == shown).all(axis=1)))
-
-
-def network_playground(vec_env: VecEnv) -> tuple[Any, NetworkEnvStates, Any]:
-    """Environments to evaluate networks or tiles on: compiled, their states, how they are seen.
-
-    Raises:
-        NotCompilable: where there is none; the message says why.
-    """
-    world, seen = network_world(vec_env)
-    return world, NetworkEnvStates(vec_env, world, seen), seen

@@ -27,7 +27,7 @@ from experiments.plan import PlannedRun
 from experiments.run_folders import run_name
 from experiments.run_limits import RunLimits
 from pipeline.errors import UserError, one_line
-from pipeline.progress import Heartbeat
+from pipeline.signs_of_life import Heartbeat
 
 SECONDS_TO_GATHER = 60.0
 SECONDS_BETWEEN_LOOKS = 1.0

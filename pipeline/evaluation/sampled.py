@@ -446,7 +446,7 @@ def compiled_copy(env: VecEnv) -> CompiledCopy | None:
     from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
 
     from agents.compiled.worlds import NotCompilable, monitor_of
-    from agents.networks.observations import network_world
+    from agents.networks.network_worlds import network_world
 
     if not isinstance(env, DummyVecEnv) or any(monitor_of(each) is None for each in env.envs):
         return None
@@ -468,7 +468,7 @@ def evaluate_compiled(
     """
     from agents.compiled.greedy_play import play_episodes
     from agents.compiled.records import DECIMALS
-    from agents.networks.observations import NetworkEnvStates
+    from agents.networks.network_worlds import NetworkEnvStates
     from agents.networks.perceptron import one_thread
 
     env, n_envs = copy.env, copy.env.num_envs

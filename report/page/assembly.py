@@ -14,7 +14,7 @@ from experiments.plan import PlannedRun, tuning_seeds
 from experiments.results import StudyResults
 from experiments.run_files import mixed_versions
 from pipeline.files import write_text
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.page import result_sections, world_sections
 from report.page import result_sections as result_sections_module
 from report.page.frame import (

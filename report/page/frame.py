@@ -22,7 +22,7 @@ from envs.layout import GridLayout
 from experiments.analysis import StudyAnalysis
 from experiments.plan import PlannedRun
 from pipeline.errors import visible
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from report.ranking import bar
 from report.series import StudySeries
 from report.words import interval_alone, number, optimum_words

@@ -33,7 +33,7 @@ from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation.value_maps import MAX_STATES
 from pipeline.files import write_json, write_text
-from pipeline.progress import Tell, tell_nobody
+from pipeline.signs_of_life import Tell, tell_nobody
 from pipeline.train_spec import TrainSpec, is_plain
 from pipeline.training import carry_out, prepare
 from pipeline.unfinished_runs import SaveInterval, StateKeeping

@@ -9,7 +9,7 @@ import enjoy
 import train
 from commands import share
 from commands.cli import run_command
-from pipeline.progress import Silence
+from pipeline.signs_of_life import Silence
 
 ROOT = Path(train.__file__).parent
 COMMANDS = {"train.py": train.main, "enjoy.py": enjoy.main, "pack": share.pack}

@@ -11,7 +11,7 @@ import compare
 import enjoy
 import train
 from commands.cli import run_command
-from pipeline.progress import Activity
+from pipeline.signs_of_life import Activity
 
 ROOT = Path(train.__file__).parent
 LAKE = ["--env", "FrozenLake-v1"]

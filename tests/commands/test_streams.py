@@ -16,7 +16,7 @@ import train
 from commands.cli import Output, go_on_unread, run_command, standard_streams
 from commands.terminal import TextConsole
 from pipeline.errors import UserError
-from pipeline.progress import Heartbeat
+from pipeline.signs_of_life import Heartbeat
 
 ROOT = Path(train.__file__).parent
 

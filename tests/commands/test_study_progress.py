@@ -17,7 +17,7 @@ from experiments.child_processes import NO_LIMITS
 from experiments.launching import RunFailure
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline import progress as progress_module
+from pipeline import signs_of_life
 from pipeline.errors import UserError
 
 # --- where runs are done: what flags say of it, and what is refused before anything is begun ------
@@ -91,7 +91,7 @@ def test_a_place_that_is_held_is_opened_once_and_left_at_the_end(tmp_path, monke
 def clock(monkeypatch):
     """A clock that stands until it is told to go on."""
     fake = SimpleNamespace(now=1000.0)
-    for place in (compare, tune, terminal, progress_module):
+    for place in (compare, tune, terminal, signs_of_life):
         monkeypatch.setattr(place, "time", SimpleNamespace(monotonic=lambda: fake.now))
     # Nothing beats by itself.
     still = SimpleNamespace(start=skip, stop=skip)

@@ -11,7 +11,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from agents import load_algorithm
 from agents.compiled.greedy_play import play_episodes
 from agents.compiled.worlds import compile_envs
-from agents.networks.observations import NetworkEnvStates, network_world
+from agents.networks.network_worlds import NetworkEnvStates, network_world
 from agents.networks.q_learner import choose_greedily
 from envs.wrappers import DiscretizeObservation
 from pipeline.evaluation.sampled import SampledEvaluator, compiled_copy, evaluate, evaluate_compiled

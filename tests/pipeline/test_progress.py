@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import pipeline.progress as module
 from agents import load_algorithm
-from pipeline import progress
+from pipeline import signs_of_life
 from pipeline.progress import ProgressDisplay
 
 
@@ -33,7 +33,7 @@ def clock(monkeypatch):
 
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=monotonic))
     # What is due by the clock looks at it without letting it go on, and not by itself.
-    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: fake.now))
+    monkeypatch.setattr(signs_of_life, "time", SimpleNamespace(monotonic=lambda: fake.now))
     monkeypatch.setattr(module, "Heartbeat", lambda *_: SimpleNamespace(start=skip, stop=skip))
     return fake
 

@@ -9,15 +9,17 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from pipeline import progress
-from pipeline.progress import COMPILING, Heartbeat, Silence, can_move, doing
+from pipeline import signs_of_life
+from pipeline.signs_of_life import COMPILING, Heartbeat, Silence, can_move, doing
 
 
 @pytest.fixture
 def clock(monkeypatch):
     """A clock that stands until it is told to go on."""
     fake = SimpleNamespace(now=1000.0)
-    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: fake.now), raising=True)
+    monkeypatch.setattr(
+        signs_of_life, "time", SimpleNamespace(monotonic=lambda: fake.now), raising=True
+    )
     return fake
 
 
@@ -33,7 +35,7 @@ def hearts(monkeypatch):
         def stop(self):
             beating.clear()
 
-    monkeypatch.setattr(progress, "Heartbeat", StillHeart)
+    monkeypatch.setattr(signs_of_life, "Heartbeat", StillHeart)
     return beating
 
 

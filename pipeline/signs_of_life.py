@@ -1,0 +1,226 @@
+"""What is being done now: shown at once on a terminal, and elsewhere said where it takes long."""
+
+from __future__ import annotations
+
+import _thread
+import contextlib
+import logging
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+# What is shorter than that goes without a word where lines stay.
+SECONDS_BEFORE_A_LINE = 5.0
+SECONDS_BETWEEN_LINES = 10.0
+
+SECONDS_BETWEEN_LOOKS = 1.0
+SECONDS_BETWEEN_FRAMES = 0.25
+SPINNER = "line"  # plain letters, which every terminal has
+
+# Told how far something is, in a few words.
+Tell = Callable[[str], object]
+
+COMPILING = "compiling (the first time, some seconds)"
+
+
+def can_move(console: Console) -> bool:
+    """Whether what is shown on a console can be replaced: on no plain teletype, nor in a file."""
+    return console.is_terminal and not console.is_dumb_terminal
+
+
+def tell_nobody(detail: str) -> None:
+    """A `Tell` where nobody watches."""
+
+
+def duration(seconds: float) -> str:
+    """A time in hours, minutes and seconds, as far as they matter."""
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes} min"
+    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+
+
+class Silence:
+    """How long nothing has been said, by a clock of its own.
+
+    Args:
+        allowed: seconds until the first line is due; for each after that, `SECONDS_BETWEEN_LINES`.
+    """
+
+    def __init__(self, allowed: float = SECONDS_BEFORE_A_LINE) -> None:
+        self._ends = time.monotonic() + allowed
+
+    @property
+    def is_too_long(self) -> bool:
+        """Whether a line is due."""
+        return time.monotonic() > self._ends
+
+    def end(self) -> None:
+        """Note that something is being said now."""
+        self._ends = time.monotonic() + SECONDS_BETWEEN_LINES
+
+
+class Heartbeat:
+    """Calls a function every so often, whatever else goes on; it begins and ends as often as asked.
+
+    Args:
+        function: called in a thread of its own.
+        seconds: between two calls.
+    """
+
+    def __init__(self, function: Callable[[], object], seconds: float) -> None:
+        self._function = function
+        self._seconds = seconds
+        self._calling = threading.RLock()
+        self._stopping = threading.Event()
+
+    def start(self) -> None:
+        """Begin to call the function."""
+        self.stop()
+        self._stopping = threading.Event()
+        # Where the machine has no thread left, the work goes on without these signs. `Thread` would
+        # wait until the thread runs, and again until it is gone: longer than a short work takes.
+        with contextlib.suppress(RuntimeError):
+            _thread.start_new_thread(self._beat, (self._stopping,))
+
+    def stop(self) -> None:
+        """Call it no more, from when this returns; harmless when called again."""
+        with self._calling:
+            self._stopping.set()
+
+    def _beat(self, stopping: threading.Event) -> None:
+        # Where nothing can be written any more, the main thread learns of it by itself.
+        with contextlib.suppress(OSError):
+            while not stopping.wait(self._seconds):
+                with self._calling:
+                    if not stopping.is_set():
+                        self._function()
+
+
+class CompilationNotice(logging.Handler):
+    """Says once that something is being compiled.
+
+    Args:
+        say: called when that begins.
+    """
+
+    def __init__(self, say: Callable[[], object]) -> None:
+        super().__init__(logging.INFO)
+        self._say = say
+        self.log = logging.getLogger("machine_code")
+        self.level_before = self.log.level
+
+    def listen(self) -> None:
+        """Begin to wait for something to be compiled."""
+        self.log.addHandler(self)
+        self.log.setLevel(logging.INFO)
+
+    def stop(self) -> None:
+        """Say no more; harmless when called again."""
+        self.log.removeHandler(self)
+        self.log.setLevel(self.level_before)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno == logging.INFO:
+            self.stop()
+            self._say()
+
+
+class Activity:
+    """What is being done now; `doing` shows it.
+
+    Args:
+        console: where to.
+        text: what it is.
+    """
+
+    def __init__(self, console: Console, text: str) -> None:
+        self.console = console
+        self._silence = Silence()
+        self._bar: Progress | None = None
+        self.now(text)
+
+    def now(self, text: str) -> None:
+        """Go on to something else."""
+        self._text = text
+        self._detail = ""
+        self._since = time.monotonic()
+
+    def at(self, detail: str) -> None:
+        """Tell how far it is; cheap enough for every step of a loop."""
+        self._detail = detail
+
+    def say(self, line: str) -> None:
+        """Print a line that stays."""
+        self._silence.end()
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+    def look(self) -> None:
+        """Show how far things are, or say it where only lines can be had and one is due."""
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], description=escape(self._words), refresh=True)
+        elif self._silence.is_too_long:
+            self.say(f"{self._words}, {time.monotonic() - self._since:.0f} s")
+
+    @property
+    def _words(self) -> str:
+        return f"{self._text}: {self._detail}" if self._detail else self._text
+
+    @contextmanager
+    def shown(self) -> Iterator[None]:
+        """Show it while the ``with`` statement runs, and leave nothing of it on a terminal."""
+        with ExitStack() as stack:
+            if can_move(self.console):
+                columns = (
+                    SpinnerColumn(SPINNER),
+                    TextColumn("{task.description}"),
+                    TimeElapsedColumn(),
+                )
+                self._bar = Progress(
+                    *columns, console=self.console, transient=True, auto_refresh=False
+                )
+                stack.enter_context(self._bar)
+                self._bar.add_task(escape(self._words), total=None)
+                self._bar.refresh()
+            seconds = SECONDS_BETWEEN_LOOKS if self._bar is None else SECONDS_BETWEEN_FRAMES
+            heart = Heartbeat(self.look, seconds)
+            stack.callback(heart.stop)
+            heart.start()
+            notice = CompilationNotice(self._on_compiling)
+            stack.callback(notice.stop)
+            notice.listen()
+            yield
+
+    def _on_compiling(self) -> None:
+        if self._bar is None:  # a line that stays says what it was for
+            self.say(f"{self._text}: {COMPILING}")
+        else:
+            self.at(COMPILING)
+
+
+@contextmanager
+def doing(console: Console, text: str) -> Iterator[Activity]:
+    """Show what is being done while the ``with`` statement runs.
+
+    On a terminal that is a line that moves and is gone at the end. Elsewhere lines stay, so there
+    is none for what is over in five seconds, and then one every ten.
+
+    Args:
+        console: where to; nothing is shown on a quiet one.
+        text: what is being done.
+
+    Yields:
+        What tells of further activities and prints lines between.
+    """
+    activity = Activity(console, text)
+    if console.quiet:
+        yield activity
+        return
+    with activity.shown():
+        yield activity
