@@ -92,7 +92,7 @@ def _is_plain(env: gym.Env[Any, Any]) -> bool:
         kind = type(env)
         if _has_own_method(env):
             return False
-        only_shows = isinstance(env, gym.ObservationWrapper) and kind.__module__.startswith(
+        only_shows = isinstance(env, gym.ObservationWrapper) and f"{kind.__module__}.".startswith(
             _OBSERVATION_HOMES
         )
         if not only_shows and f"{kind.__module__}.{kind.__qualname__}" not in TRANSPARENT_WRAPPERS:

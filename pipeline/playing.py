@@ -1,36 +1,22 @@
-"""Playing a trained agent, episode by episode, and filming it."""
+"""Playing a trained agent, episode by episode."""
 
 from __future__ import annotations
 
-import errno
-import importlib.util
-import io
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch as th
-from gymnasium import spaces
-from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.distributions import CategoricalDistribution
-from stable_baselines3.common.policies import ActorCriticPolicy
 
-from agents.linear.algorithm import TileAlgorithm
-from agents.linear.policy_gradients import SoftmaxAlgorithm
-from mdp.array_types import Floats
 from pipeline.environments import make_evaluation_env
 from pipeline.errors import UserError
-from pipeline.files import replacing
 from pipeline.models.choose import ChosenModel
 from pipeline.models.load import take_over
 
 if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
     from stable_baselines3.common.vec_env import VecEnv
-
-
-# Playing a trained agent, episode by episode.
 
 RenderMode = Literal["human", "ansi", "rgb_array"]
 
@@ -186,144 +172,3 @@ class FrameTaker:
         drawn: list[Any] = self._first_of_next + self.env.env_method("render")[0]
         self._first_of_next = [drawn.pop()] if done else []
         return drawn
-
-
-# Films of trained agents: taking the pictures, and writing them to a file.
-
-FILM_SUFFIXES = (".gif", ".mp4")
-FRAMES_PER_SECOND = 10
-
-
-def check_film_path(path: Path) -> None:
-    """Make sure that a film can be written before anything is played.
-
-    Raises:
-        UserError: otherwise.
-    """
-    if path.suffix not in FILM_SUFFIXES:
-        raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
-    if not path.absolute().parent.is_dir():
-        raise UserError(f"--record: there is no folder {path.parent}")
-    if not os.access(path.absolute().parent, os.W_OK):
-        raise UserError(f"--record: nothing can be written in {path.parent}")
-    if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
-        raise UserError("--record to .mp4 needs: pip install 'rl-yardstick[video]'")
-
-
-def film_episode(
-    model: BaseAlgorithm, env: VecEnv, max_steps: int, *, deterministic: bool
-) -> tuple[list[Any], tuple[float, int] | None]:
-    """Play one episode and keep what is drawn.
-
-    Args:
-        model: the agent.
-        env: from `pipeline.playing.playing_env`, drawn as ``"rgb_array"``.
-        max_steps: after how many steps to stop, where the episode has not ended before.
-        deterministic: the policy's best actions rather than samples of them.
-
-    Returns:
-        Pictures, uint8 of shape (height, width, 3); and return and length of the episode, None
-        where it did not end.
-    """
-    taker = FrameTaker(env)
-    frames: list[Any] = []
-    ended = list(
-        play_episodes(
-            model,
-            env,
-            1,
-            max_steps,
-            deterministic=deterministic,
-            after_step=lambda done: frames.extend(taker.take(done)),
-        )
-    )
-    return frames, ended[0] if ended else None
-
-
-def write_film(path: Path, frames: list[Any]) -> None:
-    """Write pictures, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
-    film = _as_mp4(frames) if path.suffix == ".mp4" else as_gif(frames)
-    with replacing(path) as file:
-        file.write(film)
-
-
-def as_gif(frames: list[Any]) -> bytes:
-    """Pictures, uint8 of shape (height, width, 3), as the content of a GIF file."""
-    from PIL import Image
-
-    first, *others = [Image.fromarray(frame) for frame in frames]
-    duration, film = 1000 // FRAMES_PER_SECOND, io.BytesIO()
-    first.save(film, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
-    return film.getvalue()
-
-
-def _as_mp4(frames: list[Any]) -> bytes:
-    import imageio.v2 as imageio
-
-    # Encoders want even sides.
-    even = [frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2] for frame in frames]
-    film: bytes = imageio.mimwrite(
-        "<bytes>", even, format="mp4", fps=FRAMES_PER_SECOND, macro_block_size=1
-    )
-    # It goes through a temporary file, and on a full disk nobody says so.
-    if b"moov" not in film:
-        raise OSError(errno.EIO, "the encoder wrote no whole film: is the disk full?")
-    return film
-
-
-# What an agent makes of the actions before it: its values, or how probable it finds them.
-
-
-class ActionFigures(NamedTuple):
-    """A number for each action.
-
-    Attributes:
-        word: what the numbers are: ``"value"``, ``"score"`` or ``"probability"``.
-        numbers: shape (A,).
-    """
-
-    word: str
-    numbers: Floats
-
-
-def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | None:
-    """What an agent knows about its actions at an observation, by itself and for itself.
-
-    Args:
-        agent: any agent.
-        observations: as one environment of a VecEnv shows them, the first axis of length 1.
-
-    Returns:
-        The figures; None where actions are no choice among a few, or the agent keeps no figures.
-    """
-    policy: Any = agent.policy
-    if not isinstance(agent.action_space, spaces.Discrete):
-        return None
-    for word, name in (("value", "q_table"), ("score", "scores")):
-        table = getattr(policy, name, None)
-        if table is not None and isinstance(agent.observation_space, spaces.Discrete):
-            row = int(np.asarray(observations).reshape(-1)[0])
-            return ActionFigures(word, np.asarray(table)[row if len(table) > 1 else 0])
-    if isinstance(agent, SoftmaxAlgorithm):
-        return ActionFigures("probability", agent.action_probabilities(observations)[0])
-    if isinstance(agent, TileAlgorithm):
-        return ActionFigures("value", agent.policy.sums(observations)[0])
-    with th.no_grad():
-        return _of_network(policy, observations)
-
-
-def _of_network(policy: Any, observations: Any) -> ActionFigures | None:
-    if getattr(policy, "q_net", None) is not None:
-        tensor, _ = policy.obs_to_tensor(observations)
-        return ActionFigures("value", policy.q_net(tensor)[0].cpu().numpy())
-    if getattr(policy, "quantile_net", None) is not None:
-        tensor, _ = policy.obs_to_tensor(observations)
-        return ActionFigures("value", policy.quantile_net(tensor)[0].mean(dim=0).cpu().numpy())
-    # A policy with a memory would have to be told what it remembers.
-    if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
-        tensor, _ = policy.obs_to_tensor(observations)
-        distribution = policy.get_distribution(tensor)
-        if isinstance(distribution, CategoricalDistribution):
-            probabilities = distribution.distribution.probs[0]
-            return ActionFigures("probability", probabilities.cpu().numpy())
-    return None

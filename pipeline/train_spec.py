@@ -14,7 +14,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Self
 
-from agents import ALGORITHMS
 from pipeline.settings.hyperparams import Hyperparams, split
 from pipeline.user_modules import UserModule
 
@@ -179,6 +178,8 @@ def is_plain(spec: TrainSpec) -> bool:
 
 
 def _is_known_agent(spec: TrainSpec) -> bool:
+    from agents import ALGORITHMS
+
     if spec.algo in NETWORKS:
         default = ALGORITHMS[spec.algo].engines[0]
         return bool(spec.hyperparams.algorithm.get("engine", default) != "library")

@@ -50,7 +50,7 @@ def film_of(planned: PlannedRun) -> Path | None:
     """
     path = planned.path / FILM
     if not has_film(planned):
-        from pipeline.playing import as_gif
+        from pipeline.filming import as_gif
 
         try:
             frames, episode = _play(planned)
@@ -88,9 +88,10 @@ def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     import torch as th
 
     from pipeline.evaluation.sampled import evaluation_seed
+    from pipeline.filming import film_episode
     from pipeline.models.choose import model_of_run
     from pipeline.models.load import load_model
-    from pipeline.playing import film_episode, playing_env
+    from pipeline.playing import playing_env
 
     # Pictures alone: no display is needed, nor looked for.
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -146,8 +147,8 @@ def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[P
 def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"
     from pipeline.evaluation.sampled import evaluation_seed
+    from pipeline.filming import write_film
     from pipeline.models.choose import model_of_run
-    from pipeline.playing import write_film
 
     for checkpoint, episode in _checkpoints(planned):
         path = folder / f"{name}_{episode}.gif"
@@ -188,8 +189,9 @@ def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[
     """
     import torch as th
 
+    from pipeline.filming import film_episode
     from pipeline.models.load import load_model
-    from pipeline.playing import film_episode, playing_env
+    from pipeline.playing import playing_env
 
     th.set_num_threads(chosen.spec.num_threads)
     env = playing_env(chosen, "rgb_array")

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         steps_to_threshold,
         summarise_steps,
     )
+    from verdicts.error_levels import level_of_look
     from verdicts.failures import FailureCount, count_failures, fail_more_often, failure_threshold
     from verdicts.growth import Growth, grow, look_sizes
     from verdicts.pairs import (
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
         describe_pairs,
         fewest_seeds,
         judge_pairs,
-        level_of_look,
         probability_of_improvement,
         seeds_needed,
     )
@@ -113,7 +113,7 @@ _HOMES = {
     "PairComparison": "verdicts.pairs",
     "compare_pairs": "verdicts.pairs",
     "describe_pairs": "verdicts.pairs",
-    "level_of_look": "verdicts.pairs",
+    "level_of_look": "verdicts.error_levels",
     "Estimate": "verdicts.resampling",
     "Statistic": "verdicts.resampling",
     "Summary": "verdicts.resampling",

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from verdicts.pairs import FEWEST_SEEDS, Judgement, fewest_seeds, judge_pairs, level_of_look
+from verdicts.error_levels import level_of_look
+from verdicts.pairs import FEWEST_SEEDS, Judgement, fewest_seeds, judge_pairs
 from verdicts.resampling import Floats
 
 # How many times the seeds of a look the next one has, about.

@@ -17,10 +17,10 @@ from commands.enjoy import LiveShow, build_parser, check_playing, figures_table,
 from commands.terminal import TextConsole
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.action_figures import ActionFigures
 from pipeline.errors import UserError
 from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.models.load import load_to_play
-from pipeline.playing import ActionFigures
 from pipeline.runs import Run
 
 # --- flags of enjoy.py as users of rl_zoo3 know them, and commands that are printed to be typed----
