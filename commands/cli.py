@@ -349,14 +349,19 @@ RUN_MEMORY = quantity(run_limits.memory)
 JOBS = whole_number(1, 4096, besides={-1: "all cores", 0: "likewise"})
 FIRST_SEED = whole_number(0, 2**31)
 
-ASSIGNMENTS: Mapping[str, Any] = {"nargs": "+", "default": [], "metavar": "KEY:VALUE"}
+
+def assignments() -> Mapping[str, Any]:
+    """What flags take that assign values; each has a list of its own, or args.yml has anchors."""
+    return {"nargs": "+", "default": [], "metavar": "KEY:VALUE"}
+
+
 _MODULES: Mapping[str, Any] = {"nargs": "+", "type": filled, "default": [], "metavar": "MODULE"}
 
 # Flags that several commands have: their names, what they take, and what is said of them.
 SHARED: Sequence[tuple[str, Mapping[str, Any], str]] = (
-    ("-params --hyperparams", ASSIGNMENTS, ""),
+    ("-params --hyperparams", assignments(), ""),
     ("-conf --conf-file", {"type": filled, "metavar": "YAML"}, "hyperparameters from another file"),
-    ("--env-kwargs", ASSIGNMENTS, "environment arguments"),
+    ("--env-kwargs", assignments(), "environment arguments"),
     ("--gym-packages", _MODULES, "modules of yours, with environments or agents: names or files"),
     (
         "--engine",

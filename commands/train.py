@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from commands.cli import (
-    ASSIGNMENTS,
     BUDGET,
     COUNT,
     INTERVAL,
@@ -21,6 +20,7 @@ from commands.cli import (
     VERBOSITY,
     OneLineParser,
     add_shared,
+    assignments,
     called_as,
     check_device,
     check_tensorboard,
@@ -87,7 +87,7 @@ def build_parser() -> argparse.ArgumentParser:
     changed = "hyperparameters to change, e.g. learning_rate:0.01"
     add_shared(group, "--hyperparams", help=changed)
     add_shared(group, "--engine", "--conf-file", "--env-kwargs")
-    add("--eval-env-kwargs", **ASSIGNMENTS, help="environment arguments for evaluation only")
+    add("--eval-env-kwargs", **assignments(), help="environment arguments for evaluation only")
     add_shared(group, "--gym-packages")
     add(
         *("-i", "--trained-agent"),
