@@ -51,9 +51,9 @@ class AlgorithmEntry:
 
     @property
     def family(self) -> str:
-        """The folder of `agents` that the class lives in; empty where it is in none."""
-        package, *folders = self.entry_point.partition(":")[0].split(".")
-        return folders[0] if package == "agents" and len(folders) > 1 else ""
+        """The folder or file of `agents` that the class lives in; empty where it is elsewhere."""
+        package, *below = self.entry_point.partition(":")[0].split(".")
+        return below[0] if package == "agents" and below else ""
 
     @property
     def is_installed(self) -> bool:

@@ -10,7 +10,7 @@ import pytest
 from envs.known_models import transition_model
 from mdp.graph import PolicyChain
 
-FOLDER = Path(__file__).resolve().parent.parent / "textbook"
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "textbook"
 
 
 @pytest.fixture(autouse=True)

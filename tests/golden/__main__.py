@@ -78,9 +78,11 @@ def look(root: Path, patterns: list[str]) -> Found:
         out = Path(folder) / "found.jsonl"
         threads = {f"{library}_NUM_THREADS": "1" for library in ("OMP", "MKL", "OPENBLAS", "NUMBA")}
         own = {"XDG_CONFIG_HOME": folder, "SDL_VIDEODRIVER": "dummy", "MPLBACKEND": "Agg"}
+        # A study in this process may have left it, and the program imports what lies beside it.
+        env = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}
         subprocess.run(
             [sys.executable, HERE / "observe.py", root, out, *patterns],
-            env={**os.environ, **threads, **own, "PYTHONPATH": str(root.resolve())},
+            env=env | threads | own | {"PYTHONPATH": str(root.resolve())},
             check=True,
         )
         return Found(out.read_text(encoding="utf-8").splitlines())

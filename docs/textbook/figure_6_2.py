@@ -1,6 +1,6 @@
 """Figure 6.2, on the right: TD(0) and Monte Carlo on the walk of five states (example 6.2).
 
-    python textbook/figure_6_2.py              # 100 runs, as in the book: half a minute
+    python docs/textbook/figure_6_2.py              # 100 runs, as in the book: half a minute
 
 The error of the predicted values after each of 100 episodes. All values begin at 0.5.
 """

@@ -1,6 +1,6 @@
 """Figure 5.2: how to play Blackjack, learnt by Monte Carlo control (example 5.3).
 
-    python textbook/figure_5_2.py              # 500,000 episodes: two minutes
+    python docs/textbook/figure_5_2.py              # 500,000 episodes: two minutes
 
 The book explores by its starts, and averages all returns. Ours explores by an epsilon that falls
 from 0.3 to 0.05, and its step size falls too: returns of early, worse play are forgotten. Beside

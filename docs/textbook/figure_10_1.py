@@ -1,6 +1,6 @@
 """Figure 10.1: what it costs to go on, on the mountain car, as it is learnt (example 10.1).
 
-    python textbook/figure_10_1.py              # 9,000 episodes, as in the book: a minute
+    python docs/textbook/figure_10_1.py              # 9,000 episodes, as in the book: a minute
 
 The cost-to-go is the negative of the best action value: the steps that the agent thinks are left.
 Semi-gradient SARSA on eight tilings, without exploration: values of 0 are optimistic enough.

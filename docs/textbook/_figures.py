@@ -25,7 +25,7 @@ from mdp.array_types import Bools, Floats
 
 mpl.use("Agg")
 
-IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images" / "textbook"
+IMAGES = Path(__file__).resolve().parent.parent / "images" / "textbook"
 MOST_STEPS = 10**9  # where episodes are counted
 
 

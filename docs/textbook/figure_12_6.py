@@ -1,6 +1,6 @@
 """Figure 12.6: TD(lambda) on the walk of 19 states (section 12.2).
 
-    python textbook/figure_12_6.py              # 100 runs: three minutes
+    python docs/textbook/figure_12_6.py              # 100 runs: three minutes
 
 The error of the predicted values, over the first ten episodes, with accumulating traces.
 """

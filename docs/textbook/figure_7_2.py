@@ -1,6 +1,6 @@
 """Figure 7.2: n-step TD on the walk of 19 states (example 7.1).
 
-    python textbook/figure_7_2.py              # 100 runs, as in the book: three minutes
+    python docs/textbook/figure_7_2.py              # 100 runs, as in the book: three minutes
 
 The error of the predicted values, over the first ten episodes. All values begin at 0.
 """

@@ -1,6 +1,6 @@
 """Figure 6.3: three targets on the cliff, over step sizes (section 6.6).
 
-    python textbook/figure_6_3.py              # 100 runs: three minutes; the book has 50,000
+    python docs/textbook/figure_6_3.py              # 100 runs: three minutes; the book has 50,000
 
 Mean return of an episode while learning, with a constant epsilon of 0.1: of the first 100 episodes
 (interim) and of 20,000 (asymptotic; the book has 100,000). Expected SARSA does not feel the chance

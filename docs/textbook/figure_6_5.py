@@ -1,6 +1,6 @@
 """Figure 6.5: Q-learning takes chance for worth, double Q-learning does not (section 6.7).
 
-    python textbook/figure_6_5.py              # 1,000 runs: two minutes; the book has 10,000
+    python docs/textbook/figure_6_5.py              # 1,000 runs: two minutes; the book has 10,000
 
 How often each goes left from A, in each of the first 300 episodes. With epsilon-greedy choices, 5 %
 are left at least.

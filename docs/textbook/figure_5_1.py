@@ -1,6 +1,6 @@
 """Figure 5.1: what sticking on 20 and 21 is worth in Blackjack, by Monte Carlo (example 5.1).
 
-    python textbook/figure_5_1.py              # 500,000 episodes, as in the book: a minute
+    python docs/textbook/figure_5_1.py              # 500,000 episodes, as in the book: a minute
 
 Beside the estimates stand the exact values, which the book does not have.
 """
