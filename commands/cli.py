@@ -22,15 +22,17 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from pathlib import Path
 from signal import SIGINT, Signals
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TextIO, TypeVar
 
 from experiments import run_limits
 from pipeline.errors import OTHER_NAMES, UserError, did_you_mean, one_line, shown, visible
 from pipeline.failures import OwnExit, exhaustion
 from pipeline.files import portable_name
 from pipeline.stopping import default_for_signals, n_stops
-from pipeline.unfinished_runs import SaveInterval
 from safe_files.files import UnsafeFileError
+
+if TYPE_CHECKING:
+    from pipeline.unfinished_runs import SaveInterval
 
 MISTAKE = 2  # exit code
 
@@ -322,6 +324,8 @@ def folder_name(text: str) -> str:
 
 def save_interval(text: str) -> SaveInterval:
     """How often to save a state: ``30s``, ``5m``, ``5000`` steps, ``auto`` or ``never``."""
+    from pipeline.unfinished_runs import SaveInterval
+
     if text in ("auto", "never"):
         return SaveInterval(is_off=text == "never")
     unit = {"s": 1.0, "m": 60.0, "h": 3600.0}.get(text[-1:])
