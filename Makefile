@@ -17,7 +17,7 @@ PINS := constraints.txt requirements.txt
 # MushroomRL needs an old NumPy and brings a PyTorch of its own: that comparison is run by itself.
 # What times something, with as few rounds as tell anything.
 BENCHMARKS := 'tabular_speed.py --repeats 2' 'plain_loops.py' 'network_speed.py --repeats 1' \
-  'network_settings.py --repeats 1' 'against_rl_zoo3.py --repeats 1' 'startup.py' \
+  'against_rl_zoo3.py --repeats 1' 'startup.py' \
   'coursework_sweeps.py' 'bandit_testbed.py --rounds 1' 'bandit_speed.py --rounds 2' \
   'exact_evaluation.py' 'evaluation_share.py -n 20000 --env CartPole-v1 Acrobot-v1' \
   'planning_scale.py' 'page_scale.py'

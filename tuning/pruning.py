@@ -2,7 +2,7 @@
 
 All trials go through the same seeds in the same shuffled order, so that any two are compared seed
 by seed. Scores are the better the higher; a cost is handed over with its sign turned.
-`benchmarks/pruning.py` measures what each rule saves and errs.
+docs/search-spaces.md says what each rule saves and errs.
 """
 
 from __future__ import annotations
