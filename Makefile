@@ -73,7 +73,6 @@ mutants: $(STAMP) ## Count the deliberate errors that tests catch: PACKAGE=mdp N
 	$(BIN)/python tests/mutation $(PACKAGE) -n $(N) --seed $(SEED) --jobs $(JOBS)
 
 docs: $(STAMP) ## Make the site of all pages, build/site/index.html, and check its links
-	$(BIN)/python docs/scripts/fill_pages.py --check
 	rm -rf build/site
 	$(BIN)/python -m sphinx --builder html --fail-on-warning --keep-going --quiet docs build/site
 	$(BIN)/python docs/scripts/check_links.py build/site

@@ -8,7 +8,7 @@ Trainings are collected from the text, see docs/scripts/recommended_commands.py,
 another in this process, with ``--engine auto`` and the seeds 1000 to 1019; fewer where that many
 take longer than ``--limit`` seconds, and one where an agent plans and draws no numbers. What is
 found is kept in the file at once, and what is in it is not done again. ``--fill`` writes the table
-into docs/documented-commands.md; ``docs/scripts/fill_pages.py`` then says it beside the commands.
+into docs/documented-commands.md, and beside the commands of all pages what they reach.
 
 With ``PYTHONPATH=OLDER_CHECKOUT`` the same trainings are done with an older version.
 """
@@ -31,7 +31,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT / "docs" / "scripts"))
 
-from recommended_commands import PAGE, trainings  # noqa: E402
+from recommended_commands import PAGE, trainings, with_outcomes  # noqa: E402
 
 SEEDS = range(1000, 1020)
 FEWEST = 5
@@ -166,6 +166,8 @@ def main() -> None:
         PAGE.write_text(
             BLOCK.sub(lambda b: f"{b[1]}{table(found, before)}{b[2]}", text), encoding="utf-8"
         )
+        for page in PAGE.parent.rglob("*.md"):
+            page.write_text(with_outcomes(page.read_text(encoding="utf-8")), encoding="utf-8")
         return
     results = args.results.resolve()
     with tempfile.TemporaryDirectory() as name:

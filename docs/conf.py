@@ -22,6 +22,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
     "agent_classes",
+    "fill_pages",
     "mathml",
     "root_documents",
     "site_contents",

@@ -1,8 +1,8 @@
 """Brackets that were worked out for environments of Gymnasium as they are by default.
 
-`benchmarks/optimum_brackets.py` of commit d0af048 wrote them. One is claimed of an environment only if that is the
-class, with the constants and under the time limit, that it was worked out for, and if nothing
-around it changes rewards, actions or steps.
+`benchmarks/optimum_brackets.py` of commit d0af048 wrote them. One is claimed of an environment only
+if that is the class, with the constants and under the time limit, that it was worked out for, and
+if nothing around it changes rewards, actions or steps.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What scripts write into the pages of docs/ is there as they would write it now."""
+"""Pages of docs/ can be filled with what follows from code, and have one form."""
 
 import importlib.util
 import re
@@ -14,8 +14,8 @@ FORM = ["Idea", "Update", "Pseudo-code, and the code that runs", "By hand", "Whe
 FORM += ["See it", "Source"]
 
 
-def script(name):
-    spec = importlib.util.spec_from_file_location(name, DOCS / "scripts" / f"{name}.py")
+def script(name, folder="scripts"):
+    spec = importlib.util.spec_from_file_location(name, DOCS / folder / f"{name}.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
@@ -25,15 +25,23 @@ def script(name):
 @pytest.fixture(scope="module")
 def fill_pages():
     before = list(sys.path)
-    yield script("fill_pages")
+    yield script("fill_pages", "_ext")
     sys.path[:] = before
 
 
-def test_pages_are_as_the_script_fills_them(fill_pages):
-    """Otherwise: python docs/scripts/fill_pages.py. `make docs` looks at the dear ones too."""
+def test_pages_can_be_filled(fill_pages):
+    """`make docs` fills the dear ones too, in seconds to a minute."""
     dear = {"environments.md", "jacks-car-rental.md"}
-    pages = sorted(path for path in DOCS.rglob("*.md") if path.name not in dear)
-    assert [path.name for path in pages if not fill_pages.is_current(path)] == []
+    for path in sorted(path for path in DOCS.rglob("*.md") if path.name not in dear):
+        text = fill_pages.filled(path.read_text(), path.parent)
+        assert not re.search(r"\]\(\S+ \"[a-z-]+[:\"]", text), path
+
+
+def test_commands_say_what_they_reach(fill_pages):
+    """Otherwise: python benchmarks/documented_commands.py --fill."""
+    with_outcomes = fill_pages.with_outcomes
+    texts = {path: path.read_text() for path in DOCS.rglob("*.md")}
+    assert [path.name for path, text in texts.items() if with_outcomes(text) != text] == []
 
 
 def test_every_environment_is_pictured(fill_pages):
@@ -41,15 +49,12 @@ def test_every_environment_is_pictured(fill_pages):
     assert drawn == set(fill_pages.pictured_environments())
 
 
-def test_a_block_is_filled_and_others_stay(fill_pages):
-    page = "<!-- code: mdp/graph.py nothing -->\nold\n<!-- end -->\n"
+def test_a_line_is_filled_and_others_stay(fill_pages):
     with pytest.raises(ValueError, match=r"mdp/graph\.py defines no nothing"):
-        fill_pages.filled(page)
-    other = "<!-- headline: held-out -->\nkept\n<!-- end -->\n"
-    agents = "<!-- agents -->\nformer words\n<!-- end -->\n"
-    filled = fill_pages.filled(other + agents)
+        fill_pages.filled('[x](../mdp/graph.py "code: nothing")', DOCS)
+    other = 'See [code](x.py "code: f") and [a title](x.md "agents of ours").\n'
+    filled = fill_pages.filled(f'{other}[Agents](x.py "agents")\n', DOCS)
     assert filled.startswith(other)
-    assert "former words" not in filled
     assert all(f"`{name}`" in filled for name in ALGORITHMS)
 
 

@@ -20,7 +20,7 @@ from pathlib import Path
 DOCS = Path(__file__).resolve().parents[1]
 ROOT = DOCS.parent
 IMAGES = DOCS / "images"
-sys.path[:0] = [str(ROOT), str(DOCS / "scripts")]
+sys.path[:0] = [str(ROOT), str(DOCS / "_ext")]
 os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
 
 WIDEST = 560  # pixels, of an environment

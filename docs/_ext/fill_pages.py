@@ -1,0 +1,83 @@
+"""Puts what follows from code into pages: pieces of source, facts on environments, tables.
+
+A page says what stands there by a link with a title, which a code host shows as a link::
+
+    [The code](../../agents/tabular/one_step.py "code: best_next_value QLearning")
+
+The kinds: ``code``, with names that the linked file defines; ``environment``, with an id and
+arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, likewise, for
+a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``agents`` and
+``agents-by-spaces``, with nothing, for tables of agents.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+DOCS = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(DOCS.parent), str(DOCS / "scripts")]
+
+from agent_tables import agents_block, by_spaces_block  # noqa: E402
+from code_blocks import code_block  # noqa: E402
+from environment_facts import (  # noqa: E402
+    docstring_block,
+    environment_block,
+    facts_block,
+    optima_block,
+    variants_block,
+)
+from recommended_commands import with_outcomes  # noqa: E402
+
+KINDS: dict[str, Callable[..., str]] = {
+    "agents": agents_block,
+    "agents-by-spaces": by_spaces_block,
+    "code": code_block,
+    "docstring": docstring_block,
+    "environment": environment_block,
+    "facts": facts_block,
+    "optima": optima_block,
+    "variants": variants_block,
+}
+LINE = re.compile(rf'^\[[^\]\n]*\]\((\S+) "({"|".join(KINDS)})(?:: ([^"\n]*))?"\)$', re.MULTILINE)
+
+
+def filled(text: str, folder: Path) -> str:
+    """A page of a folder, with what belongs in the place of its lines."""
+
+    def fill(line: re.Match[str]) -> str:
+        target, kind, arguments = line.groups()
+        words = (arguments or "").split()
+        if kind == "code":
+            words = [(folder / target).resolve().relative_to(DOCS.parent).as_posix(), *words]
+        return KINDS[kind](*words).rstrip("\n")
+
+    return LINE.sub(fill, text)
+
+
+def pictured_environments() -> dict[str, dict[str, object]]:
+    """The environments that pages show, with their arguments."""
+    from pipeline.settings.values import parse_assignments
+
+    found = {}
+    for path in sorted(DOCS.rglob("*.md")):
+        for _, kind, arguments in LINE.findall(path.read_text(encoding="utf-8")):
+            if kind in ("environment", "facts"):
+                env_id, *pairs = arguments.split()
+                found[env_id] = parse_assignments(pairs)
+    return found
+
+
+def read(app: Sphinx, page: str, source: list[str]) -> None:
+    """Fill a page before it is parsed; commands in docstrings say what they reach as well."""
+    source[0] = with_outcomes(filled(source[0], (DOCS / page).parent))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Called by Sphinx."""
+    app.connect("source-read", read)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
