@@ -23,10 +23,15 @@ from experiments.study import (
 )
 from pipeline.agent_settings import check_algorithm, check_fit, resolved_spec, training_follows
 from pipeline.digests import DamagedFileError
-from pipeline.environments import check_env_id, make_single_env, usual_kwargs, with_maps_read
+from pipeline.environments import (
+    check_env_id,
+    check_memory,
+    make_single_env,
+    usual_kwargs,
+    with_maps_read,
+)
 from pipeline.errors import UserError
 from pipeline.files import plain
-from pipeline.memory_limits import check_pulls
 from pipeline.models.load import agent_class
 from pipeline.runs import FINISHED, ReadRun, Run, environment_name
 from pipeline.settings.hyperparams import (
@@ -173,6 +178,7 @@ def _by_name(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 # --- The plan of a study.
 
+_BYTES_PER_PULL = 24  # the arm, the reward and the regret
 MOST_RUNS = 1_000_000
 
 # What a batch can follow, besides the agent's own arguments.
@@ -210,9 +216,10 @@ def plan(
     batches = {labels for labels, spec in specs.items() if _is_batch(spec)}
     n_seeds = {labels: (counts or {}).get(labels, study.n_seeds) for labels in specs}
     for labels in batches:
-        check_pulls(
-            n_seeds[labels], specs[labels].hyperparams.n_timesteps or 0, " on ".join(labels)
-        )
+        n_timesteps = specs[labels].hyperparams.n_timesteps or 0
+        pulls = f"{n_seeds[labels]:,} seeds with n_timesteps {n_timesteps:,}"
+        n_bytes = n_seeds[labels] * n_timesteps * _BYTES_PER_PULL
+        check_memory(pulls, n_bytes, " on ".join(labels))
     return [
         _planned_run(study, root, *labels, seed, spec, n_seeds[labels] if labels in batches else 0)
         for seed in study.seeds

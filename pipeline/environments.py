@@ -19,10 +19,10 @@ from envs.bandits.logged import ReplayBandit
 from envs.grid import GridWorld, read_rows
 from envs.wrappers import ActionMasks, has_masks
 from pipeline.errors import UserError, one_line, shown, unknown
-from pipeline.memory_limits import check_environments, check_frame_stack
 from pipeline.stopping import shield_workers
 from pipeline.train_spec import TrainSpec
 from pipeline.user_modules import import_again
+from safe_files.files import memory_bytes
 
 # Where neither the environment nor the hyperparameters limit an episode, evaluation does: a greedy
 # policy that runs in a circle would never end.
@@ -42,9 +42,21 @@ MISTAKES = (
     gym.error.Error,
 )
 
+_BYTES_PER_ENVIRONMENT = 20_000  # CartPole with its Monitor takes more
+
 Wrap = Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]]
 
 TRAINING_VEC_ENVS = {"dummy": "DummyVecEnv", "subproc": "SubprocVecEnv"}
+
+
+def check_memory(what: str, n_bytes: int, where: str) -> None:
+    """Refuse what this machine's memory cannot hold."""
+    if n_bytes > memory_bytes():
+        needed, present = (f"{max(round(n / 2**30), 1):,} GB" for n in (n_bytes, memory_bytes()))
+        raise UserError(
+            f"{where}: {what} would take {needed} of memory at least, "
+            f"and this machine has {present}"
+        )
 
 
 def check_env_id(env_id: str) -> None:
@@ -228,7 +240,7 @@ def _make_vec_env(
 
     from pipeline.settings.components import vec_wrapper_factory
 
-    check_environments(n_envs, spec.env_id)
+    check_memory(f"n_envs {n_envs:,}", n_envs * _BYTES_PER_ENVIRONMENT, spec.env_id)
     kwargs = training_kwargs(spec) if training else evaluation_kwargs(spec)
     if training and spec.vec_env == "subproc":
         shield_workers()
@@ -258,9 +270,7 @@ def _make_vec_env(
     env = env if wrap is None else wrap(env)
     env = _normalize(env, spec, training)
     if spec.hyperparams.frame_stack is not None:
-        n_frames = spec.hyperparams.frame_stack
-        check_frame_stack(n_frames, n_envs, env.observation_space, spec.env_id)
-        env = vec_env.VecFrameStack(env, n_frames)
+        env = vec_env.VecFrameStack(env, spec.hyperparams.frame_stack)
     return BaseAlgorithm._wrap_env(env)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, cast
@@ -37,7 +37,6 @@ from pipeline.evaluation.exact import ExactEvaluator, discount_note, evaluator_o
 from pipeline.evaluation.policies import why_not_exact
 from pipeline.evaluation.sampled import n_environments, takes_batches
 from pipeline.evaluation.value_maps import map_refusal
-from pipeline.memory_limits import check_agent, check_environments, takes_buffers
 from pipeline.models.choose import (
     continuing,
     load_to_continue,
@@ -101,24 +100,15 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     """The arguments of the agent's constructor, checked and made into objects.
 
     Raises:
-        UserError: if one is unknown, has a wrong type or range, or asks for more memory than there
-            is.
+        UserError: if one is unknown, or has a wrong type or range.
     """
     algorithm, kwargs = agent_class(spec.algo), spec.hyperparams.algorithm
     check_action_noise(spec.hyperparams, algorithm, spec.algo)
-    check_environments(spec.hyperparams.n_envs, spec.algo)
-    parameters, observations = algorithm_parameters(algorithm), None
-    if needs_policy(algorithm, kwargs) or takes_buffers(spec.hyperparams, parameters):
-        env = make_single_env(spec, training=True)
-        observations = env.observation_space
-        env.close()
     if needs_policy(algorithm, kwargs):
-        is_dict = isinstance(observations, spaces.Dict)
+        with closing(make_single_env(spec, training=True)) as env:
+            is_dict = isinstance(env.observation_space, spaces.Dict)
         kwargs = {"policy": default_policy(algorithm, is_dict), **kwargs}
-    built = build_algorithm_kwargs(algorithm, kwargs, spec.algo, spec.gym_packages)
-    defaults = {name: parameter.default for name, parameter in parameters.items()}
-    check_agent(spec.hyperparams, {**defaults, **built}, observations, spec.algo)
-    return built
+    return build_algorithm_kwargs(algorithm, kwargs, spec.algo, spec.gym_packages)
 
 
 def set_arithmetic(spec: TrainSpec) -> None:

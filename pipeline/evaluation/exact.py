@@ -6,6 +6,7 @@ and its return under the time limit follows by arithmetic, without evaluation no
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,6 +14,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 
@@ -41,7 +43,6 @@ from mdp.array_types import Bools, Floats
 from pipeline.environments import evaluation_kwargs, make_single_env
 from pipeline.evaluation.policies import OfLastPolicy, best_actions, obstacle, policy_matrix
 from pipeline.evaluation.sampled import Evaluation, Yardstick
-from pipeline.memory_limits import observation_bytes
 from pipeline.train_spec import TrainSpec, is_plain
 
 # What is observed in all states, kept as one array.
@@ -130,6 +131,17 @@ class ExactEvaluator:
         return obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
 
 
+def _observation_bytes(space: spaces.Space[Any]) -> int:
+    """Bytes of one observation; 0 where the space does not tell."""
+    if isinstance(space, spaces.Dict):
+        return sum(map(_observation_bytes, space.spaces.values()))
+    if isinstance(space, spaces.Tuple):
+        return sum(map(_observation_bytes, space.spaces))
+    if space.shape is None or space.dtype is None:
+        return 0
+    return math.prod(space.shape) * space.dtype.itemsize
+
+
 def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
     """The exact evaluator of a run, or None where episodes have to be sampled."""
     if _is_wrapped_as_vector(spec):
@@ -139,7 +151,7 @@ def exact_evaluator(spec: TrainSpec) -> ExactEvaluator | None:
         model, horizon = transition_model(env), time_limit(env)
         if model is None or horizon is None:
             return None
-        if model.n_states * observation_bytes(env.observation_space) > MOST_BYTES_OBSERVED:
+        if model.n_states * _observation_bytes(env.observation_space) > MOST_BYTES_OBSERVED:
             return None
         observations = observations_of_states(env)
         if observations is None:

@@ -59,7 +59,7 @@ def test_a_study_has_a_bearable_number_of_runs(monkeypatch):
 
 
 def test_a_batch_has_a_bearable_number_of_pulls(monkeypatch):
-    monkeypatch.setattr("pipeline.memory_limits.memory_bytes", lambda: 10**6)
+    monkeypatch.setattr("pipeline.environments.memory_bytes", lambda: 10**6)
     settings = {"n_timesteps": 1000, "env_kwargs": {"pulls": 1000}}
     bandit = EnvironmentSpec("arms", "GaussianBandit-v0", settings)
     assert len(plan(study_of("ucb", environments=[bandit], n_seeds=30), Path("nowhere"))) == 1
