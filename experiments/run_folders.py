@@ -23,7 +23,7 @@ from experiments.study import StudySpec
 from pipeline import locks
 from pipeline.digests import STATE_FOLDER, DamagedFileError
 from pipeline.errors import UserError, shown
-from pipeline.files import portable_name, put_in_place, settle, sync_together
+from pipeline.files import portable_name, put_in_place, settle, sync
 from pipeline.locks import seconds_silent
 from pipeline.runs import has_state
 from pipeline.signs_of_life import Tell, tell_nobody
@@ -246,7 +246,7 @@ def put_run_in_place(planned: PlannedRun, draft: Path) -> None:
     except OSError:
         if not planned.is_finished:
             raise
-    sync_together([], list(planned.path.parents)[:3])
+    sync(*list(planned.path.parents)[:3])
 
 
 def _is_kept_aside(folder: Path) -> bool:

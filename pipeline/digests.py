@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -186,6 +187,19 @@ def _as_damage(path: Path) -> Iterator[None]:
         raise DamagedFileError(path, f"cannot be read: {error.strerror}") from error
     except UnsafeFileError as error:
         raise DamagedFileError(path, str(error).removeprefix(f"{path} ")) from error
+
+
+# What the objects of a training, and what is recorded of them, are made by.
+OF_TRAINING = ("safe_files", "machine_code", "mdp", "envs", "agents", "pipeline")
+
+
+@cache
+def source_digest(*more: str) -> str:
+    """The digest of the sources of `OF_TRAINING` and ``more``, as they are when first asked for."""
+    from machine_code.sources import content_lines, source_paths
+    from machine_code.sources import digest_of as digest_of_lines
+
+    return digest_of_lines(content_lines(source_paths({*OF_TRAINING, *more})))
 
 
 def _seal(record: Mapping[str, Any]) -> str:

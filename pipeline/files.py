@@ -1,7 +1,4 @@
-"""Writing files so that a reader, or a crash, never meets a half-written one; names for them.
-
-And JSON that every reader takes: Python's own writes ``NaN`` and ``Infinity``, which are none.
-"""
+"""Writing files so that a reader, or a crash, never meets a half-written one; their names; JSON."""
 
 from __future__ import annotations
 
@@ -15,18 +12,13 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from functools import lru_cache
 from io import BufferedWriter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from safe_files.files import NEW, folder_of, open_number
-
-if TYPE_CHECKING:
-    from concurrent.futures import ThreadPoolExecutor
-
 
 # Windows takes no more than 260 characters for a whole path, Linux no more than 255 bytes a name.
 LONGEST_NAME = 100  # bytes
@@ -42,22 +34,16 @@ DISK_ERRORS = frozenset({errno.ENOSPC, errno.EFBIG, errno.EIO, getattr(errno, "E
 # Folders of others above one's own, and file systems that flush no folder.
 _CANNOT_SYNC = frozenset({errno.EACCES, errno.EPERM, errno.EINVAL, errno.ENOTSUP})
 
-SYNCED_AT_ONCE = 8
+_SYNCED_AT_ONCE = 8
 
 # Windows refuses to rename what a reader or a virus scanner has open, mostly for an instant.
 _PAUSES = (0.05, 0.1, 0.2, 0.4, 0.8)  # seconds
 
 
 def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
-    """The name of a file or folder, as every common file system takes it.
+    """The name where every common file system takes it; else one like it, with a digest.
 
-    Args:
-        name: what it should be called.
-        longest: how many bytes it may have.
-
-    Returns:
-        The name as it is, where no system would refuse it; otherwise one that resembles it, with a
-        digest that keeps it apart from others.
+    It has at most ``longest`` bytes.
     """
     plain = _REFUSED_SIGNS.sub("_", name) or "_"
     is_device = _DEVICE.match(plain) is not None
@@ -73,10 +59,7 @@ def portable_name(name: str, longest: int = LONGEST_NAME) -> str:
 def put_in_place(draft: Path, path: Path, folder: int | None = None) -> None:
     """Rename a file or folder to ``path``; a file that is there is replaced in one step.
 
-    Args:
-        draft: what there is.
-        path: what it is to be called.
-        folder: the open folder that both are names in; None where they are whole paths.
+    Both are names in the open ``folder``, where there is one.
     """
     for pause in _PAUSES if sys.platform == "win32" else ():
         try:
@@ -103,13 +86,9 @@ def naming(path: Path) -> Iterator[None]:
 def replacing(path: Path) -> Iterator[BufferedWriter]:
     """Give a file to write to, and let it appear as ``path`` once it is whole.
 
-    Nobody meets a half-written file then, whatever becomes of the process; a power cut may still
-    take the file. A link or pipe of that name is replaced and not written to; and who exchanges its
-    folder meanwhile changes nothing, since names are those of the open folder.
-
-    Raises:
-        OSError: if the folder is gone, as one that was renamed meanwhile, or lies behind a link in
-            a folder that is held: see `safe_files.files`.
+    Nobody meets a half-written file, whatever becomes of the process; a power cut may still take
+    it. A link or pipe of that name is replaced and not written to. Names are those of the open
+    folder, so that exchanging the folder meanwhile changes nothing.
     """
     # A name that could be guessed might be there already, as a link to another's file.
     name = f".{path.name}.{secrets.token_hex(8)}.tmp"
@@ -130,69 +109,41 @@ def replacing(path: Path) -> Iterator[BufferedWriter]:
 
 def settle(folder: Path) -> None:
     """Wait until the disk has a folder and all that is in it."""
-    sync_together(files_below(folder), [Path(parent) for parent, *_ in os.walk(folder)])
+    sync(*files_below(folder), *(Path(parent) for parent, *_ in os.walk(folder)))
+
+
+def sync(*paths: Path) -> None:
+    """Wait until the disk has the contents of files and the names in folders.
+
+    All are asked for at once: one after the other, each would be finished before the next begins.
+    """
+    from concurrent.futures import ThreadPoolExecutor  # half of what this module would take to load
+
+    with ThreadPoolExecutor(_SYNCED_AT_ONCE) as pool:
+        list(pool.map(_sync, paths))
+
+
+def _sync(path: Path) -> None:
+    is_folder = path.is_dir()
+    if sys.platform == "win32" and is_folder:  # it keeps names in a journal, and flushes no folder
+        return
+    try:
+        # Windows flushes only what may be written.
+        access = os.O_RDWR if sys.platform == "win32" else os.O_RDONLY
+        number = os.open(path, access) if is_folder else open_number(path, access)
+        try:
+            os.fsync(number)
+        finally:
+            os.close(number)
+    except OSError as error:
+        if not is_folder or error.errno not in _CANNOT_SYNC:
+            raise
 
 
 def files_below(folder: Path) -> list[Path]:
     """The regular files in a folder and in those inside it; no link is followed or counts."""
     paths = (Path(parent, name) for parent, _, names in os.walk(folder) for name in names)
     return [path for path in paths if path.is_file() and not path.is_symlink()]
-
-
-def sync_file(path: Path) -> None:
-    """Wait until the disk has the contents of a file."""
-    # Windows flushes only what may be written.
-    number = open_number(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
-    try:
-        os.fsync(number)
-    finally:
-        os.close(number)
-
-
-if sys.platform == "win32":
-
-    def sync_folders(*folders: Path) -> None:
-        """Nothing: Windows keeps names in a journal of its own, and flushes no folder."""
-else:
-
-    def sync_folders(*folders: Path) -> None:
-        """Wait until the disk has the names in the folders, as far as this user may ask for it."""
-        for folder in folders:
-            try:
-                number = os.open(folder, os.O_RDONLY)
-                try:
-                    os.fsync(number)
-                finally:
-                    os.close(number)
-            except OSError as error:
-                if error.errno not in _CANNOT_SYNC:
-                    raise
-
-
-def sync_together(files: Iterable[Path], folders: Iterable[Path]) -> None:
-    """Wait until the disk has files and the names in folders, which are asked for at once.
-
-    A disk that is asked for one after the other has to finish each before it hears of the next.
-    """
-    from concurrent.futures import wait  # half of what this module would take to load
-
-    pool = _waiting_threads(os.getpid())
-    waits = [pool.submit(sync_file, path) for path in files]
-    waits += [pool.submit(sync_folders, folder) for folder in folders]
-    wait(waits)
-    for one in waits:
-        one.result()
-
-
-@lru_cache(maxsize=1)
-def _waiting_threads(pid: int) -> ThreadPoolExecutor:
-    """The threads of a process that wait for its disk: to start them takes longer than to wait.
-
-    A process has none of those that it was forked from had.
-    """
-    from concurrent.futures import ThreadPoolExecutor
-
-    return ThreadPoolExecutor(SYNCED_AT_ONCE, f"disk-{pid}")
 
 
 def drafts_in(folder: Path) -> list[Path]:

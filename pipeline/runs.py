@@ -16,7 +16,7 @@ import re
 import secrets
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
@@ -42,7 +42,6 @@ from pipeline.files import (
     portable_name,
     put_in_place,
     replacing,
-    sync_together,
     write_json,
     write_text,
 )
@@ -315,11 +314,6 @@ class Run:
         digests = self.files.digests
         if digests is not None and path.parent.resolve() == self.path.resolve():
             self.update_info(**{FIELD: {**digests, path.name: digest_of(path)}})
-
-    def wait_for_disk(self, files: Sequence[Path]) -> None:
-        """Wait until the disk has files of the run, and the way to them."""
-        way = [self.path, *self.path.parents][:3]
-        sync_together(files, {*(path.parent for path in files), *way})
 
     @property
     def files(self) -> RecordedFiles:

@@ -8,11 +8,9 @@
 | | the header, JSON: the note, places in the training, length and SHA-256 of each part |
 | | the parts: the pickle, then memory of arrays and tensors, each without the zeros at its end |
 
-A pickle can run any code when it is loaded. So nothing is unpickled before the header's HMAC and
-the SHA-256 of each part are found right, and what is unpickled are the very bytes that were
-checked. The file of another user or machine, or one with a single bit changed, is refused.
-
-The newest two states of a run are kept, so that one is whole.
+A pickle can run any code when it is loaded. So the header's HMAC and the SHA-256 of each part are
+checked first, and what is unpickled are the very bytes that were checked. The newest two states of
+a run are kept, so that one is whole.
 """
 
 from __future__ import annotations
@@ -34,10 +32,10 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
+from pipeline.digests import source_digest
 from pipeline.errors import UserError
-from pipeline.files import replacing, sync_folders
+from pipeline.files import replacing, sync
 from pipeline.runs import state_file, state_files
-from pipeline.source_digest import source_digest
 from pipeline.states import Pickled, Place
 from safe_files.files import NO_LIMIT, UnsafeFileError, opened
 
@@ -55,15 +53,10 @@ class BadStateError(Exception):
 
 @dataclass(frozen=True)
 class SavedState:
-    """A state that was read back and whose signature is right; nothing is unpickled yet.
+    """A state that was read back and whose signature is right; nothing is unpickled yet."""
 
-    Attributes:
-        content: the training.
-        note: what else was written down.
-    """
-
-    content: Pickled
-    note: dict[str, Any]
+    content: Pickled  # the training
+    note: dict[str, Any]  # what else was written down
 
     @property
     def is_of_these_sources(self) -> bool:
@@ -72,28 +65,18 @@ class SavedState:
 
 
 def save_state(folder: Path, number: int, content: Pickled, note: dict[str, Any]) -> None:
-    """Write the state of that number in place of the one before the last.
-
-    Raises:
-        OSError: if it cannot be written; the last one is there still.
-        UserError: if there is no key to sign it with.
-    """
+    """Write the state of that number in place of the one before the last."""
     key = state_key()
     folder.mkdir(exist_ok=True)
     with replacing(state_file(folder, number)) as file:
         write_state(file, content, {**note, "number": number, SOURCES: source_digest()}, key)
-    sync_folders(folder)
+    sync(folder)
 
 
 def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | None:
-    """The newest state that is whole, or None where there is none at all.
+    """The newest state that is whole; None where there is none at all.
 
-    Args:
-        folder: the states'.
-        tell: told of one that is not.
-
-    Raises:
-        UserError: if there are some, and none is whole or this user's.
+    What is damaged or another user's is told, and refused where nothing else is there.
     """
     key, found, reasons = state_key(), [], []
     for path in filter(Path.is_file, state_files(folder)):
@@ -113,14 +96,7 @@ def newest_state(folder: Path, tell: Callable[[str], object]) -> SavedState | No
 
 
 def write_state(file: BufferedWriter, content: Pickled, note: dict[str, Any], key: bytes) -> None:
-    """Write a state and flush it to the disk.
-
-    Args:
-        file: where to, open and empty.
-        content: the training.
-        note: what else the file is to say, as JSON; it is read before anything is unpickled.
-        key: what signs the file.
-    """
+    """Write a state, with a note as JSON, and flush it to the disk."""
     memories = [(_as_array(memory), isinstance(memory, th.Tensor)) for memory in content.memories]
     parts = [np.frombuffer(content.pickled, np.uint8)]
     parts += [_without_zeros(memory) for memory, _ in memories]
@@ -143,16 +119,7 @@ def write_state(file: BufferedWriter, content: Pickled, note: dict[str, Any], ke
 
 
 def read_state(file: BufferedReader, key: bytes) -> SavedState:
-    """Read a state and check it, without unpickling anything.
-
-    Args:
-        file: open at its beginning.
-        key: as it was signed with.
-
-    Raises:
-        BadStateError: if the file holds none, a damaged one, or one made under another key.
-        OSError: if it cannot be read.
-    """
+    """Read a state and check it, without unpickling anything."""
     if file.read(len(MAGIC)) != MAGIC:
         raise BadStateError("it is no state, or one of another version of Yardstick")
     signature, length = file.read(hashlib.sha256().digest_size), file.read(8)
@@ -211,11 +178,7 @@ def _without_zeros(content: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def state_key() -> bytes:
-    """The key that this user's states are signed with.
-
-    Raises:
-        UserError: if there is none and none can be made.
-    """
+    """The key that this user's states are signed with."""
     try:
         return user_key(APPLICATION)
     except OSError as error:
@@ -225,11 +188,7 @@ def state_key() -> bytes:
 
 
 def configuration_folder(application: str) -> Path:
-    """Where an application keeps what belongs to the user; the folder need not be there.
-
-    Raises:
-        OSError: if the user has no home.
-    """
+    """Where an application keeps what belongs to the user; the folder need not be there."""
     try:
         home = Path.home()
     except RuntimeError as error:
@@ -242,11 +201,7 @@ def configuration_folder(application: str) -> Path:
 
 
 def user_key(application: str) -> bytes:
-    """The user's key for an application; made at the first call, readable by the user alone.
-
-    Raises:
-        OSError: if there is none and none can be made, or others may read or change it.
-    """
+    """The user's key for an application; made at the first call, readable by the user alone."""
     path = configuration_folder(application) / "snapshots.key"
     if not os.path.lexists(path):
         _make(path)

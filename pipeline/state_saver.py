@@ -1,4 +1,4 @@
-"""Keeps the state of a training, and puts a training back into it."""
+"""Saves the state of a training, and puts a training back into it."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from agents.common.callbacks import BlockCallback, Horizon
 from machine_code.work_time import WorkTime
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator
-from pipeline.files import files_below, sync_file
+from pipeline.files import settle, sync
 from pipeline.progress import ProgressDisplay
 from pipeline.runs import Run
 from pipeline.state_files import SavedState, save_state
 from pipeline.states import NotFittingError, NotKeepableError, pickled, unpickled
 from pipeline.stopping import current
-from pipeline.unfinished_runs import Position, SaveInterval, log_positions, settings_digest
+from pipeline.unfinished_runs import SaveInterval, log_positions, settings_digest
 from pipeline.user_modules import UserModule
 
 # Saving may take this share of the time, where the user has not said how often.
@@ -44,56 +44,16 @@ FIRST_COST = 0.05  # seconds; of states of which nothing is known
 # double, so that half of what was done since is kept.
 SHORTEST_PAUSE = 0.1
 
-# Bytes of a file since the last state. A fast table writes many times that in a second, and waiting
-# until the disk has it would take more than all else.
-MOST_SYNCED = 1 << 20
 
+class StateSaver(BlockCallback):
+    """Saves all that a training consists of; ends the training where a signal asks for it.
 
-class StopAtSafeMoment(BlockCallback):
-    """Ends the training, if a signal asks for it, before the next steps are taken.
-
-    That is after the last update and before the environments move: what the agent has seen it has
-    learnt from, and what it is about to see has not happened yet.
+    Both happen at a safe moment: after the last update and before the environments move. The state
+    is that of the agent with its environments, of all callbacks with the environments that they
+    evaluate on, of the user's modules, and of the generators that libraries share.
     """
 
     takes_blocks = True
-
-    def _on_rollout_start(self) -> None:
-        self.stop_if_asked()
-
-    def stop_if_asked(self) -> None:
-        """End the training here, if a signal asks for it.
-
-        Raises:
-            Stopped: if so.
-        """
-        stop = current()
-        if stop.number is not None:
-            with stop.held():
-                self.before_stopping()
-            stop.raise_if_asked()
-
-    def before_stopping(self) -> None:
-        """What there is to do at the last safe moment."""
-
-    def _on_step(self) -> bool:
-        return True
-
-
-class StateSaver(StopAtSafeMoment):
-    """Saves all that a training consists of, between two updates; the first of the callbacks.
-
-    The state is that of the agent with its environments, of all other callbacks with the
-    environments that they evaluate on, of the user's modules, and of the generators that libraries
-    share.
-
-    Args:
-        run: whose folder the states go to.
-        root: all callbacks, this one among them.
-        interval: how often.
-        tell: told in one line why no state is kept, where that is so.
-        state: what the training goes on from, or None where it begins.
-    """
 
     def __init__(
         self,
@@ -105,12 +65,12 @@ class StateSaver(StopAtSafeMoment):
     ) -> None:
         super().__init__()
         self.run = run
-        self.root: BaseCallback = self
-        self.modules: tuple[UserModule, ...] = ()
+        self.root: BaseCallback = self  # all callbacks, this one among them
+        self.modules: tuple[UserModule, ...] = ()  # the user's
         self.told: set[str] = set()
         self.interval = interval
-        self.tell = tell
-        self.state = state
+        self.tell = tell  # told in one line why no state is kept
+        self.state = state  # that the training goes on from
         self.is_off = interval.is_off
         note = {} if state is None else state.note
         self.n_saved = int(note.get("number", 0))
@@ -119,8 +79,6 @@ class StateSaver(StopAtSafeMoment):
             float(note.get("seconds", 0.0)), float(note.get("cpu_seconds", 0.0))
         )
         self.started = WorkTime.now()
-        self.n_synced: dict[str, int] = {}  # bytes, by the names of files
-        self.stamps: dict[Path, tuple[int, int, int]] = {}  # of files that the disk has
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
         self.was_cut_off = was_cut_off
@@ -144,11 +102,6 @@ class StateSaver(StopAtSafeMoment):
         if getattr(self.model, "tells_safe_moments", False):
             self._act()
 
-    def before_stopping(self) -> None:
-        """Save the state that the run is to go on from, unless a second signal is in a hurry."""
-        if not (self.is_off or current().is_urgent):
-            self.save()
-
     def _on_training_start(self) -> None:
         self.steps_at_save = self.model.num_timesteps
         self.saved_at, self.started = time.monotonic(), WorkTime.now()
@@ -157,13 +110,21 @@ class StateSaver(StopAtSafeMoment):
         if not getattr(self.model, "tells_safe_moments", False):
             self._act()
 
+    def _on_step(self) -> bool:
+        return True
+
     def _act(self) -> None:
         if self.state is not None:
             state, self.state = self.state, None
             self._go_back_to(state)
         elif self._is_due():
             self.save()
-        self.stop_if_asked()
+        stop = current()
+        if stop.number is not None:
+            with stop.held():
+                if not (self.is_off or stop.is_urgent):
+                    self.save()
+            stop.raise_if_asked()
         self.n_rollouts += 1
 
     def _is_due(self) -> bool:
@@ -196,17 +157,13 @@ class StateSaver(StopAtSafeMoment):
             self.pause = min(pause, 2 * (self.pause + seconds)) if self.was_cut_off else pause
 
     def _first_pause(self, note: Mapping[str, Any]) -> float:
-        """Seconds until the first state, where the user has not said how often.
-
-        A training that begins waits until a state is likely to be `SHARE_OF_TIME` of it; one that
-        was cut off no longer than saving took before.
-        """
+        """Seconds until the first state, where the user has not said how often."""
         if not self.was_cut_off:
             return FIRST_COST / SHARE_OF_TIME
         return max(float(note.get("pause", 0.0)) * SHARE_OF_TIME, SHORTEST_PAUSE)
 
     def _tell_once(self, line: str) -> None:
-        """Say a line that would be the same at each state, as long as a disk is full."""
+        """Say a line once that would be the same at each state, as long as a disk is full."""
         if line not in self.told:
             self.told.add(line)
             self.tell(line)
@@ -233,33 +190,12 @@ class StateSaver(StopAtSafeMoment):
             "pause": self.pause,
             "spec": settings_digest(self.run.recorded_spec()),
         }
-        self._sync(positions)
+        # The disk has to have what the state is checked against, and what is not written again.
+        settle(self.run.path)
+        logs = (self.run.path / name for name in positions)
+        sync(*(path for path in logs if path.parent != self.run.path), *self.run.path.parents[:2])
         save_state(self.run.state_path, self.n_saved + 1, content, note)
         self.n_saved += 1
-
-    def _sync(self, positions: Mapping[str, Position]) -> None:
-        """Let the disk have what the state is held against, and what is not written anew after it.
-
-        Of logs that grow fast, only as far as that takes no time.
-        """
-        for name, (length, *_) in positions.items():
-            if length - self.n_synced.get(name, 0) <= MOST_SYNCED:
-                sync_file(self.run.path / name)
-            self.n_synced[name] = length
-        self.run.wait_for_disk(self._files_changed(positions))
-
-    def _files_changed(self, logs: Mapping[str, Position]) -> list[Path]:
-        """The files of the run beside its logs and states that the disk may not have yet."""
-        changed = []
-        for path in files_below(self.run.path):
-            if path.parent == self.run.state_path or path.name in logs:
-                continue
-            status = path.stat()
-            stamp = status.st_ino, status.st_mtime_ns, status.st_size
-            if self.stamps.get(path) != stamp:
-                self.stamps[path] = stamp
-                changed.append(path)
-        return changed
 
     def _roots(self) -> dict[str, Any]:
         logger = self.model.logger
@@ -298,10 +234,7 @@ class StateSaver(StopAtSafeMoment):
 
 @contextmanager
 def _garbage_left() -> Iterator[None]:
-    """Do without the garbage collector: a state has no cycles, and may set off a search for them.
-
-    That goes through all that the libraries hold, and takes several times as long as the state.
-    """
+    """Do without the garbage collector, which takes several times as long as the state."""
     was_on = gc.isenabled()
     gc.disable()
     try:
@@ -362,9 +295,7 @@ _CODE = (ModuleType, type, FunctionType)
 def user_state(modules: Iterable[UserModule]) -> dict[str, dict[str, Any]]:
     """The values of global names and of classes' attributes, by the names of their holders.
 
-    Args:
-        modules: those that were typed; what lies beside them counts too, what is installed does
-            not.
+    What lies beside the modules counts too; what is installed does not.
     """
     return {name: _values(holder) for name, holder in _holders(modules)}
 
@@ -431,13 +362,6 @@ class IterationInterval(int):
     """
 
     before: int
-
-    @classmethod
-    def after(cls, before: int, interval: int) -> IterationInterval:
-        """An interval, where so many iterations went before."""
-        result = cls(interval)
-        result.before = before
-        return result
 
     def __rmod__(self, iteration: int) -> int:
         return (iteration + self.before) % int(self)

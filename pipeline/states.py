@@ -1,17 +1,18 @@
 """The state of a training under way as one pickle, and back into a training that was built anew.
 
-What belongs to the process (log files, threads, windows, the run itself) is not pickled. The state
-says at which place it was, and takes what is at that place of the newly built training. Agent,
-environments, buffers and callbacks are pickled, but filled into those that were built anew, because
-functions that are running hold them. The memory of arrays and tensors stands beside the pickle, so
-that nothing is copied, and arrays that share memory share it again.
+- What belongs to the process (log files, threads, windows, the run) is not pickled. The state keeps
+  its place in the training, and takes what is at that place of the newly built one.
+- Agent, environments, buffers and callbacks are filled into those that were built anew, because
+  running functions hold them.
+- The memory of arrays and tensors stands beside the pickle, without a copy; what shared memory
+  shares it again.
 
-A pickle can run any code when it is loaded. `pipeline.state_files` sees to it that only this user's
-own are.
+A pickle can run any code: `pipeline.state_files` has only this user's own loaded.
 """
 
 from __future__ import annotations
 
+import copyreg
 import functools
 import importlib
 import io
@@ -28,7 +29,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import PurePath
 from types import CellType, CodeType, FunctionType, MethodType, ModuleType
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import cloudpickle
 import gymnasium as gym
@@ -85,15 +86,22 @@ class NotFittingError(Exception):
     """A state does not fit what was built anew."""
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """Where an object was: the steps that `_children` names, and the name of its class."""
 
-    steps: tuple[str, ...]
+    steps: Sequence[str]
     class_name: str
 
-    def __str__(self) -> str:
-        return "".join(self.steps)
+
+@dataclass(frozen=True)
+class Pickled:
+    """Objects as a pickle, and what it needs beside it."""
+
+    pickled: bytes | memoryview
+    places: Sequence[Place]  # of what it takes from the newly built training
+    memories: Sequence[NDArray[np.uint8] | th.Tensor]
+    has_code: bool = False  # functions, which another version of Python cannot read
+    lost: Sequence[str] = ()  # what is not kept and may make a difference, with its place
 
 
 # --- from objects to a pickle --------------------------------------------------------------------
@@ -101,7 +109,7 @@ class Place:
 
 @dataclass(frozen=True, eq=False)
 class Memory:
-    """Bytes that arrays and tensors look into, so that they share them again."""
+    """Bytes that arrays and tensors look into."""
 
     begin: int
     content: NDArray[np.uint8]
@@ -111,36 +119,11 @@ class Memory:
         return self.begin <= begin and end <= self.begin + len(self.content)
 
 
-@dataclass(frozen=True)
-class Pickled:
-    """Objects as a pickle, and what it needs beside it.
-
-    Attributes:
-        pickled: the pickle.
-        places: where in the training that is what it takes from it.
-        memories: bytes, each an array or a tensor.
-        has_code: whether functions are in it, which another version of Python cannot read.
-        lost: what is not kept although it may make a difference, each named with its place.
-    """
-
-    pickled: bytes | memoryview
-    places: Sequence[Place]
-    memories: Sequence[NDArray[np.uint8] | th.Tensor]
-    has_code: bool = False
-    lost: Sequence[str] = ()
-
-
 def pickled(roots: dict[str, Any], kept: tuple[type, ...] = ()) -> Pickled:
-    """Pickle objects, without changing them.
+    """Pickle objects by name; those of the classes ``kept`` belong to the process.
 
-    The memories are those of the objects: write them out before they go on.
-
-    Args:
-        roots: the objects, by name.
-        kept: classes whose objects belong to the process.
-
-    Raises:
-        NotKeepableError: if an object cannot be pickled, naming its place.
+    The memories are those of the objects: write them out before they go on. What cannot be pickled
+    raises `NotKeepableError`, which names its place.
     """
     stream = io.BytesIO()
     pickler = _Pickler(stream, roots, kept)
@@ -173,9 +156,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         """Pickle the roots."""
         try:
             self.dump(roots)
-        except NotKeepableError:
-            raise
-        except MemoryError:
+        except (NotKeepableError, MemoryError):
             raise
         except Exception as error:  # objects may raise anything where they are looked into
             deep = isinstance(error, RecursionError) or isinstance(error.__cause__, RecursionError)
@@ -236,8 +217,8 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
     def _is_made_of_attributes(self, kind: Any) -> bool:
         """Whether attributes are all that objects of a class hold.
 
-        What such a class says in `__getstate__` is not asked: it may leave out what a model file
-        does not need, or make the object anew, as environments that are an `EzPickle` do.
+        `__getstate__` is not asked: it may leave out what a model file does not need, or have the
+        object made anew, as an `EzPickle` does.
         """
         return (
             kind.__reduce_ex__ is object.__reduce_ex__
@@ -319,10 +300,8 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         return self._memory(storage.data_ptr(), storage.nbytes(), True, (tensor, storage))
 
     def _memory(self, begin: int, n_bytes: int, is_tensor: bool, owner: Any) -> Memory:
-        known = self._known_memories.get(begin)
-        if known is None or not known.reaches(begin, begin + n_bytes):
-            place = bisect_right(self._begins, begin)
-            known = self._known_memories[self._begins[place - 1]] if place else None
+        place = bisect_right(self._begins, begin)
+        known = self._known_memories[self._begins[place - 1]] if place else None
         if n_bytes and known is not None and known.reaches(begin, begin + n_bytes):
             return known
         memory = Memory(begin, _bytes_at(begin, n_bytes, owner), is_tensor)
@@ -361,10 +340,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
 def _steps_to(roots: Mapping[str, Any], everything: bool) -> dict[int, tuple[str, ...]]:
     """How objects are reached from the roots, by their ids.
 
-    Args:
-        roots: the objects to begin with.
-        everything: whether to look into all objects, or only into those that are filled in and
-            what lies in them and in their lists.
+    Without ``everything`` only what is filled in is looked into, and short lists in it.
     """
     found: dict[int, tuple[str, ...]] = {}
     pending: deque[tuple[tuple[str, ...], Any, bool]] = deque(
@@ -427,15 +403,9 @@ def _attributes_of(obj: Any) -> Iterator[tuple[str, Any]]:
 @functools.cache
 def _slots(kind: Any) -> tuple[str, ...]:
     """The names of the slots of a class and those above it, as attributes are called."""
-    found = []
-    for base in kind.__mro__:
-        declared = vars(base).get("__slots__", ())
-        for name in [declared] if isinstance(declared, str) else declared:
-            if name in ("__dict__", "__weakref__"):
-                continue
-            private = name.startswith("__") and not name.endswith("__")
-            found.append(f"_{base.__name__.lstrip('_')}{name}" if private else name)
-    return tuple(found)
+    # `object.__reduce_ex__` goes by the same list, and the type checker does not know it.
+    slot_names: Any = getattr(copyreg, "_slotnames")  # noqa: B009
+    return tuple(slot_names(kind))
 
 
 def _hides_state(kind: type) -> bool:
@@ -478,11 +448,7 @@ def _name_of(value: Any) -> str:
 
 
 def _find(name: str) -> Any:
-    """The class or function of that name, in a module that is there already; None if there is none.
-
-    Args:
-        name: as `_name_of` has it.
-    """
+    """The class or function of a `_name_of`, in a module that is there already; else None."""
     module, _, path = name.partition(":")
     found: Any = sys.modules.get(module)
     for part in path.split("."):
@@ -512,19 +478,11 @@ def _bytes_at(begin: int, n_bytes: int, owner: Any) -> NDArray[np.uint8]:
 def unpickled(
     state: Pickled, roots: dict[str, Any], moved: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
-    """Unpickle what this user has pickled, into objects that were built anew.
+    """Unpickle what this user has pickled, into objects of the same names that were built anew.
 
-    Args:
-        state: as `pickled` made it, and nobody else.
-        roots: the objects that were built anew, by the names that they were saved under.
-        moved: folders that have another name by now; texts that begin with one are changed.
-
-    Returns:
-        What was saved, by name; objects of `FILLED_IN` are those of ``roots``.
-
-    Raises:
-        NotFittingError: if something that belongs to the process is missing there; nothing has
-            changed by then.
+    Texts that begin with a folder that has ``moved`` are changed. What was saved is returned by
+    name; objects of `FILLED_IN` are those of ``roots``. `NotFittingError` names what belongs to the
+    process and is missing there.
     """
     renamed = {before: now for before, now in (moved or {}).items() if before != now}
     existing = [_follow(roots, place) for place in state.places]
@@ -560,13 +518,15 @@ class _Existing:
         found, place = self.existing[number], self.places[number]
         wanted, above = place.class_name, type(found).__mro__
         if wanted not in map(_name_of, above) and not wanted.startswith(_MADE_ANEW):
-            raise NotFittingError(f"{wanted.replace(':', '.')} is missing in {place}")
+            where = "".join(place.steps)
+            raise NotFittingError(f"{wanted.replace(':', '.')} is missing in {where}")
         return found
 
     def _filled_in(self, number: int, kind: type) -> Any:
         found = self.existing[number]
         if isinstance(found, FILLED_IN) and type(found) is not kind:
-            raise NotFittingError(f"{kind.__qualname__} is missing in {self.places[number]}")
+            where = "".join(self.places[number].steps)
+            raise NotFittingError(f"{kind.__qualname__} is missing in {where}")
         return found if type(found) is kind else _blank(kind)
 
 

@@ -1,4 +1,9 @@
-"""How a training is asked to stop, by signals and when a worker process ends."""
+"""How a command is stopped: Ctrl-C, SIGTERM and SIGHUP all ask for the same, and lose nothing.
+
+Within `stops_noticed` the first signal raises `Stopped` in the main thread, as Ctrl-C raises
+KeyboardInterrupt: at once, or where the work can wait for a better moment, then or when it has
+waited long enough. The second one waits for nothing but what is `held`. The third ends the process.
+"""
 
 from __future__ import annotations
 
@@ -20,14 +25,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 
-# How a command is stopped: Ctrl-C, SIGTERM and SIGHUP all ask for the same, and lose nothing.
-#
-# Within `stops_noticed` the first signal raises `Stopped` in the main thread, as Ctrl-C raises
-# KeyboardInterrupt: at once, or where the work can wait for a better moment, then or when it has
-# waited long enough. The second one waits for nothing but what is `held`. The third ends the
-# process
-# as if nothing were in its way.
-
 # Those that a platform lacks are left out: Windows has no SIGHUP.
 SIGNALS = tuple(
     getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
@@ -41,11 +38,7 @@ _SOON = 0.02  # seconds
 
 
 class Stopped(KeyboardInterrupt):
-    """A signal asked the process to stop.
-
-    Attributes:
-        number: the signal.
-    """
+    """A signal of this ``number`` asked the process to stop."""
 
     def __init__(self, number: int) -> None:
         super().__init__(number)
@@ -61,10 +54,9 @@ class StopRequest:
     def __init__(self) -> None:
         self.number: int | None = None  # the first signal that asked
         self.n_asked = 0  # how often; signals in quick succession count once
-        self._asked_at = self._signalled_at = self._raised_at = -math.inf
-        self._patience = 0.0  # seconds
-        self._reminds = False
-        self._alarm_before: tuple[Any, tuple[float, float]] | None = None  # handler, and its timer
+        self._asked_at = self._signalled_at = -math.inf
+        self._patience = 0.0  # seconds; infinite where nothing may be raised
+        self._is_waiting = False  # inside `waiting`, and so reminded by a timer
 
     @property
     def is_urgent(self) -> bool:
@@ -78,31 +70,22 @@ class StopRequest:
 
     @contextmanager
     def waiting(self, seconds: float) -> Iterator[None]:
-        """Let a stop wait inside the ``with`` statement; inside another, this one counts.
+        """Let a stop wait so long inside the ``with`` statement, unless a second signal comes.
 
-        Args:
-            seconds: for how long after the first signal, if `raise_if_asked` is not called before;
-                0 for not at all. A second signal ends the waiting.
-
-        Raises:
-            Stopped: when the time is over, also at the beginning of the ``with`` statement; and
-                in the place of any exception that comes of it, as of a library that swallowed it.
+        When the time is over `Stopped` is raised, also in the place of an error that comes of it.
         """
-        before = self._patience, self._reminds
-        self._patience, self._reminds, self._raised_at = seconds, True, -math.inf
+        before = self._patience, self._is_waiting
+        self._patience, self._is_waiting = seconds, True
         try:
-            if self._is_due():
-                self.raise_if_asked()
-            self._set_timer()
+            self._raise_if_due()
             yield
         except Exception as error:
-            was_raised_here = self._raised_at > -math.inf
-            if self.number is None or not (was_raised_here or _is_of_a_stop(error)):
+            if self.number is None or self._seconds_left() > 0:
                 raise
             raise Stopped(self.number) from error
         finally:
-            self._patience, self._reminds = before
-            self._set_timer()
+            self._patience, self._is_waiting = before
+            self._set_timer(self._seconds_left())
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -112,83 +95,46 @@ class StopRequest:
             yield
         finally:
             self._patience = before
-            self._set_timer()
+            self._set_timer(self._seconds_left())
 
     def notice(self, number: int, frame: FrameType | None = None) -> None:
         """Handle a signal, by raising `Stopped` if that need not wait."""
         now = time.monotonic()
         is_another = now - self._signalled_at > SECONDS_OF_ONE_REQUEST
         self._signalled_at = now
+        if not is_another:
+            return
+        self.n_asked += 1
         if self.number is None:
-            self.number, self.n_asked, self._asked_at = number, 1, now
+            self.number, self._asked_at = number, now
             _noticed.append(number)
-            if sys.platform != "win32":
-                self._alarm_before = (
-                    signal.signal(signal.SIGALRM, self._remind),
-                    signal.setitimer(signal.ITIMER_REAL, 0),
-                )
-        elif is_another:
-            self.n_asked += 1
         if self.n_asked > 2:
             signal.signal(number, signal.SIG_DFL)
             signal.raise_signal(number)
         self._raise_if_due()
 
-    def _remind(self, number: int, frame: FrameType | None) -> None:
-        if self._reminds:
-            self._raise_if_due()
+    def _seconds_left(self) -> float:
+        """Until `Stopped` is to be raised; infinite where nobody has asked, or it is held."""
+        if self.number is None or self._patience == math.inf:
+            return math.inf
+        return 0.0 if self.is_urgent else self._asked_at + self._patience - time.monotonic()
 
-    def _raise_if_due(self) -> None:
-        is_due = self._is_due()
-        if is_due:
-            self._raised_at = time.monotonic()
-        self._set_timer()
-        if is_due:
+    def _raise_if_due(self, *_: object) -> None:
+        left = self._seconds_left()
+        self._set_timer(left if left > 0 else SECONDS_BEFORE_RAISING_AGAIN)
+        if left <= 0:
             self.raise_if_asked()
 
-    def _is_due(self) -> bool:
-        now = time.monotonic()
-        if self.number is None or self._patience == math.inf:
-            return False
-        if now < self._raised_at + SECONDS_BEFORE_RAISING_AGAIN:
-            return False
-        return self.is_urgent or now >= self._asked_at + self._patience
+    def _set_timer(self, seconds: float) -> None:
+        """Have `_raise_if_due` called then, also where the main thread waits for something.
 
-    def _set_timer(self) -> None:
-        """Have the main thread reminded when its time is over, wherever it waits.
-
-        An alarm also ends a wait for input or another process. Windows has none: what waits there
-        is told at the next safe moment.
+        Windows has no such timer: what waits there is told at the next safe moment.
         """
-        if sys.platform == "win32" or self._alarm_before is None:
-            return
-        delay = 0.0  # for none
-        if self._reminds and self._patience < math.inf:
-            due = -math.inf if self.is_urgent else self._asked_at + self._patience
-            again = self._raised_at + SECONDS_BEFORE_RAISING_AGAIN
-            delay = max(due - time.monotonic(), again - time.monotonic(), _SOON)
-        signal.setitimer(signal.ITIMER_REAL, delay)
-
-    def end(self) -> None:
-        """Remind no more."""
-        if sys.platform != "win32" and self._alarm_before is not None:
-            handler, timer = self._alarm_before
-            self._alarm_before = None
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, handler or signal.SIG_DFL)
-            signal.setitimer(signal.ITIMER_REAL, *timer)
-
-
-def _is_of_a_stop(error: BaseException) -> bool:
-    """Whether an exception was made of a stop, or raised while one was being handled."""
-    seen: set[int] = set()
-    cause: BaseException | None = error
-    while cause is not None and id(cause) not in seen:
-        if isinstance(cause, Stopped):
-            return True
-        seen.add(id(cause))
-        cause = cause.__cause__ or cause.__context__
-    return False
+        if sys.platform != "win32" and self.number is not None:
+            is_timed = self._is_waiting and seconds < math.inf
+            if is_timed:
+                signal.signal(signal.SIGALRM, self._raise_if_due)
+            signal.setitimer(signal.ITIMER_REAL, max(seconds, _SOON) if is_timed else 0.0)
 
 
 _current: list[StopRequest] = []
@@ -212,8 +158,7 @@ def stops_noticed() -> Iterator[StopRequest]:
     """Notice the signals that ask to stop; inside another such ``with`` statement, the same ones.
 
     A signal that is ignored from outside stays so, as ``nohup`` and a shell's ``&`` want it, and
-    one that has a handler keeps it. Outside the main thread, where Python delivers no signals, none
-    is noticed.
+    one that has a handler keeps it. Outside the main thread Python delivers none.
     """
     if _current or threading.current_thread() is not threading.main_thread():
         yield current()
@@ -235,7 +180,7 @@ def stops_noticed() -> Iterator[StopRequest]:
         yield request
     finally:
         request._patience = math.inf  # before a call, in which a signal could still be handled
-        request.end()
+        request._set_timer(math.inf)
         sys.unraisablehook = tell
         for number, handler in before.items():
             if handler is not None:
@@ -251,20 +196,18 @@ def default_for_signals() -> None:
                 signal.signal(number, signal.SIG_DFL)
 
 
-# The processes of a SubprocVecEnv, when one ends or somebody asks the training to stop.
-#
-# Ctrl-C in a terminal, a closed terminal and many a cluster signal to all processes at once.
-# Workers
-# that ended by themselves would take away the environments that the training still needs.
+# --- the processes of a SubprocVecEnv -------------------------------------------------------------
 
-# After a stop was asked for: what takes longer is ended.
-SECONDS_FOR_CLOSING = 1.8
-# For a process whose pipe is closed.
-SECONDS_TO_END = 1.0
+SECONDS_FOR_CLOSING = 1.8  # after a stop was asked for: what takes longer is ended
+SECONDS_TO_END = 1.0  # for a process whose pipe is closed
 
 
 def shield_workers() -> None:
-    """Let the processes that are started from now on leave signals to this one."""
+    """Let the processes that are started from now on leave signals to this one.
+
+    A terminal and many a cluster signal to all processes at once, and the training still needs its
+    environments.
+    """
     if sys.platform != "win32" and "forkserver" in multiprocessing.get_all_start_methods():
         from multiprocessing import forkserver, resource_tracker
 
@@ -279,11 +222,7 @@ def shield_workers() -> None:
 
 @contextmanager
 def deaths_told(env: VecEnv) -> Iterator[None]:
-    """Say which process of a SubprocVecEnv has ended, where one has.
-
-    Raises:
-        UserError: naming it, in the place of what its pipe raises.
-    """
+    """Say which process of a SubprocVecEnv has ended, in the place of what its pipe raises."""
     try:
         yield
     except (EOFError, ConnectionError) as error:

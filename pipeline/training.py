@@ -317,7 +317,8 @@ def _learn(training: Training) -> None:
     begun = training.keeping.state
     before = 0 if begun is None else iterations_before(training.model, begun.note)
     if before and (interval := kwargs.get("log_interval", 1)) is not None:
-        kwargs["log_interval"] = IterationInterval.after(before, interval)
+        kwargs["log_interval"] = IterationInterval(interval)
+        kwargs["log_interval"].before = before
     env = training.model.get_env()
     assert env is not None
     try:

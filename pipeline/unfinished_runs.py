@@ -1,16 +1,12 @@
-"""Runs that were cut off: which there are, and what is needed to go on with one.
-
-A command asks for this before PyTorch is imported.
-"""
+"""Runs that were cut off, and what is needed to go on with one; imported before PyTorch is."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -48,45 +44,26 @@ Position = tuple[int, int]
 
 @dataclass(frozen=True)
 class SaveInterval:
-    """How often to save the state.
+    """How often to save the state."""
 
-    Attributes:
-        seconds: between two states; 0 for as often as takes `SHARE_OF_TIME`.
-        steps: environment steps between them instead, counted over all environments; or 0.
-        is_off: to save none.
-    """
-
-    seconds: float = 0.0
-    steps: int = 0
-    is_off: bool = False
+    seconds: float = 0.0  # between two states; 0 for as often as takes `SHARE_OF_TIME`
+    steps: int = 0  # instead, environment steps between them, counted over all environments
+    is_off: bool = False  # to save none
 
 
 @dataclass(frozen=True)
 class StateKeeping:
-    """What becomes of a training's state.
-
-    Attributes:
-        interval: how often it is saved.
-        state: what the training goes on from; None where it begins.
-        goes_on: whether the run folder is an earlier process's, also where that left no state.
-        was_cut_off: whether another process began the run and did not finish it, so that states
-            come sooner.
-        stays: whether states are still there when the run is finished.
-    """
+    """What becomes of a training's state."""
 
     interval: SaveInterval = SaveInterval()
-    state: SavedState | None = None
-    goes_on: bool = False
-    was_cut_off: bool = False
-    stays: bool = False
+    state: SavedState | None = None  # that the training goes on from
+    goes_on: bool = False  # in the run folder of an earlier process, which may have left no state
+    was_cut_off: bool = False  # by the end of another process: states come sooner
+    stays: bool = False  # once the run is finished
 
 
 def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
-    """The newest run of an agent on an environment that is not finished.
-
-    Raises:
-        UserError: if there is none.
-    """
+    """The newest run of an agent on an environment that is not finished."""
     name = environment_name(env_id)
     runs = [Run(path, name) for _, path in numbered_runs(log_folder / algo, name)]
     for run in reversed(runs):
@@ -97,12 +74,7 @@ def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
 
 
 def run_of_spec(spec: TrainSpec, any_seed: bool) -> Run | None:
-    """The newest run of the very same settings, finished or not; None where there is none.
-
-    Args:
-        spec: the settings.
-        any_seed: whether the seed does not matter.
-    """
+    """The newest run of the very same settings, finished or not; None where there is none."""
     name = environment_name(spec.env_id)
     wanted = _settings(spec.as_data(), any_seed)
     for _, path in reversed(numbered_runs(spec.log_folder / spec.algo, name)):
@@ -117,24 +89,12 @@ def run_of_spec(spec: TrainSpec, any_seed: bool) -> Run | None:
 
 
 def is_finished(run: Run) -> bool:
-    """Whether a run came to its end.
-
-    Raises:
-        UserError: if ``run.json`` is damaged.
-    """
+    """Whether a run came to its end."""
     return run.read_info().get("state") == FINISHED
 
 
 def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
-    """What a run was asked to do.
-
-    Args:
-        run: the run folder.
-        modules: those of the user's that were typed again.
-
-    Raises:
-        UserError: if the folder does not say, or needs a module that was not typed.
-    """
+    """What a run was asked to do; its modules of the user's have to be typed again."""
     recorded = run.recorded_spec()
     if not recorded:
         raise UserError(f"{run.path} does not say what it was asked for: it is no run of ours")
@@ -160,13 +120,7 @@ def recorded_training(run: Run, modules: Iterable[UserModule]) -> TrainSpec:
 def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> StateKeeping:
     """Put the files of a run back to where its newest state was, or to its beginning.
 
-    Args:
-        run: the run folder.
-        keeping: what becomes of states from now on.
-        tell: told in one line what will not be as it was.
-
-    Raises:
-        UserError: if its states are all damaged or another user's, or its files are gone.
+    What will not be as it was is told in one line each.
     """
     from pipeline.state_files import newest_state  # it takes PyTorch
 
@@ -238,15 +192,7 @@ def settings_digest(spec: Mapping[str, Any]) -> str:
 
 
 def log_positions(run_folder: Path, log_folder: str | None) -> dict[str, Position]:
-    """How far Monitor's and TensorBoard's files have come.
-
-    Args:
-        run_folder: where Monitor writes.
-        log_folder: where the logger does, or None.
-
-    Returns:
-        By path: of Monitor's files relative to the run folder, of the others from the root.
-    """
+    """How far Monitor's files have come, by name, and TensorBoard's, by path from the root."""
     paths = {path.name: path for path in monitor_files(run_folder)}
     paths |= {str(path): path for path in _event_files(log_folder)}
     return {name: _position(path, path.stat().st_size) for name, path in paths.items()}
@@ -256,9 +202,6 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, P
     """Remove what was appended since, and the files that were begun since.
 
     What is left is a new file, so that no other name of the old one is written to.
-
-    Raises:
-        UserError: if a file is missing, or does not begin with what it held.
     """
     for name, position in positions.items():
         path = run_folder / name  # or the name itself, where that begins at the root
@@ -274,31 +217,26 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, P
     for path in [*monitor_files(run_folder), *_event_files(log_folder)]:
         name = path.name if path.parent == run_folder else str(path)
         if name in positions:
-            with replacing(path) as draft, opened(path, NO_LIMIT) as file:
-                _copy(file, positions[name][0], draft.write)
+            with replacing(path) as draft:
+                draft.writelines(_pieces(path, positions[name][0]))
         else:
             path.unlink()
 
 
 def _position(path: Path, length: int) -> Position:
     """Where a file is after so many bytes, or at its end if that comes before."""
-    checksum = 0
+    checksum = n_read = 0
+    for piece in _pieces(path, length):
+        checksum, n_read = zlib.crc32(piece, checksum), n_read + len(piece)
+    return n_read, checksum
 
-    def add(piece: bytes) -> None:
-        nonlocal checksum
-        checksum = zlib.crc32(piece, checksum)
 
+def _pieces(path: Path, length: int) -> Iterator[bytes]:
+    """So many bytes of a file, or all if it has fewer."""
     with opened(path, NO_LIMIT) as file:
-        return _copy(file, length, add), checksum
-
-
-def _copy(file: BufferedReader, length: int, write: Callable[[bytes], object]) -> int:
-    """Hand on so many bytes of a file, or all if it has fewer; how many there were."""
-    n_read = 0
-    while piece := file.read(min(_PIECE, length - n_read)):
-        write(piece)
-        n_read += len(piece)
-    return n_read
+        while piece := file.read(min(_PIECE, length)):
+            yield piece
+            length -= len(piece)
 
 
 def monitor_files(run_folder: Path) -> list[Path]:

@@ -23,7 +23,7 @@ from experiments.plan import PlannedRun
 from experiments.run_folders import claim_draft, draft_path, put_run_in_place, remove_draft
 from pipeline.digests import FIELD, RECORD, RecordedFiles
 from pipeline.errors import UserError, one_line
-from pipeline.files import portable_name, sync_file, sync_folders
+from pipeline.files import portable_name, sync
 from pipeline.locks import is_gone
 
 # The last is for a worker that can do no run at all.
@@ -204,8 +204,8 @@ def _write(folder: Path, files: Mapping[str, bytes]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         with path.open("xb") as file:
             file.write(files[name])
-        sync_file(path)
-    sync_folders(*{(folder / name).parent for name in files}, folder)
+    written = {folder / name for name in files}
+    sync(*written, *{path.parent for path in written}, folder)
 
 
 def _check(planned: PlannedRun, draft: Path, names: set[str]) -> None:

@@ -27,7 +27,7 @@ from experiments.cluster.answers import DONE, FAILED, STOPPED, UNFIT, Answer, fi
 from experiments.launching import do_supervised
 from experiments.plan import PlannedRun
 from experiments.run_limits import RunLimits
-from pipeline.source_digest import source_digest
+from pipeline.digests import source_digest
 from pipeline.train_spec import TrainSpec
 
 # The topics of what workers tell drivers, besides answers: who has begun what, and who leaves.

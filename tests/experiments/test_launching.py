@@ -31,8 +31,8 @@ from experiments.run_folders import draft_path, leave_drafts, run_name
 from experiments.run_in_child import do_run
 from experiments.run_limits import RunLimits
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
+from pipeline.digests import source_digest
 from pipeline.errors import UserError
-from pipeline.source_digest import source_digest
 from pipeline.state_files import SavedState
 from pipeline.unfinished_runs import StateKeeping
 

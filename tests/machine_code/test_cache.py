@@ -433,7 +433,7 @@ def test_names_and_contents_count_and_other_files_do_not(tmp_path, monkeypatch):
 def test_what_a_state_was_made_by_is_known_without_the_compiler():
     code = """
 import sys
-from pipeline.source_digest import source_digest
+from pipeline.digests import source_digest
 assert len(source_digest()) == 16 and source_digest() != source_digest("experiments")
 assert not {"numba", "scipy", "torch"} & sys.modules.keys()
 """

@@ -4,7 +4,6 @@ import errno
 import json
 import math
 import os
-import signal
 import sys
 import threading
 from pathlib import Path
@@ -135,10 +134,10 @@ def test_a_folder_that_cannot_be_flushed_is_passed_over_and_a_broken_disk_is_not
         return fsync
 
     monkeypatch.setattr(files.os, "fsync", failing(errno.EINVAL))
-    files.sync_folders(tmp_path)
+    files.sync(tmp_path)
     monkeypatch.setattr(files.os, "fsync", failing(errno.EIO))
     with pytest.raises(OSError, match="no"):
-        files.sync_folders(tmp_path)
+        files.sync(tmp_path)
 
 
 def test_a_disk_that_is_full_is_named_and_another_error_is_left_alone(tmp_path):
@@ -284,22 +283,9 @@ def test_a_folder_that_is_gone_is_not_made_anew(tmp_path):
     assert not path.parent.exists()
 
 
-def test_the_disk_is_waited_for_also_in_a_process_that_was_forked(tmp_path):
-    files.sync_together([], [tmp_path])  # from here on this process has its threads
-    missing = tmp_path / "missing"
+def test_what_the_disk_cannot_be_asked_for_is_told(tmp_path):
     with pytest.raises(FileNotFoundError):
-        files.sync_together([missing, *[tmp_path] * 20], [])
-    if sys.platform == "win32":
-        return
-    child = os.fork()
-    if not child:
-        files.settle(tmp_path)
-        os._exit(7)
-    watch = threading.Timer(30, os.kill, [child, signal.SIGKILL])
-    watch.start()
-    _, status = os.waitpid(child, 0)
-    watch.cancel()
-    assert os.waitstatus_to_exitcode(status) == 7
+        files.sync(tmp_path / "missing", *[tmp_path] * 20)
 
 
 leaves = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()

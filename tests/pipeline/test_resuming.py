@@ -3,9 +3,11 @@
 import gc
 import io
 import json
+import os
 import sys
 import zipfile
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -479,39 +481,19 @@ def test_what_keeps_states_from_being_saved_is_said_once_and_ends_no_training(
 
 
 def test_what_a_state_is_held_against_is_on_the_disk_before_it(tmp_path, monkeypatch):
-    """After a power cut a state would be there whose rows of Monitor are not."""
-    order = []
-    saver, save = "pipeline.state_saver", state_files.save_state
-    monkeypatch.setattr(f"{saver}.sync_file", lambda path: order.append(path.name))
-    monkeypatch.setattr(f"{saver}.save_state", lambda *args: (order.append("state"), save(*args)))
-    log = {"tensorboard_log": tmp_path / "log", "log_interval": 1}
+    """After a power cut a state would be there whose rows of Monitor, or whose models are not."""
+    synced, fsync = [], os.fsync
+
+    def noted(number):
+        synced.append(Path(f"/proc/self/fd/{number}").readlink().name)
+        fsync(number)
+
+    monkeypatch.setattr("os.fsync", noted)
+    log = {"tensorboard_log": tmp_path / "log", "log_interval": 1, "eval_freq": 50}
     cut_off(spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL, **log), monkeypatch)
-    *rows, events, state = order[: order.index("state") + 1]
-    assert rows == ["0.monitor.csv", "1.monitor.csv"]
-    assert events.startswith("events.out.tfevents")
-    assert state == "state"
-    order.clear()
-    monkeypatch.setattr(f"{saver}.MOST_SYNCED", 0)  # what would take long is left out
-    cut_off(spec_of(tmp_path, LEFT_RIGHT, "ppo", 600, SMALL), monkeypatch)
-    assert set(order) == {"state"}
-
-
-def test_models_are_on_the_disk_before_a_state_that_comes_after_them(tmp_path, monkeypatch):
-    """They are not written again by a run that goes on from it."""
-    held, save = [], state_files.save_state
-    monkeypatch.setattr(
-        "pipeline.runs.sync_together",
-        lambda files, _: held.extend(path.name for path in files),
-    )
-    seen = []
-    monkeypatch.setattr(
-        "pipeline.state_saver.save_state",
-        lambda *args: (seen.append(set(held)), held.clear(), save(*args)),
-    )
-    spec = spec_of(tmp_path, GRID, "qlearning", 600, {}, eval_freq=100)
-    train(spec, Console(quiet=True), {}, "", keeping=StateKeeping(SaveInterval(steps=150)))
-    assert {"run.json", "best_model.zip", "evaluations.npz"} <= seen[0]
-    assert "run.json" not in seen[1]  # it has not changed since
+    before = synced[: next(i for i, name in enumerate(synced) if ".state." in name)]
+    assert {"0.monitor.csv", "1.monitor.csv", "run.json", "best_model.zip"} <= {*before}
+    assert any(name.startswith("events.out.tfevents") for name in before)
 
 
 def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
