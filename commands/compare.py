@@ -224,7 +224,7 @@ def _engines(planned: Sequence[PlannedRun]) -> tuple[str, dict[tuple[str, str], 
     from agents.networks.engine_setting import machine_pace
     from commands.terminal import seconds_of, study_line
     from experiments.launching import expected_seconds
-    from pipeline.engine_outlook import planned_outlook
+    from pipeline.preparation import planned_outlook
 
     found = {key: planned_outlook(runs[0].spec) for key, runs in missing.items()}
     outlooks = {key: each for key, each in found.items() if each is not None}

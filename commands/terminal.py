@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from agents.networks.engine_setting import EnginePlan
     from experiments.launching import Launcher, Launchers
-    from pipeline.engine_outlook import EngineOutlook
     from pipeline.evaluation.sampled import Evaluation
+    from pipeline.preparation import EngineOutlook
 
 UNBOUNDED = 10_000  # columns
 

@@ -197,8 +197,8 @@ def _begin(args: argparse.Namespace, spec: TrainSpec, stop: StopRequest) -> int:
     with stop.held():
         with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
+                from pipeline.preparation import prepare
                 from pipeline.runs import at_work_on
-                from pipeline.training import prepare
                 from pipeline.unfinished_runs import StateKeeping
 
             activity.now("making the environments and the agent")
@@ -273,7 +273,7 @@ def _go_on(args: argparse.Namespace, run: Run, spec: TrainSpec, stop: StopReques
             return 0
         with doing(console, "loading the libraries") as activity, loading_libraries():
             with stop.waiting(0.0):
-                from pipeline.training import prepare
+                from pipeline.preparation import prepare
                 from pipeline.unfinished_runs import StateKeeping
 
                 activity.now("making the environments and the agent")
@@ -447,7 +447,7 @@ def _schedule_in_words(value: object) -> str:
 def print_engine(console: Console, training: Training) -> None:
     """Say on which engine it will run, and what that takes."""
     from commands.terminal import say, training_line
-    from pipeline.engine_outlook import engine_outlook
+    from pipeline.preparation import engine_outlook
 
     model, callback = training.model, training.callback
     line = training_line(engine_outlook(model, training.spec, [callback]), model, callback)

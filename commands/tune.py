@@ -407,7 +407,7 @@ def print_opened(context: RunContext, opened: OpenTuning) -> None:
         tell(f"{name}: the search space is widened to hold the shipped value")
     if tuning.agent.algo not in NETWORKS:
         return
-    from pipeline.engine_outlook import planned_outlook
+    from pipeline.preparation import planned_outlook
 
     searched = planned_run(tuning, opened.root, suggestions.shipped, tuning.seeds[0])
     runs = (searched, shipped_run(tuning, opened.root))

@@ -309,11 +309,6 @@ class PullRecorder(PullLog):
             np.savez(file, allow_pickle=False, **self.arrays())
 
 
-def are_bandits(env: VecEnv) -> bool:
-    """Whether the environments have arms whose pulls can be recorded."""
-    return env.has_attr("n_arms")
-
-
 # Evaluations during training: when they are due, and what is kept of them.
 
 SECONDS_BETWEEN_WRITES = 1.0

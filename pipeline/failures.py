@@ -12,7 +12,7 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from pipeline.errors import UserError, one_line
 from pipeline.stopping import Stopped, current
 
 if TYPE_CHECKING:
-    from pipeline.preparation import Training
+    pass
 
 
 # PyTorch's allocator, the dynamic linker, and Python's threads have no exception of their own.
@@ -118,53 +118,6 @@ def blame_settings(algo: str, model: Any, error: Exception) -> None:
         place = f"{packages[-1]}, {Path(frame.f_code.co_filename).name}:{line}"
         when = f"{algo} at step {model.num_timesteps:,}"
         raise LibraryError(f"{when}: {one_line(error)} ({place})") from error
-
-
-@exits_as_mistakes()
-def close(training: Training) -> None:
-    """Close what is open, each part also where another cannot be closed."""
-    from pipeline.stopping import close_environments
-
-    model = training.model
-    with ExitStack() as stack:
-        if model.env is not None:
-            stack.callback(close_environments, model.env)
-        stack.callback(close_environments, training.eval_env)
-        if hasattr(model, "_logger"):
-            stack.callback(model.logger.close)
-
-
-def has_begun(training: Training) -> bool:
-    """Whether there is something that was learnt, by this process or the ones before it."""
-    model, is_back = training.model, training.saver.state is None
-    return is_back and model.num_timesteps > model._num_timesteps_at_start
-
-
-def give_up(training: Training, error: BaseException) -> None:
-    """Note the reason; or remove the folder, where the agent failed before its first step."""
-    from pipeline.files import DISK_ERRORS
-    from pipeline.locks import FolderGoneError, is_gone
-    from pipeline.runs import INTERRUPTED
-
-    run, is_new = training.run, not training.keeping.goes_on
-    if is_gone(run.path):
-        raise FolderGoneError(run.path) from error
-    is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt | LibraryError)
-    if is_new and is_expected and not has_begun(training):
-        run.discard()
-        if not isinstance(error, ValueError):  # the others say for themselves what it was
-            return
-        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
-        raise UserError(message) from error
-    with suppress(OSError):  # what the run has failed by says more
-        training.evaluation.write()
-    if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
-        run.update_info(state=INTERRUPTED)
-        return
-    run.fail(one_line(error))
-    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
-        when = f"the run has failed at step {training.model.num_timesteps:,}"
-        raise UserError(f"{error.filename}: {error.strerror}: {when}") from error
 
 
 def is_of_the_machine(error: BaseException | None) -> bool:

@@ -1,11 +1,14 @@
-"""All parts of a training run, made before its first step."""
+"""`prepare`: the run folder and all parts of a training, made before its first step."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack, closing
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
+from uuid import uuid4
 
 import torch as th
 from gymnasium import spaces
@@ -16,27 +19,33 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
 
+from agents.common.callbacks import EpisodeBudget
+from agents.compiled.worlds import NotCompilable
+from agents.networks.network_worlds import network_world
 from pipeline.callbacks import (
     EvaluationCallback,
     NumberWatch,
     PullRecorder,
     all_callbacks,
-    are_bandits,
     evaluation_callback,
     named_callbacks,
     pull_recorder,
 )
+from pipeline.digests import VERSION, VERSION_FIELD
 from pipeline.environments import (
     make_evaluation_env,
     make_single_env,
     make_training_env,
     trains_on_variant,
 )
-from pipeline.errors import UserError
+from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator, discount_note, evaluator_of, model_refusal
 from pipeline.evaluation.policies import why_not_exact
 from pipeline.evaluation.sampled import n_environments, takes_batches
 from pipeline.evaluation.value_maps import map_refusal
+from pipeline.failures import exits_as_mistakes
+from pipeline.files import naming
+from pipeline.library_loading import load_for_optimizer
 from pipeline.models.choose import (
     continuing,
     load_to_continue,
@@ -45,7 +54,18 @@ from pipeline.models.choose import (
 )
 from pipeline.models.load import ModelFile, agent_class, take_over, telling_masks
 from pipeline.progress import ProgressDisplay
-from pipeline.runs import Run, environment_name
+from pipeline.runs import (
+    RUNNING,
+    TRAINED_AGENT,
+    Run,
+    environment_name,
+    recorded_machine,
+    recorded_versions,
+    remove_leftovers,
+    write_arguments,
+    write_settings,
+)
+from pipeline.settings import components
 from pipeline.settings.components import (
     action_noise,
     build_algorithm_kwargs,
@@ -56,52 +76,107 @@ from pipeline.settings.components import (
 from pipeline.settings.values import algorithm_parameters
 from pipeline.signs_of_life import can_move
 from pipeline.state_saver import StateSaver, resumed_logger
-from pipeline.stopping import close_environments, end_workers_after_stop
-from pipeline.train_spec import TrainSpec
+from pipeline.stopping import close_environments, current, end_workers_after_stop
+from pipeline.train_spec import NETWORKS, TrainSpec
 from pipeline.unfinished_runs import StateKeeping
 from pipeline.watching import EvaluationMaps, Watch, watch_of
+
+if TYPE_CHECKING:
+    from agents.networks.engine_setting import EnginePlan, Work
+
+# A budget in episodes has no number of steps; this one is never reached.
+UNBOUNDED_TIMESTEPS = 10**12
+NEW = StateKeeping()
 
 
 @dataclass(frozen=True)
 class Training:
-    """A run that is set up and can be started.
+    """A run that is set up and can be started."""
 
-    Attributes:
-        spec: what was asked for.
-        run: its folder.
-        model: the agent, with its environments.
-        eval_env: environments to evaluate on.
-        evaluation: the evaluation callback, also part of ``callback``.
-        callback: all callbacks.
-        saver: keeps the state, also part of ``callback``.
-        keeping: what becomes of it.
-        pulls: keeps every pull, on bandits; else None, and where a compiled loop was asked for.
-        refusal: why the model that the environment brings is not believed; None if it is.
-        trained_digest: that of the zip that the agent goes on from; None for a new agent.
-        watch: keeps how the agent learns, for a page; None where nobody asked for one.
-    """
-
-    spec: TrainSpec
+    spec: TrainSpec  # with what an agent that goes on has brought along
     run: Run
-    model: BaseAlgorithm
+    model: BaseAlgorithm  # the agent, with its environments
     eval_env: VecEnv
-    evaluation: EvaluationCallback
     display: ProgressDisplay
-    callback: BaseCallback
-    saver: StateSaver
+    callback: BaseCallback  # all callbacks
+    evaluation: EvaluationCallback  # one of them
+    saver: StateSaver  # likewise
     keeping: StateKeeping
-    pulls: PullRecorder | None = None
-    refusal: str | None = None
-    trained_digest: str | None = None
-    watch: Watch | None = None
+    pulls: PullRecorder | None  # on bandits, but where a compiled loop was asked for
+    watch: Watch | None  # keeps how the agent learns, for a page
+    refusal: str | None  # why the model that the environment brings is not believed
+
+
+@exits_as_mistakes()
+def prepare(
+    spec: TrainSpec,
+    console: Console,
+    args: dict[str, Any],
+    command: str,
+    run: Run | None = None,
+    keeping: StateKeeping = NEW,
+) -> Training:
+    """Make the run folder and all parts of the training.
+
+    Args:
+        spec: what to do.
+        console: where the training is to report to.
+        args: the command's arguments, for the run folder.
+        command: the command itself, likewise.
+        run: the run folder, made already; by default a new one in the spec's log folder.
+        keeping: what becomes of the state of the training.
+
+    Raises:
+        UserError: if the spec does not work out, or the environment asks the program to end; no
+            folder is left behind then.
+        Stopped: if a signal asks for it, likewise.
+    """
+    _set_arithmetic(spec)
+    stop = current()
+    with stop.waiting(0.0):
+        kwargs = algorithm_kwargs(spec)
+        if run is None:
+            remove_leftovers(spec.log_folder, spec.algo, spec.env_id)
+    with stop.held(), ExitStack() as undo, _library_errors_in_one_line():
+        if run is None:
+            suffix = f"_{uuid4()}" if spec.unique_id else ""
+            run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
+        if not keeping.goes_on:
+            undo.callback(run.discard)
+        with stop.waiting(0.0), naming(run.path):
+            run.keep_room()
+            trained = model_to_continue(spec)
+            training = _set_up(spec, trained, run, kwargs, console, undo, keeping)
+            load_for_optimizer(training.model)
+        if keeping.goes_on:
+            run.reopen()
+        else:
+            _record_beginning(training, trained, args, command)
+            stop.raise_if_asked()
+        undo.pop_all()
+    return training
+
+
+def _set_arithmetic(spec: TrainSpec) -> None:
+    """What holds for the whole process, and so is set anew for each run in it."""
+    if spec.num_threads > 0:
+        th.set_num_threads(spec.num_threads)
+    flushes = spec.hyperparams.flush_denormal
+    if not th.set_flush_denormal(flushes) and flushes:
+        raise UserError("flush_denormal: this processor has no such setting; leave it out")
+
+
+@contextmanager
+def _library_errors_in_one_line() -> Iterator[None]:
+    """Errors of settings that only the library checks, when it gets them."""
+    try:
+        yield
+    except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
+        raise UserError(one_line(error)) from error
 
 
 def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
-    """The arguments of the agent's constructor, checked and made into objects.
-
-    Raises:
-        UserError: if one is unknown, or has a wrong type or range.
-    """
+    """The arguments of the agent's constructor, checked and made into objects."""
     algorithm, kwargs = agent_class(spec.algo), spec.hyperparams.algorithm
     check_action_noise(spec.hyperparams, algorithm, spec.algo)
     if needs_policy(algorithm, kwargs):
@@ -111,21 +186,9 @@ def algorithm_kwargs(spec: TrainSpec) -> dict[str, Any]:
     return build_algorithm_kwargs(algorithm, kwargs, spec.algo, spec.gym_packages)
 
 
-def set_arithmetic(spec: TrainSpec) -> None:
-    """What holds for the whole process, and so is set anew for each run in it.
-
-    Raises:
-        UserError: if the processor does not know a setting.
-    """
-    if spec.num_threads > 0:
-        th.set_num_threads(spec.num_threads)
-    flushes = spec.hyperparams.flush_denormal
-    if not th.set_flush_denormal(flushes) and flushes:
-        raise UserError("flush_denormal: this processor has no such setting; leave it out")
-
-
-def set_up(
+def _set_up(
     spec: TrainSpec,
+    trained: ModelFile | None,
     run: Run,
     kwargs: dict[str, Any],
     console: Console,
@@ -134,21 +197,23 @@ def set_up(
 ) -> Training:
     """Make all parts of the training, and add to ``undo`` how to remove them again."""
     undo.callback(end_workers_after_stop)
-    trained = model_to_continue(spec)
     spec, env = _training_env(spec, trained, run, undo, appends=keeping.state is not None)
     model = make_model(spec, trained, env, kwargs)
     if is_unread(spec):
         model.set_logger(Logger(folder=None, output_formats=[]))
     elif keeping.state is not None:
         model.set_logger(resumed_logger(model, keeping.state.note))
-    is_bandit = are_bandits(env)
+    is_bandit = env.has_attr("n_arms")
     exact = _exact_evaluator(spec, model, console)
     gamma = getattr(model, "gamma", None)
     if spec.verbose and exact is not None and isinstance(gamma, float) and not is_bandit:
         note = discount_note(spec, exact, gamma)
         if note is not None:
             _say(console, note)
-    eval_env = make_evaluation_env(spec, _n_eval_envs(spec, model, is_exact=exact is not None))
+    n_eval_envs = 1
+    if exact is None and takes_batches(model):
+        n_eval_envs = n_environments(spec.n_eval_envs, spec.eval_episodes)
+    eval_env = make_evaluation_env(spec, n_eval_envs)
     undo.callback(close_environments, eval_env)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
     evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
@@ -157,49 +222,47 @@ def set_up(
     )
     saver.modules = spec.user_modules
     pulls = pull_recorder(model, run, console) if is_bandit else None
+    watch = watch_of(spec, model, exact)
+    shows_evaluations = isinstance(watch, EvaluationMaps)
+    if shows_evaluations:
+        evaluation.callback = watch
     # In this order: of a broken number nothing is kept, and no other callback sees a moment that a
     # training goes back from.
     first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
-    watch = _watch(spec, model, exact, evaluation)
-    told_steps = None if isinstance(watch, EvaluationMaps) else watch
-    others = [*filter(None, [pulls, told_steps]), evaluation]
+    others = [*filter(None, [pulls, None if shows_evaluations else watch]), evaluation]
     saver.root = all_callbacks(spec, [*first, *others], display)
-    refusal = None if evaluation.value_maps is not None else model_refusal(spec)
     return Training(
         spec,
         run,
         model,
         eval_env,
-        evaluation,
         display,
         saver.root,
+        evaluation,
         saver,
         keeping,
         pulls,
-        refusal,
-        None if trained is None else trained.digest,
         watch,
+        refusal=None if evaluation.value_maps is not None else model_refusal(spec),
     )
 
 
-def _watch(
-    spec: TrainSpec,
-    model: BaseAlgorithm,
-    exact: ExactEvaluator | None,
-    evaluation: EvaluationCallback,
-) -> Watch | None:
-    """What keeps how the agent learns; one that looks at evaluations is told of them from now."""
-    watch = watch_of(spec, model, exact)
-    if isinstance(watch, EvaluationMaps):
-        evaluation.callback = watch
-    return watch
-
-
-def _n_eval_envs(spec: TrainSpec, model: BaseAlgorithm, *, is_exact: bool) -> int:
-    """How many environments to evaluate on; exact evaluation plays on none."""
-    if is_exact or not takes_batches(model):
-        return 1
-    return n_environments(spec.n_eval_envs, spec.eval_episodes)
+def _record_beginning(
+    training: Training, trained: ModelFile | None, args: dict[str, Any], command: str
+) -> None:
+    run, spec = training.run, training.spec
+    write_settings(run, spec, command)
+    write_arguments(run, spec, args)
+    run.update_info(
+        state=RUNNING,
+        **{VERSION_FIELD: VERSION},
+        env_name=run.env_name,
+        spec=spec.as_data(),
+        versions=recorded_versions(),
+        machine=recorded_machine(),
+        **({} if trained is None else {TRAINED_AGENT: trained.digest}),
+        **({} if training.refusal is None else {"model_refused": training.refusal}),
+    )
 
 
 def _say(console: Console, line: str) -> None:
@@ -224,27 +287,21 @@ def _exact_evaluator(
 def _training_env(
     spec: TrainSpec, trained: ModelFile | None, run: Run, undo: ExitStack, appends: bool
 ) -> tuple[TrainSpec, VecEnv]:
-    """What the agent is trained on; and the spec, which follows one that goes on.
-
-    With ``appends``, Monitor goes on in the files that are there.
-    """
+    """What the agent is trained on, and the spec, which follows an agent that goes on."""
     if trained is not None:
         spec = telling_masks(spec, trained)
     statistics = statistics_to_continue(spec)
     if statistics is not None:
         spec = continuing(spec, statistics)
-    env = make_training_env(appending(spec) if appends else spec, run.path)
+    made = spec
+    if appends:  # Monitor goes on in the files that are there
+        monitor_kwargs = {**spec.hyperparams.monitor_kwargs, "override_existing": False}
+        made = replace(spec, hyperparams=replace(spec.hyperparams, monitor_kwargs=monitor_kwargs))
+    env = make_training_env(made, run.path)
     undo.callback(close_environments, env)
     if statistics is not None:
         take_over(env, statistics)
     return spec, env
-
-
-def appending(spec: TrainSpec) -> TrainSpec:
-    """The spec, with Monitors that go on in the files that are there."""
-    hyperparams = spec.hyperparams
-    arguments = {**hyperparams.monitor_kwargs, "override_existing": False}
-    return replace(spec, hyperparams=replace(hyperparams, monitor_kwargs=arguments))
 
 
 def is_unread(spec: TrainSpec) -> bool:
@@ -255,14 +312,7 @@ def is_unread(spec: TrainSpec) -> bool:
 def make_model(
     spec: TrainSpec, trained: ModelFile | None, env: VecEnv, kwargs: dict[str, Any]
 ) -> BaseAlgorithm:
-    """The agent of a run, a new one or the one that it goes on from.
-
-    Args:
-        spec: the run.
-        trained: the file of an agent that goes on; None for a new one.
-        env: the environments of the training.
-        kwargs: the constructor's arguments, see `algorithm_kwargs`.
-    """
+    """The agent of a run: a new one, or the one that it goes on from."""
     folder = spec.tensorboard_log
     common: dict[str, Any] = {
         "seed": spec.seed,
@@ -270,23 +320,14 @@ def make_model(
         "tensorboard_log": None if folder is None else str(folder / environment_name(spec.env_id)),
         **action_noise(spec.hyperparams, env.action_space),
     }
-    if trained is None:
-        return _new_model(agent_class(spec.algo), env, spec.device, common, kwargs)
-    return load_to_continue(spec, trained, env, **common, **kwargs)
-
-
-def _new_model(
-    algorithm: type[BaseAlgorithm],
-    env: VecEnv,
-    device: str,
-    common: dict[str, Any],
-    kwargs: dict[str, Any],
-) -> BaseAlgorithm:
-    """An agent; what its constructor does not take of the common arguments is set afterwards."""
-    given, parameters = {"device": device, **common}, algorithm_parameters(algorithm)
+    if trained is not None:
+        return load_to_continue(spec, trained, env, **common, **kwargs)
+    # What a constructor does not take of these is set afterwards.
+    algorithm, given = agent_class(spec.algo), {"device": spec.device, **common}
+    parameters = algorithm_parameters(algorithm)
     taken = {name: value for name, value in given.items() if name in parameters}
     if "seed" not in taken:
-        set_random_seed(common["seed"])
+        set_random_seed(spec.seed)
     # The type checker knows the arguments of the base class, which has more of them.
     model: BaseAlgorithm = cast(Any, algorithm)(env=env, **taken, **kwargs)
     for name in common.keys() - taken.keys():
@@ -294,3 +335,54 @@ def _new_model(
     if "seed" not in taken:
         model.set_random_seed(common["seed"])
     return model
+
+
+# --- the engine of networks, found out before a training begins -----------------------------------
+
+
+@dataclass(frozen=True)
+class EngineOutlook:
+    """On which engine a training will run, and on which it could."""
+
+    plan: EnginePlan  # the engine that it will run on
+    auto: EnginePlan  # the one that ``engine: auto`` would choose
+    work: Work | None  # None where nobody knows what a step of the environment takes
+
+
+def engine_outlook(
+    model: BaseAlgorithm, spec: TrainSpec, callbacks: list[BaseCallback]
+) -> EngineOutlook | None:
+    """The outlook of an agent that is there; None for one that has no networks, or one engine."""
+    from agents.networks.engine_setting import CompiledNetworks  # it takes a while to load
+
+    if not isinstance(model, CompiledNetworks) or model.env is None:
+        return None
+    n_timesteps = spec.hyperparams.n_timesteps or UNBOUNDED_TIMESTEPS
+    plan = model.engine_plan(n_timesteps, callbacks)
+    auto = model.engine_plan(n_timesteps, callbacks, "auto")
+    work = None
+    with suppress(NotCompilable):
+        network_world(model.env)
+        work = model.work(n_timesteps, callbacks)
+    return EngineOutlook(plan, auto, work)
+
+
+def planned_outlook(spec: TrainSpec) -> EngineOutlook | None:
+    """The same of a run that another process will do: its agent is made here, and thrown away.
+
+    Whatever goes wrong, the run itself will say so.
+    """
+    if spec.algo not in NETWORKS:
+        return None
+    with (
+        suppress(Exception),
+        warnings.catch_warnings(action="ignore"),
+        closing(make_training_env(spec, None)) as env,
+    ):
+        model = make_model(spec, None, env, algorithm_kwargs(spec))
+        special, modules = spec.hyperparams, spec.gym_packages
+        callbacks = components.callbacks(special.callback, modules, spec.log_folder)
+        if special.n_episodes is not None:
+            callbacks.append(EpisodeBudget(special.n_episodes))
+        return engine_outlook(model, spec, callbacks)
+    return None

@@ -1,14 +1,12 @@
-"""From a spec to a finished run folder: `prepare` makes all parts, `carry_out` trains."""
+"""A training run, from a spec to a finished folder: `prepare`, then `carry_out`."""
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from signal import Signals
 from typing import Any
-from uuid import uuid4
 
 from rich.console import Console
 
@@ -16,116 +14,24 @@ from machine_code.compiling import compile_timer
 from machine_code.work_time import WorkTime
 from pipeline.callbacks import PullSummary, summarise_pulls
 from pipeline.curve_pictures import draw_learning_curve, draw_pulls
-from pipeline.digests import VERSION, VERSION_FIELD
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import value_map
-from pipeline.failures import (
-    blame_settings,
-    blame_weights,
-    close,
-    exits_as_mistakes,
-    give_up,
-    has_begun,
-)
-from pipeline.files import naming
-from pipeline.library_loading import load_for_optimizer, loading_libraries
+from pipeline.failures import LibraryError, blame_settings, blame_weights, exits_as_mistakes
+from pipeline.files import DISK_ERRORS, naming
+from pipeline.library_loading import loading_libraries
+from pipeline.locks import FolderGoneError, is_gone
 from pipeline.map_pictures import draw_value_map
 from pipeline.models.find import final_replay_buffer_path
 from pipeline.models.load import save_model, save_normalization, save_replay_buffer
-from pipeline.preparation import Training, algorithm_kwargs, is_unread, set_arithmetic, set_up
-from pipeline.runs import (
-    FINISHED,
-    INTERRUPTED,
-    RUNNING,
-    TRAINED_AGENT,
-    Run,
-    recorded_machine,
-    recorded_versions,
-    remove_leftovers,
-    remove_states,
-    write_arguments,
-    write_settings,
-)
+from pipeline.preparation import NEW, UNBOUNDED_TIMESTEPS, Training, is_unread, prepare
+from pipeline.runs import FINISHED, INTERRUPTED, Run, remove_states
 from pipeline.signs_of_life import Activity, doing
 from pipeline.state_saver import IterationInterval, iterations_before
-from pipeline.stopping import current, deaths_told
+from pipeline.stopping import close_environments, current, deaths_told
 from pipeline.train_spec import TrainSpec
 from pipeline.unfinished_runs import StateKeeping
 
-# What is done with a training that has come to its end: saved, judged, drawn.
-
-
-def save(training: Training, state: str) -> PullSummary | None:
-    """Save what was learnt, and what was pulled; the figures on the latter."""
-    run, model, recorder = training.run, training.model, training.pulls
-    save_model(model, run.model_path)
-    save_normalization(model, run.vecnormalize_path)
-    if training.spec.save_replay_buffer and not current().is_urgent:
-        save_replay_buffer(model, final_replay_buffer_path(run.path))
-    if recorder is None or not recorder.n_calls:
-        return None
-    if state == INTERRUPTED:
-        recorder.write()  # as it does by itself where the training was not interrupted
-    return summarise_pulls(recorder.arrays())
-
-
-def judge(training: Training, state: str) -> Evaluation | None:
-    """Evaluate what is not evaluated yet; the final evaluation, where the training was not cut off.
-
-    It is exact, or by episodes that were used for nothing else.
-    """
-    evaluation, model = training.evaluation, training.model
-    if not evaluation.is_asked_for:
-        return None
-    if not evaluation.evaluations_timesteps:
-        # The run was shorter than the time to its first evaluation, or called no callback.
-        evaluation.init_callback(model)
-        evaluation.evaluate_now()
-    evaluation.write()
-    if evaluation.value_maps is not None:
-        evaluation.value_maps.finish(model, model.num_timesteps)
-    return _final_evaluation(training) if state == FINISHED else None
-
-
-def draw(training: Training, final: Evaluation | None) -> None:
-    """Draw the pulls, the learning curve and the map of the final policy, where there are such."""
-    if training.spec.pictures:
-        with loading_libraries():  # Matplotlib
-            _draw(training, final)
-
-
-def _draw(training: Training, final: Evaluation | None) -> None:
-    run, spec, recorder = training.run, training.spec, training.pulls
-    title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
-    has_pulls = recorder is not None and recorder.n_calls > 0
-    if recorder is not None and has_pulls:
-        draw_pulls(run.pulls_picture_path, title, recorder.arrays())
-    if not has_pulls or training.evaluation.evaluations_timesteps:
-        yardstick = None if final is None else final.yardstick
-        first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant
-        draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
-    maps = training.evaluation.value_maps
-    if maps is not None and training.evaluation.is_asked_for:
-        found = value_map(maps.evaluator, training.model)
-        if found is not None:
-            draw_value_map(run.value_map_path, title, found)
-
-
-def _final_evaluation(training: Training) -> Evaluation:
-    evaluation, model = training.evaluation, training.model
-    evaluation.take_statistics()
-    with evaluation.timed():
-        if isinstance(evaluation.evaluator, SampledEvaluator):
-            return evaluation.evaluator.at_the_end(model)
-        return evaluation.evaluator(model)
-
-
-# From a spec to a finished run folder: `prepare` makes all parts, `carry_out` trains.
-
-# A budget in episodes has no number of steps; this one is never reached.
-UNBOUNDED_TIMESTEPS = 10**12
-NEW = StateKeeping()
 # After a signal that asks to stop: how long the training may go on to where nothing is half done,
 # and when evaluating and drawing what was learnt has to be over.
 SECONDS_TO_A_SAFE_MOMENT = 1.0
@@ -178,80 +84,6 @@ def train(
     return carry_out(prepare(spec, console, args, command, run, keeping))
 
 
-@exits_as_mistakes()
-def prepare(
-    spec: TrainSpec,
-    console: Console,
-    args: dict[str, Any],
-    command: str,
-    run: Run | None = None,
-    keeping: StateKeeping = NEW,
-) -> Training:
-    """Make the run folder and all parts of the training.
-
-    Args:
-        spec: what to do.
-        console: where the training is to report to.
-        args: the command's arguments, for the run folder.
-        command: the command itself, likewise.
-        run: the run folder, made already; by default a new one in the spec's log folder.
-        keeping: what becomes of the state of the training.
-
-    Raises:
-        UserError: if the spec does not work out, or the environment asks the program to end; no
-            folder is left behind then.
-        Stopped: if a signal asks for it, likewise.
-    """
-    set_arithmetic(spec)
-    stop = current()
-    with stop.waiting(0.0):
-        kwargs = algorithm_kwargs(spec)
-        if run is None:
-            remove_leftovers(spec.log_folder, spec.algo, spec.env_id)
-    suffix = f"_{uuid4()}" if spec.unique_id else ""
-    with stop.held(), ExitStack() as undo, _library_errors_in_one_line():
-        if run is None:
-            run = Run.claim(spec.log_folder, spec.algo, spec.env_id, suffix)
-        if not keeping.goes_on:
-            undo.callback(run.discard)
-        with stop.waiting(0.0), naming(run.path):
-            run.keep_room()
-            training = set_up(spec, run, kwargs, console, undo, keeping)
-            load_for_optimizer(training.model)
-        if keeping.goes_on:
-            run.reopen()
-        else:
-            _record_beginning(training, args, command)
-            stop.raise_if_asked()
-        undo.pop_all()
-    return training
-
-
-def _record_beginning(training: Training, args: dict[str, Any], command: str) -> None:
-    run, spec = training.run, training.spec  # with what an agent that goes on has brought along
-    write_settings(run, spec, command)
-    write_arguments(run, spec, args)
-    run.update_info(
-        state=RUNNING,
-        **{VERSION_FIELD: VERSION},
-        env_name=run.env_name,
-        spec=spec.as_data(),
-        versions=recorded_versions(),
-        machine=recorded_machine(),
-        **({} if training.trained_digest is None else {TRAINED_AGENT: training.trained_digest}),
-        **({} if training.refusal is None else {"model_refused": training.refusal}),
-    )
-
-
-@contextmanager
-def _library_errors_in_one_line() -> Iterator[None]:
-    """Errors of settings that only the library checks, when it gets them."""
-    try:
-        yield
-    except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
-        raise UserError(one_line(error)) from error
-
-
 def carry_out(training: Training, tell: Callable[[Outcome], object] = lambda _: None) -> Outcome:
     """Train, and save, judge and draw what was learnt.
 
@@ -273,7 +105,7 @@ def carry_out(training: Training, tell: Callable[[Outcome], object] = lambda _: 
             with naming(training.run.path):
                 outcome = _train_and_finish(training, tell)
         except BaseException as error:
-            with contextlib.suppress(BaseException):  # it would hide what the run broke by
+            with suppress(BaseException):  # it would hide what the run broke by
                 close(training)
             give_up(training, error)
             raise
@@ -314,9 +146,9 @@ def _learn(training: Training) -> None:
         kwargs["log_interval"] = None
     elif spec.log_interval != -1:
         kwargs["log_interval"] = spec.log_interval if spec.log_interval > 0 else None
-    begun = training.keeping.state
+    begun, interval = training.keeping.state, kwargs.get("log_interval", 1)
     before = 0 if begun is None else iterations_before(training.model, begun.note)
-    if before and (interval := kwargs.get("log_interval", 1)) is not None:
+    if before and interval is not None:
         kwargs["log_interval"] = IterationInterval(interval)
         kwargs["log_interval"].before = before
     env = training.model.get_env()
@@ -336,15 +168,21 @@ def _learn(training: Training) -> None:
         raise
 
 
+def has_begun(training: Training) -> bool:
+    """Whether there is something that was learnt, by this process or the ones before it."""
+    model, is_back = training.model, training.saver.state is None
+    return is_back and model.num_timesteps > model._num_timesteps_at_start
+
+
 def _judged(training: Training, state: str, taken: WorkTime, activity: Activity) -> Outcome:
     """Save what was learnt, and judge it."""
     model, evaluation = training.model, training.evaluation
-    pulls = save(training, state)
+    pulls = _save(training, state)
     final: Evaluation | None = None
     try:
         with _stoppable(state):
             activity.now("evaluating the final policy")
-            final = judge(training, state)
+            final = _judge(training, state)
     except KeyboardInterrupt:
         state = INTERRUPTED
     return Outcome(
@@ -363,12 +201,55 @@ def _judged(training: Training, state: str, taken: WorkTime, activity: Activity)
     )
 
 
+def _save(training: Training, state: str) -> PullSummary | None:
+    """Save what was learnt, and what was pulled; the figures on the latter."""
+    run, model, recorder = training.run, training.model, training.pulls
+    save_model(model, run.model_path)
+    save_normalization(model, run.vecnormalize_path)
+    if training.spec.save_replay_buffer and not current().is_urgent:
+        save_replay_buffer(model, final_replay_buffer_path(run.path))
+    if recorder is None or not recorder.n_calls:
+        return None
+    if state == INTERRUPTED:
+        recorder.write()  # as it does by itself where the training was not interrupted
+    return summarise_pulls(recorder.arrays())
+
+
+def _judge(training: Training, state: str) -> Evaluation | None:
+    """Evaluate what is not evaluated yet; the final evaluation, where the training was not cut off.
+
+    It is exact, or by episodes that were used for nothing else.
+    """
+    evaluation, model = training.evaluation, training.model
+    if not evaluation.is_asked_for:
+        return None
+    if not evaluation.evaluations_timesteps:
+        # The run was shorter than the time to its first evaluation, or called no callback.
+        evaluation.init_callback(model)
+        evaluation.evaluate_now()
+    evaluation.write()
+    if evaluation.value_maps is not None:
+        evaluation.value_maps.finish(model, model.num_timesteps)
+    return _final_evaluation(training) if state == FINISHED else None
+
+
+def _final_evaluation(training: Training) -> Evaluation:
+    evaluation, model = training.evaluation, training.model
+    evaluation.take_statistics()
+    with evaluation.timed():
+        if isinstance(evaluation.evaluator, SampledEvaluator):
+            return evaluation.evaluator.at_the_end(model)
+        return evaluation.evaluator(model)
+
+
 def _finish(training: Training, state: str, outcome: Outcome, activity: Activity) -> Outcome:
     """Draw what was learnt; ``run.json`` says so when all else is there."""
     try:
         with _stoppable(state):
             activity.now("drawing the pictures")
-            draw(training, outcome.final)
+            if training.spec.pictures:
+                with loading_libraries():  # Matplotlib
+                    draw(training, outcome.final)
     except KeyboardInterrupt:
         if outcome.state == FINISHED:
             activity.say("stopped while drawing: the run counts as interrupted")
@@ -387,6 +268,24 @@ def _stoppable(state: str) -> Iterator[None]:
         yield
 
 
+def draw(training: Training, final: Evaluation | None) -> None:
+    """Draw the pulls, the learning curve and the map of the final policy, where there are such."""
+    run, spec, recorder = training.run, training.spec, training.pulls
+    title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
+    has_pulls = recorder is not None and recorder.n_calls > 0
+    if recorder is not None and has_pulls:
+        draw_pulls(run.pulls_picture_path, title, recorder.arrays())
+    if not has_pulls or training.evaluation.evaluations_timesteps:
+        yardstick = None if final is None else final.yardstick
+        first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant
+        draw_learning_curve(run, title, first_step, yardstick, on_variant=on_variant)
+    maps = training.evaluation.value_maps
+    if maps is not None and training.evaluation.is_asked_for:
+        found = value_map(maps.evaluator, training.model)
+        if found is not None:
+            draw_value_map(run.value_map_path, title, found)
+
+
 def _record(outcome: Outcome) -> None:
     """Write what came out into ``run.json``, the last file of a run."""
     pulls, number = outcome.pulls, current().number
@@ -403,3 +302,41 @@ def _record(outcome: Outcome) -> None:
         **({"stopped_by": Signals(number).name} if number and outcome.state == INTERRUPTED else {}),
         **({} if pulls is None else {"regret": pulls.regret, "pulls": pulls.as_data()}),
     )
+
+
+# --- the end of a training, and of one that breaks ------------------------------------------------
+
+
+@exits_as_mistakes()
+def close(training: Training) -> None:
+    """Close what is open, each part also where another cannot be closed."""
+    model = training.model
+    with ExitStack() as stack:
+        if model.env is not None:
+            stack.callback(close_environments, model.env)
+        stack.callback(close_environments, training.eval_env)
+        if hasattr(model, "_logger"):
+            stack.callback(model.logger.close)
+
+
+def give_up(training: Training, error: BaseException) -> None:
+    """Note the reason; or remove the folder, where the agent failed before its first step."""
+    run, is_new = training.run, not training.keeping.goes_on
+    if is_gone(run.path):
+        raise FolderGoneError(run.path) from error
+    is_expected = isinstance(error, ValueError | OSError | KeyboardInterrupt | LibraryError)
+    if is_new and is_expected and not has_begun(training):
+        run.discard()
+        if not isinstance(error, ValueError):  # the others say for themselves what it was
+            return
+        message = f"{training.spec.algo} on {run.env_name}: {one_line(error)}"
+        raise UserError(message) from error
+    with suppress(OSError):  # what the run has failed by says more
+        training.evaluation.write()
+    if isinstance(error, KeyboardInterrupt) or training.saver.state is not None:
+        run.update_info(state=INTERRUPTED)
+        return
+    run.fail(one_line(error))
+    if isinstance(error, OSError) and error.errno in DISK_ERRORS:
+        when = f"the run has failed at step {training.model.num_timesteps:,}"
+        raise UserError(f"{error.filename}: {error.strerror}: {when}") from error

@@ -33,9 +33,10 @@ from pipeline.environments import make_single_env
 from pipeline.errors import UserError
 from pipeline.evaluation.value_maps import MAX_STATES
 from pipeline.files import write_json, write_text
+from pipeline.preparation import prepare
 from pipeline.signs_of_life import Tell, tell_nobody
 from pipeline.train_spec import TrainSpec, is_plain
-from pipeline.training import carry_out, prepare
+from pipeline.training import carry_out
 from pipeline.unfinished_runs import SaveInterval, StateKeeping
 from pipeline.user_modules import import_again
 from pipeline.watching import LOGGED, MapRecorder, TableRecorder

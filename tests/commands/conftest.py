@@ -30,7 +30,7 @@ def pictures():
 def no_pictures_elsewhere(request, monkeypatch):
     """They take most of a short run."""
     if "pictures" not in request.fixturenames:
-        monkeypatch.setattr("pipeline.training._draw", lambda *_: None)
+        monkeypatch.setattr("pipeline.training.draw", lambda *_: None)
 
 
 @pytest.fixture

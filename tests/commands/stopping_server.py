@@ -43,7 +43,6 @@ def moments():
     from agents.compiled import engine
     from commands import terminal
     from pipeline import callbacks, files, preparation, training
-    from pipeline import stopping as stopping_module
     from pipeline.runs import Run
     from pipeline.state_saver import StateSaver
 
@@ -59,7 +58,7 @@ def moments():
         "judging": (training, "_final_evaluation", always),
         "drawing": (training, "draw_learning_curve", always),
         "recording": (Run, "end", always),
-        "closing": (stopping_module, "close_environments", always),
+        "closing": (training, "close_environments", always),
     }
 
 

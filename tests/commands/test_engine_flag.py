@@ -14,9 +14,9 @@ from commands.terminal import about, search_line, study_line, training_line
 from commands.train import train_spec
 from commands.tune import tuning_spec
 from experiments.plan import plan
-from pipeline.engine_outlook import EngineOutlook, planned_outlook
 from pipeline.errors import UserError
 from pipeline.model_card import card
+from pipeline.preparation import EngineOutlook, planned_outlook
 from tuning.retesting import Candidate, retest_study
 from tuning.suggesting import planned_run
 

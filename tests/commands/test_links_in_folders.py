@@ -81,7 +81,7 @@ def type_command(tmp_path, monkeypatch, capfd):
     """Run a command in this process, where it may not take long: exit code and all output."""
     (tmp_path / "own").mkdir()
     monkeypatch.chdir(tmp_path / "own")
-    monkeypatch.setattr("pipeline.training._draw", lambda *_: None)
+    monkeypatch.setattr("pipeline.training.draw", lambda *_: None)
 
     def run(command, *words):
         monkeypatch.setattr(sys, "argv", [command, *map(str, words)])

@@ -32,7 +32,7 @@ from experiments.bandits import (
 )
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec, read_study
-from pipeline.callbacks import PullRecorder, are_bandits
+from pipeline.callbacks import PullRecorder
 from pipeline.runs import PULLS_FILE, Run
 from pipeline.training import train
 from report.conclusions import conclusion
@@ -103,7 +103,7 @@ def test_a_log_knows_rewards_and_matches_alone(tmp_path):
 def test_what_is_a_bandit():
     for env_id, expected in (("BernoulliBandit-v0", True), ("FrozenLake-v1", False)):
         env = make_vec_env(lambda env_id=env_id: gym.make(env_id))
-        assert are_bandits(env) == expected
+        assert env.has_attr("n_arms") == expected
         env.close()
 
 
