@@ -184,6 +184,7 @@ class Case:
         if filled[0].endswith(".py"):
             filled = [str(ROOT / filled[0]), *filled[1:], "-f", str(logs)]
         environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+        environment["PYTHONFAULTHANDLER"] = "1"  # what hangs tells where
         if stop is not None:
             (self.folder / "calls").write_bytes(bytes(8))
             environment |= {

@@ -46,6 +46,7 @@ from _campaign_commands import Case, Stop, cases, short_cases
 SIGNALS = ("SIGKILL", "SIGTERM", "SIGINT", "SIGINT twice")
 TARGETS = ("driver", "worker", "all")
 MOST_STARTS = 200  # of one command: it should have come to its end by then
+LONGEST = 60  # seconds of a start, beside twenty times as long as in peace
 
 
 def disturbed(case: Case, seed: int, most: int) -> int:
@@ -66,7 +67,7 @@ def disturbed(case: Case, seed: int, most: int) -> int:
             signals += is_stopped
         else:
             process = case.start(logs)
-        code = process.wait()
+        code = _ended(case, process)
         case.counts["orphans"] += _orphans(process.pid)
         case.counts["tracebacks"] += _has_traceback(case)
         if code == 0:
@@ -77,12 +78,25 @@ def disturbed(case: Case, seed: int, most: int) -> int:
     return signals
 
 
+def _ended(case: Case, process: subprocess.Popen[str]) -> int:
+    """The exit code; of a command that hangs, `faulthandler` prints where, and it is killed."""
+    try:
+        return process.wait(LONGEST + 20 * case.seconds)
+    except subprocess.TimeoutExpired:
+        for pid in _group(process.pid):
+            _send(pid, signal.SIGABRT)
+        case.counts["never done"] += 1
+        process.wait()
+        print(f"{case.name} hangs:\n{case.read_said()}", file=sys.stderr)
+        return 0
+
+
 def _stop_at_a_call(
     case: Case, logs: Path, draw: random.Random
 ) -> tuple[subprocess.Popen[str], bool]:
     stop = Stop(draw.randint(1, case.calls), Signals[draw.choice(SIGNALS[:3])])
     process = case.start(logs, stop)
-    process.wait()
+    _ended(case, process)
     is_stopped = case.calls_made() >= stop.call
     case.counts[stop.signal.name] += is_stopped
     return process, is_stopped
