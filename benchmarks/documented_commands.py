@@ -2,13 +2,13 @@
 
     python benchmarks/documented_commands.py --results found.json     # about an hour on one core
     python benchmarks/documented_commands.py --results found.json --only cliff --again
-    python benchmarks/documented_commands.py --results found.json --before older.json --fill
+    python benchmarks/documented_commands.py --results found.json --fill
 
 Trainings are collected from the text, see docs/scripts/recommended_commands.py, and done one after
 another in this process, with ``--engine auto`` and the seeds 1000 to 1019; fewer where that many
 take longer than ``--limit`` seconds, and one where an agent plans and draws no numbers. What is
-found is kept in the file at once, and what is in it is not done again. ``--fill`` writes the table
-into docs/documented-commands.md, and beside the commands of all pages what they reach.
+found is kept in the file at once, and what is in it is not done again. ``--fill`` puts it into
+docs/documented-commands.json, and beside the commands of all pages what they reach.
 
 With ``PYTHONPATH=OLDER_CHECKOUT`` the same trainings are done with an older version.
 """
@@ -31,14 +31,13 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.append(str(ROOT / "docs" / "scripts"))
 
-from recommended_commands import PAGE, trainings, with_outcomes  # noqa: E402
+from recommended_commands import PAGE, RESULTS, trainings, with_outcomes  # noqa: E402
 
 SEEDS = range(1000, 1020)
 FEWEST = 5
 REACHED = 0.9
 OPTIMAL = 0.01
 PLANNERS = {"optimal", "value_iteration", "policy_iteration"}
-BLOCK = re.compile(r"(<!-- trainings -->\n).*?(<!-- end -->)", re.DOTALL)
 
 
 def prepared_folder(folder: Path) -> None:
@@ -95,7 +94,7 @@ def measure(training: str, limit: float, folder: Path) -> list[dict[str, Any]]:
     return runs
 
 
-def cells(training: str, runs: list[dict[str, Any]]) -> list[str]:
+def row(training: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
     """Solved, what the median run reaches, and its processor time."""
     solved = n_solved(training, runs)
     # Beside a constant policy that is optimal too, scores have no size.
@@ -104,11 +103,11 @@ def cells(training: str, runs: list[dict[str, Any]]) -> list[str]:
     kind = next((name for name in names if all(run[name] is not None for run in runs)), None)
     reached = f"{statistics.median(run[kind] for run in runs):.3g}" if kind else ""
     reached += "" if kind in ("score", None) else f" ({kind})"
-    return [
-        "" if solved is None else f"{solved} of {len(runs)}",
-        reached,
-        f"{statistics.median(run['seconds'] for run in runs):.2g}",
-    ]
+    return {
+        "solved": "" if solved is None else f"{solved} of {len(runs)}",
+        "median": reached,
+        "seconds": float(f"{statistics.median(run['seconds'] for run in runs):.2g}"),
+    }
 
 
 def _is_optimal(run: dict[str, Any]) -> bool:
@@ -131,18 +130,14 @@ def n_solved(training: str, runs: list[dict[str, Any]]) -> int | None:
     return len([run for run in runs if run["return"] >= threshold])
 
 
-def table(found: dict[str, Any], before: dict[str, Any]) -> str:
-    """Of all trainings that were measured and are recommended still."""
-    rows = [
-        "| `train.py` with | solved | before | median score | seconds |",
-        "|---|---|---|---|---|",
-    ]
-    for training in trainings():
-        if training in found:
-            solved, reached, seconds = cells(training, found[training])
-            old = cells(training, before[training])[0] if training in before else ""
-            rows.append(f"| `{training}` | {solved} | {old} | {reached} | {seconds} |")
-    return "\n".join(rows) + "\n"
+def fill(found: dict[str, Any]) -> None:
+    """Write what was found, for all trainings that are recommended still, and beside commands."""
+    before = json.loads(RESULTS.read_text(encoding="utf-8"))
+    rows = {one: row(one, found[one]) if one in found else before.get(one) for one in trainings()}
+    lines = [f"{json.dumps(one)}: {json.dumps(each)}" for one, each in rows.items() if each]
+    RESULTS.write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
+    for page in PAGE.parent.rglob("*.md"):
+        page.write_text(with_outcomes(page.read_text(encoding="utf-8")), encoding="utf-8")
 
 
 def main() -> None:
@@ -151,23 +146,16 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("--results", type=Path, required=True, metavar="FILE")
-    parser.add_argument("--before", type=Path, metavar="FILE", help="found with an older version")
     parser.add_argument("--only", default="", metavar="REGEX", help="trainings that match")
     parser.add_argument("--again", action="store_true", help="also those that are in the file")
     parser.add_argument(
         "--limit", type=float, default=120, metavar="S", help="for one training (120)"
     )
-    parser.add_argument("--fill", action="store_true", help="write the page; nothing is run")
+    parser.add_argument("--fill", action="store_true", help="write pages; nothing is run")
     args = parser.parse_args()
     found = json.loads(args.results.read_text()) if args.results.exists() else {}
     if args.fill:
-        before = json.loads(args.before.read_text()) if args.before else {}
-        text = PAGE.read_text(encoding="utf-8")
-        PAGE.write_text(
-            BLOCK.sub(lambda b: f"{b[1]}{table(found, before)}{b[2]}", text), encoding="utf-8"
-        )
-        for page in PAGE.parent.rglob("*.md"):
-            page.write_text(with_outcomes(page.read_text(encoding="utf-8")), encoding="utf-8")
+        fill(found)
         return
     results = args.results.resolve()
     with tempfile.TemporaryDirectory() as name:
@@ -179,7 +167,7 @@ def main() -> None:
                 # The file may have grown by another process.
                 found = json.loads(results.read_text()) if results.exists() else {}
                 results.write_text(json.dumps({**found, training: runs}, indent=1))
-                print(training, *cells(training, runs), sep=" | ", flush=True)
+                print(training, *row(training, runs).values(), sep=" | ", flush=True)
 
 
 if __name__ == "__main__":

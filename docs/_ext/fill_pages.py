@@ -7,7 +7,7 @@ A page says what stands there by a link with a title, which a code host shows as
 The kinds: ``code``, with names that the linked file defines; ``environment``, with an id and
 arguments, for the picture, the facts and the docstring; ``facts`` and ``docstring``, likewise, for
 a part of these; ``optima`` and ``variants``, with several ids, for tables of optima; ``agents`` and
-``agents-by-spaces``, with nothing, for tables of agents.
+``agents-by-spaces``, with nothing, for tables of agents; ``trainings``, for what commands reach.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from environment_facts import (  # noqa: E402
     optima_block,
     variants_block,
 )
-from recommended_commands import with_outcomes  # noqa: E402
+from recommended_commands import trainings_block, with_outcomes  # noqa: E402
 
 KINDS: dict[str, Callable[..., str]] = {
     "agents": agents_block,
@@ -41,6 +41,7 @@ KINDS: dict[str, Callable[..., str]] = {
     "environment": environment_block,
     "facts": facts_block,
     "optima": optima_block,
+    "trainings": trainings_block,
     "variants": variants_block,
 }
 LINE = re.compile(rf'^\[[^\]\n]*\]\((\S+) "({"|".join(KINDS)})(?:: ([^"\n]*))?"\)$', re.MULTILINE)

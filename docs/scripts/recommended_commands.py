@@ -7,6 +7,7 @@ are the settings that a search begins with.
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "documented-commands.md"
+RESULTS = PAGE.with_suffix(".json")
 PACKAGES = ("agents", "commands", "envs", "experiments", "pipeline", "report", "tuning")
 # Where a command ends: a backtick, a comment, a cell of a table or the line.
 COMMAND = re.compile(
@@ -30,7 +32,6 @@ SEARCH = {"--trials": 1, "--timeout": 1, "-j": 1, "--seeds-per-trial": 1, "--obj
 SEARCH |= {"--sampler": 1, "--storage": 1, "--name": 1}
 STUDY = {"--env": -1, "--algos": -1, "--seeds": 1, "--first-seed": 1}
 STUDY |= {"--episodes-table": 1, "--render-every": 1, "--metric": 1}
-ROW = re.compile(r"^\| `(--env [^`]*)` \| ([^|]*) \| [^|]* \| ([^|]*) \| ([^|]*) \|$", re.MULTILINE)
 LINE = re.compile(r"^(python (?:train|compare)\.py [^#\n]*?)(?: +#[^\n]*)?$", re.MULTILINE)
 
 
@@ -133,7 +134,7 @@ def trainings() -> dict[str, list[str]]:
 
 @dataclass(frozen=True)
 class Reached:
-    """A row of the table: how many of how many runs solve it, and what the median run reaches."""
+    """How many of how many runs solve it, and what the median run reaches."""
 
     n_solved: int | None
     n_runs: int
@@ -142,13 +143,22 @@ class Reached:
 
 
 def reached() -> dict[str, Reached]:
-    """The table of the page by training."""
+    """What `benchmarks/documented_commands.py` has found, by training."""
     found = {}
-    for training, solved, median, seconds in ROW.findall(PAGE.read_text(encoding="utf-8")):
-        n_solved, _, n_runs = solved.partition(" of ")
-        count, n = (int(n_solved), int(n_runs)) if solved else (None, 0)
-        found[training] = Reached(count, n, median, float(seconds))
+    for training, row in json.loads(RESULTS.read_text(encoding="utf-8")).items():
+        n_solved, _, n_runs = row["solved"].partition(" of ")
+        count, n = (int(n_solved), int(n_runs)) if row["solved"] else (None, 0)
+        found[training] = Reached(count, n, row["median"], row["seconds"])
     return found
+
+
+def trainings_block() -> str:
+    """A row for each training."""
+    lines = ["| `train.py` with | solved | median score | seconds |", "|---|---|---|---|"]
+    for training, row in reached().items():
+        solved = "" if row.n_solved is None else f"{row.n_solved} of {row.n_runs}"
+        lines.append(f"| `{training}` | {solved} | {row.median} | {row.seconds:g} |")
+    return "\n".join(lines) + "\n"
 
 
 def with_outcomes(text: str) -> str:
