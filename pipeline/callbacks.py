@@ -13,19 +13,17 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 from stable_baselines3 import DQN
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from agents.bandits.runs import PullLog
-from agents.common.callbacks import BlockCallback, EpisodeBudget, Horizon, calls_until_multiple
+from agents.common.callbacks import BlockCallback, Horizon, calls_until_multiple
 from machine_code.work_time import WorkTime
 from pipeline.errors import UserError
-from pipeline.evaluation.exact import ExactEvaluator
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import ValueMapRecorder
 from pipeline.files import replacing
@@ -38,26 +36,19 @@ from pipeline.finite_numbers import (
 )
 from pipeline.models.find import replay_buffer_path, statistics_path
 from pipeline.models.load import save_model, save_normalization, save_replay_buffer
-from pipeline.progress import ProgressDisplay
 from pipeline.runs import PULLS_FILE, Run
 from pipeline.settings import components
 from pipeline.stopping import current
 from pipeline.train_spec import TrainSpec
 
-# Callbacks beside evaluation: checkpoints, and exploration that decays by the update.
-#
-# A hyperparameter file may name `EpisodeCheckpoint` and `ExponentialExploration` under
-# ``callback``.
+# --- what settings name: checkpoints, and exploration that decays by the update -------------------
 
 
 class Checkpoint(BlockCallback):
     """Keeps the agent as it is at some moments, as ``rl_model_<steps>_steps.zip``.
 
-    Statistics of VecNormalize go with it, under the name that `CheckpointCallback` gives them.
-
-    Args:
-        save_path: folder to write to.
-        with_replay_buffer: write the agent's replay buffer each time too, where it has one.
+    Statistics of VecNormalize go with it, under the name that `CheckpointCallback` gives them, and
+    on demand the replay buffer.
     """
 
     def __init__(self, save_path: str | Path, with_replay_buffer: bool = False) -> None:
@@ -76,11 +67,7 @@ class Checkpoint(BlockCallback):
 
 
 class StepCheckpoint(Checkpoint):
-    """A checkpoint every ``every_n_steps`` environment steps, counted over all environments.
-
-    Raises:
-        ValueError: if the number is below 1.
-    """
+    """A checkpoint every ``every_n_steps`` environment steps, counted over all environments."""
 
     def __init__(
         self, every_n_steps: int, save_path: str | Path, with_replay_buffer: bool = False
@@ -147,23 +134,15 @@ class ExponentialExploration(BaseCallback):
         self, initial_eps: float = 1.0, final_eps: float = 0.01, decay: float = 0.995
     ) -> None:
         super().__init__()
-        for name, value in (
-            ("initial_eps", initial_eps),
-            ("final_eps", final_eps),
-            ("decay", decay),
-        ):
-            if not 0 <= value <= 1:
-                raise ValueError(f"{name} must lie between 0 and 1, not {value}")
         self.initial_eps = initial_eps
         self.final_eps = final_eps
         self.decay = decay
+        for name in ("initial_eps", "final_eps", "decay"):
+            if not 0 <= (value := getattr(self, name)) <= 1:
+                raise ValueError(f"{name} must lie between 0 and 1, not {value}")
 
     def check_model(self, model: BaseAlgorithm) -> None:
-        """Refuse agents whose exploration this callback cannot change.
-
-        Raises:
-            ValueError: if the agent is not a DQN.
-        """
+        """Refuse agents whose exploration this callback cannot change."""
         if not isinstance(model, DQN):
             name = type(model).__name__
             raise ValueError(f"ExponentialExploration is for DQN and its kin, not for {name}")
@@ -180,7 +159,7 @@ class ExponentialExploration(BaseCallback):
         return True
 
 
-# A callback that ends a training at the first number that is none.
+# --- the first number that is none ends a training ------------------------------------------------
 
 # Under these names the library's agents log what they minimise. Other entries may be nan, such as
 # the variance that is explained of nothing.
@@ -198,9 +177,7 @@ _NO_EPISODE: Mapping[str, float] = {"r": 0.0}
 class NumberWatch(BlockCallback):
     """Looks at what each step brings: observations, rewards, actions, returns, and losses.
 
-    It comes before all other callbacks, so that nothing is kept of such a step. The compiled loop
-    shows it the last step of each block; the rewards that it trains on are those of a model, which
-    are finite.
+    The compiled loop shows it the last step of each block; the rewards of a model are finite.
     """
 
     takes_blocks = True
@@ -247,29 +224,22 @@ class NumberWatch(BlockCallback):
                 check_numbers(total, "return", where)
 
 
-# The pulls of a training on a bandit: a file of its run folder, and figures on them.
+# --- the pulls of a training on a bandit ----------------------------------------------------------
 
 LAST_PULLS = 100
 
 
 @dataclass(frozen=True)
 class PullSummary:
-    """Figures on the pulls of a training.
+    """Figures on the pulls of a training."""
 
-    Attributes:
-        n_pulls: how many there were, over all environments.
-        n_matched: how many of them a log held the arm of; all where there is no log.
-        reward: mean reward of the pulls that matched; None where none did.
-        regret: sum over the pulls of the best expected reward less that of the arm; None where
-            nobody knows what arms are worth, as with a log.
-        optimal: share of a best arm among the last pulls, likewise.
-    """
-
-    n_pulls: int
-    n_matched: int
-    reward: float | None
+    n_pulls: int  # over all environments
+    n_matched: int  # that a log held the arm of; all where there is no log
+    reward: float | None  # mean of the pulls that matched; None where none did
+    # Sum of the best expected reward less that of the arm; None where nobody knows what arms are
+    # worth, as with a log.
     regret: float | None
-    optimal: float | None
+    optimal: float | None  # share of a best arm among the last pulls, likewise
 
     def as_data(self) -> dict[str, Any]:
         """The figures as JSON."""
@@ -290,11 +260,7 @@ def summarise_pulls(pulls: Mapping[str, NDArray[Any]]) -> PullSummary:
 
 
 class PullRecorder(PullLog):
-    """Writes ``pulls.npz`` at the end of training; see `PullLog.arrays` for what is in it.
-
-    Args:
-        folder: where to.
-    """
+    """Writes ``pulls.npz`` at the end of training; see `PullLog.arrays` for what is in it."""
 
     def __init__(self, folder: Path) -> None:
         super().__init__()
@@ -309,7 +275,7 @@ class PullRecorder(PullLog):
             np.savez(file, allow_pickle=False, **self.arrays())
 
 
-# Evaluations during training: when they are due, and what is kept of them.
+# --- evaluations during training: when they are due, and what is kept of them ---------------------
 
 SECONDS_BETWEEN_WRITES = 1.0
 
@@ -319,22 +285,6 @@ class EvaluationCallback(EvalCallback):
 
     It writes ``evaluations.npz`` and ``best_model.zip`` with its statistics of VecNormalize, and
     feeds the same callbacks and log entries as its parent.
-
-    Args:
-        run: where the files go.
-        eval_env: the environment that the evaluation uses; its VecNormalize follows training's.
-        evaluator: evaluates an agent.
-        eval_freq: calls of `VecEnv.step` between two evaluations; 0 for none but those asked for
-            by `evaluate_now`.
-        eval_episode_freq: episodes between two evaluations, instead; 0 for none.
-        callback_after_eval: told after every evaluation.
-        value_maps: keeps the agent's policy at every evaluation, where that can be drawn.
-        during: shows what goes on while an evaluation runs.
-
-    Attributes:
-        taken: the time that evaluations have taken.
-        n_episodes: episodes of each evaluation, 0 of those that are exact.
-        best_episodes: of the best one.
     """
 
     def __init__(
@@ -348,20 +298,21 @@ class EvaluationCallback(EvalCallback):
         value_maps: ValueMapRecorder | None = None,
         during: Callable[[str], AbstractContextManager[object]] = nullcontext,
     ) -> None:
+        # Calls of `VecEnv.step` between two evaluations, or episodes; 0 for none.
         super().__init__(
             eval_env, callback_after_eval=callback_after_eval, eval_freq=eval_freq, verbose=0
         )
+        self.eval_episode_freq = eval_episode_freq
         self.run = run
         self.evaluator = evaluator
-        self.eval_episode_freq = eval_episode_freq
         self.value_maps = value_maps
-        self.during = during
+        self.during = during  # shows what goes on while an evaluation runs
         self.episodes_seen = 0
         self.last_evaluation: Evaluation | None = None
         self.best_timesteps = 0
         self.best_episodes = 0
-        self.taken = WorkTime()
-        self.n_episodes: list[int] = []
+        self.taken = WorkTime()  # the time that evaluations have taken
+        self.n_episodes: list[int] = []  # of each evaluation, 0 of those that are exact
         self._is_written = True
         self._written_at = -np.inf
 
@@ -412,11 +363,7 @@ class EvaluationCallback(EvalCallback):
             self.taken += WorkTime.now() - begun
 
     def evaluate_now(self) -> bool:
-        """Evaluate the agent as it is; False where a callback asks to stop the training.
-
-        Raises:
-            NotFiniteError: if the agent, or what it meets, is not finite.
-        """
+        """Evaluate the agent as it is; False where a callback asks to stop the training."""
         check_model(self.model)
         self.take_statistics()
         with self.during("evaluating"), self.timed():
@@ -493,40 +440,9 @@ def _table(rows: list[list[Any]]) -> NDArray[Any]:
     return np.array([row * (width // len(row)) for row in rows])
 
 
-# What is told of a training's steps: evaluations, checkpoints, pulls, and what settings name.
+# --- which callbacks a training has ---------------------------------------------------------------
 
 EVALUATIONS_PER_RUN = 20
-
-
-def all_callbacks(
-    spec: TrainSpec, callbacks: list[BaseCallback], display: ProgressDisplay
-) -> CallbackList:
-    """All callbacks: those that are there in any case, the budget, and what shows the progress."""
-    if spec.hyperparams.n_episodes is not None:
-        callbacks.append(EpisodeBudget(spec.hyperparams.n_episodes))
-    if spec.verbose > 0:
-        callbacks.append(display)
-    return CallbackList(callbacks)
-
-
-def evaluation_callback(
-    spec: TrainSpec,
-    run: Run,
-    eval_env: VecEnv,
-    n_envs: int,
-    is_bandit: bool,
-    exact: ExactEvaluator | None,
-    display: ProgressDisplay,
-) -> EvaluationCallback:
-    """The evaluations during training: exact ones where they can be."""
-    return EvaluationCallback(
-        run,
-        eval_env,
-        exact or SampledEvaluator(spec, eval_env),
-        *_evaluation_intervals(spec, n_envs, is_judged_by_regret=exact is None and is_bandit),
-        value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
-        during=display.doing,
-    )
 
 
 def named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[BaseCallback]:
@@ -534,25 +450,6 @@ def named_callbacks(spec: TrainSpec, run: Run, model: BaseAlgorithm) -> list[Bas
     callbacks: list[BaseCallback] = components.callbacks(
         spec.hyperparams.callback, spec.gym_packages, run.path
     )
-    _check_callbacks(spec, model, callbacks)
-    if spec.save_freq > 0:
-        callbacks.append(StepCheckpoint(spec.save_freq, run.path, spec.save_replay_buffer))
-    if spec.save_every_n_episodes > 0:
-        every = spec.save_every_n_episodes
-        callbacks.append(EpisodeCheckpoint(every, run.path, spec.save_replay_buffer))
-    return callbacks
-
-
-def pull_recorder(model: BaseAlgorithm, run: Run, console: Console) -> PullRecorder | None:
-    """What keeps every pull, unless a compiled loop was asked for, which does not stop at each."""
-    if getattr(model, "engine", None) == "compiled":
-        console.print("engine: compiled keeps no pulls, so that regret is not known", style="dim")
-        return None
-    return PullRecorder(run.path)
-
-
-def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[BaseCallback]) -> None:
-    """Refuse now what would end the training half-way."""
     for callback in callbacks:
         if isinstance(callback, ExponentialExploration):
             callback.check_model(model)
@@ -562,6 +459,12 @@ def _check_callbacks(spec: TrainSpec, model: BaseAlgorithm, callbacks: list[Base
             f"the schedules of {spec.algo} run by steps: give n_timesteps instead of n_episodes, "
             "or constant values"
         )
+    if spec.save_freq > 0:
+        callbacks.append(StepCheckpoint(spec.save_freq, run.path, spec.save_replay_buffer))
+    if spec.save_every_n_episodes > 0:
+        every = spec.save_every_n_episodes
+        callbacks.append(EpisodeCheckpoint(every, run.path, spec.save_replay_buffer))
+    return callbacks
 
 
 def _has_moving_schedule(model: BaseAlgorithm) -> bool:
@@ -569,7 +472,7 @@ def _has_moving_schedule(model: BaseAlgorithm) -> bool:
     return any(callable(s) and s(1.0) != s(0.0) for s in schedules)
 
 
-def _evaluation_intervals(
+def evaluation_intervals(
     spec: TrainSpec, n_envs: int, is_judged_by_regret: bool
 ) -> tuple[int, int]:
     """Calls of `VecEnv.step`, and episodes, between two evaluations; 0 for none."""

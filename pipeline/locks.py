@@ -1,15 +1,12 @@
-"""One process at a time on a study or a run: a file says who is at work, and the dead hold none.
+"""One process at a time on a study or a run: a lock file says who is at work.
 
 The file appears in one step, as a link to one that is written already; that works on network
-folders too. Its owner gives signs of life, by the clock of the folder: all machines that share it
-agree on that one. On the machine where it was made the process itself is looked for; elsewhere an
-owner counts as gone once it has been silent for a minute.
+folders too. Its owner touches it every five seconds, by the clock of the folder, which all machines
+that share it agree on. On its own machine the process is looked for; elsewhere an owner counts as
+gone once it has been silent for a minute.
 
-A number alone does not name a process: numbers are used again, after a reboot, in each container
-and on each machine that shares a folder. On Linux, what names one is the number with the time it
-began, in ticks since the machine booted, which no change of the clock moves; the identity of that
-boot; and the namespace that the number belongs to. Elsewhere it is the number on that host, and a
-process that was given it anew passes for the one before.
+Process numbers are used again, after a reboot, in each container and on each machine. So on Linux a
+process is named by its number, the kernel's ticks when it began, the boot and the namespace.
 """
 
 from __future__ import annotations
@@ -65,27 +62,19 @@ def mark() -> dict[str, Any]:
 def is_alive(record: object) -> bool | None:
     """Whether the process that a `mark` names is still there.
 
-    Args:
-        record: the mark, as it was read from a file: anything.
-
-    Returns:
-        None where one cannot tell: of another host, of another container, of what is no mark.
+    None where one cannot tell: of another host or container, and of anything that is no mark.
     """
-    if not isinstance(record, Mapping):
+    pid = record.get("pid") if isinstance(record, Mapping) else None
+    if not isinstance(record, Mapping) or type(pid) is not int or not 0 < pid < 2**31:
         return None
-    pid = record.get("pid")
-    if not isinstance(pid, int) or isinstance(pid, bool) or not 0 < pid < 2**31:
-        return None
-    boot, is_same_host = _first_line(_BOOT), record.get("host") == platform.node()
-    if boot is None or record.get("boot") is None:
-        if boot is not None or record.get("boot") is not None or not is_same_host:
-            return None
-        return _has_process(pid)
-    if record.get("boot") != boot:
-        machine = _machine()
-        is_same_machine = machine is not None and record.get("machine") == machine
-        return False if is_same_host and is_same_machine else None
-    if record.get("namespace") != _pid_namespace():
+    own, is_same_host = mark(), record.get("host") == platform.node()
+    if record.get("boot") != own["boot"]:
+        is_same_machine = own["machine"] is not None and record.get("machine") == own["machine"]
+        is_known = None not in (own["boot"], record.get("boot"))
+        return False if is_known and is_same_host and is_same_machine else None
+    if own["boot"] is None:  # the system does not tell
+        return _has_process(pid) if is_same_host else None
+    if record.get("namespace") != own["namespace"]:
         return None
     began = _ticks_at_begin(pid)
     if began is None or record.get("began") is None:  # gone, or hidden from this user
@@ -248,16 +237,9 @@ def folder_lock(
 ) -> Iterator[None]:
     """Be the only process at work in a folder inside the ``with`` statement.
 
-    Args:
-        root: the folder; it is made, and removed again if nothing else came into it.
-        on_loss: called in another thread if the lock is lost: it has to end the work.
-        say: told in a line why it takes long, where it does.
-
-    Raises:
-        FolderInUseError: if another process is at work, saying who; also at the end, if one has
-            taken this one for dead.
-        FolderGoneError: if somebody has removed the folder.
-        UnsafeFileError: if a link, a pipe or a device lies in the place of the lock.
+    The folder is made, and removed again if nothing else came into it. ``on_loss`` is called in
+    another thread if the lock is lost, and has to end the work: another process has taken this one
+    for dead, or somebody has removed the folder. ``say`` is told why it takes long.
     """
     lost: list[UserError] = []
 

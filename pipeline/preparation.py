@@ -14,7 +14,7 @@ import torch as th
 from gymnasium import spaces
 from rich.console import Console
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import set_random_seed
 from stable_baselines3.common.vec_env import VecEnv
@@ -26,10 +26,8 @@ from pipeline.callbacks import (
     EvaluationCallback,
     NumberWatch,
     PullRecorder,
-    all_callbacks,
-    evaluation_callback,
+    evaluation_intervals,
     named_callbacks,
-    pull_recorder,
 )
 from pipeline.digests import VERSION, VERSION_FIELD
 from pipeline.environments import (
@@ -41,8 +39,8 @@ from pipeline.environments import (
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.exact import ExactEvaluator, discount_note, evaluator_of, model_refusal
 from pipeline.evaluation.policies import why_not_exact
-from pipeline.evaluation.sampled import n_environments, takes_batches
-from pipeline.evaluation.value_maps import map_refusal
+from pipeline.evaluation.sampled import SampledEvaluator, n_environments, takes_batches
+from pipeline.evaluation.value_maps import ValueMapRecorder, map_refusal
 from pipeline.failures import exits_as_mistakes
 from pipeline.files import naming
 from pipeline.library_loading import load_for_optimizer
@@ -216,12 +214,23 @@ def _set_up(
     eval_env = make_evaluation_env(spec, n_eval_envs)
     undo.callback(close_environments, eval_env)
     display = ProgressDisplay(console, can_move(console), trains_on_variant(spec))
-    evaluation = evaluation_callback(spec, run, eval_env, env.num_envs, is_bandit, exact, display)
+    evaluation = EvaluationCallback(
+        run,
+        eval_env,
+        exact or SampledEvaluator(spec, eval_env),
+        *evaluation_intervals(spec, env.num_envs, is_judged_by_regret=is_bandit and exact is None),
+        value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
+        during=display.doing,
+    )
     saver = StateSaver(
         run, keeping.interval, partial(_say, console), keeping.state, keeping.was_cut_off
     )
     saver.modules = spec.user_modules
-    pulls = pull_recorder(model, run, console) if is_bandit else None
+    pulls = None
+    if is_bandit and getattr(model, "engine", None) == "compiled":  # which stops at no pull
+        _say(console, "engine: compiled keeps no pulls, so that regret is not known")
+    elif is_bandit:
+        pulls = PullRecorder(run.path)
     watch = watch_of(spec, model, exact)
     shows_evaluations = isinstance(watch, EvaluationMaps)
     if shows_evaluations:
@@ -230,7 +239,11 @@ def _set_up(
     # training goes back from.
     first = [NumberWatch(), saver, *named_callbacks(spec, run, model)]
     others = [*filter(None, [pulls, None if shows_evaluations else watch]), evaluation]
-    saver.root = all_callbacks(spec, [*first, *others], display)
+    if spec.hyperparams.n_episodes is not None:
+        others.append(EpisodeBudget(spec.hyperparams.n_episodes))
+    if spec.verbose > 0:
+        others.append(display)
+    saver.root = CallbackList([*first, *others])
     return Training(
         spec,
         run,

@@ -40,11 +40,6 @@ class ProgressDisplay(BlockCallback):
 
     A line is printed for every tenth of the training, two seconds after its beginning, and where
     ten seconds have gone by since the last.
-
-    Args:
-        console: where to.
-        live: whether to draw a bar that moves.
-        on_variant: whether returns of training are not to be held against those of evaluation.
     """
 
     takes_blocks = True
@@ -54,7 +49,7 @@ class ProgressDisplay(BlockCallback):
         self.console = console
         self.bar: Progress | None = None
         self.live = live
-        self.on_variant = on_variant
+        self.on_variant = on_variant  # returns of training are not those of evaluation
         self.has_begun = False
         self.updated = 0.0
         self.tenths_shown = 0
@@ -87,8 +82,8 @@ class ProgressDisplay(BlockCallback):
     def _on_rollout_start(self) -> None:
         self.activity = ""
         if not self.has_begun:  # a run that goes on is where it was by now
-            share = min(self.model.num_timesteps / max(self.model._total_timesteps, 1), 1.0)
-            self.has_begun, self.marks = True, [(time.monotonic(), share)]
+            self.num_timesteps = self.model.num_timesteps
+            self.has_begun, self.marks = True, [(time.monotonic(), self.share_done)]
 
     def _on_rollout_end(self) -> None:
         self.activity = LEARNING
@@ -178,10 +173,9 @@ class ProgressDisplay(BlockCallback):
         return figures if left is None else f"{figures}  about {duration(left)} left by the clock"
 
     def _seconds_left(self) -> float | None:
-        """By the clock, at the speed of the last half of what is done; None where nobody knows.
+        """By the speed of the last half of what is done; None where nobody knows.
 
-        Off-policy agents are faster before they begin to learn. What comes before the first steps
-        are done, such as compiling, does not count.
+        Off-policy agents are faster before they begin to learn.
         """
         now, share = time.monotonic(), self.share_done
         if share >= self.marks[-1][1] + 0.001:

@@ -47,11 +47,7 @@ def duration(seconds: float) -> str:
 
 
 class Silence:
-    """How long nothing has been said, by a clock of its own.
-
-    Args:
-        allowed: seconds until the first line is due; for each after that, `SECONDS_BETWEEN_LINES`.
-    """
+    """How long nothing has been said: the first line is due after so many seconds."""
 
     def __init__(self, allowed: float = SECONDS_BEFORE_A_LINE) -> None:
         self._ends = time.monotonic() + allowed
@@ -67,12 +63,7 @@ class Silence:
 
 
 class Heartbeat:
-    """Calls a function every so often, whatever else goes on; it begins and ends as often as asked.
-
-    Args:
-        function: called in a thread of its own.
-        seconds: between two calls.
-    """
+    """Calls a function in a thread of its own, with so many seconds between two calls."""
 
     def __init__(self, function: Callable[[], object], seconds: float) -> None:
         self._function = function
@@ -104,11 +95,7 @@ class Heartbeat:
 
 
 class CompilationNotice(logging.Handler):
-    """Says once that something is being compiled.
-
-    Args:
-        say: called when that begins.
-    """
+    """Says once that something is being compiled."""
 
     def __init__(self, say: Callable[[], object]) -> None:
         super().__init__(logging.INFO)
@@ -133,12 +120,7 @@ class CompilationNotice(logging.Handler):
 
 
 class Activity:
-    """What is being done now; `doing` shows it.
-
-    Args:
-        console: where to.
-        text: what it is.
-    """
+    """What is being done now; `doing` shows it."""
 
     def __init__(self, console: Console, text: str) -> None:
         self.console = console
@@ -209,14 +191,7 @@ def doing(console: Console, text: str) -> Iterator[Activity]:
     """Show what is being done while the ``with`` statement runs.
 
     On a terminal that is a line that moves and is gone at the end. Elsewhere lines stay, so there
-    is none for what is over in five seconds, and then one every ten.
-
-    Args:
-        console: where to; nothing is shown on a quiet one.
-        text: what is being done.
-
-    Yields:
-        What tells of further activities and prints lines between.
+    is none for what is over in five seconds, and then one every ten. A quiet console shows nothing.
     """
     activity = Activity(console, text)
     if console.quiet:
