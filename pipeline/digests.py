@@ -1,9 +1,9 @@
 """What the files of a run were when it ended: their SHA-256, which ``run.json`` keeps in ``files``.
 
 The entry of ``run.json`` itself is the digest of all else in it, as JSON without spaces and with
-sorted keys. A file that is not listed is the user's own, and nothing is said of it. Runs of earlier
-versions have no such field: their files are taken as they are. What tells them from a run that has
-lost it, or never came to its end, is ``record_version``, which is written when a run begins.
+sorted keys. A file that is not listed is the user's own. Runs of earlier versions have no such
+field, and no ``record_version``, which is written when a run begins: their files are taken as they
+are.
 """
 
 from __future__ import annotations
@@ -64,11 +64,7 @@ _DAMAGE = (
 
 
 class DamagedFileError(UserError):
-    """A file of a run is missing, or is not what the run left.
-
-    Attributes:
-        path: the file.
-    """
+    """The file at ``path`` is missing, or is not what the run left."""
 
     def __init__(self, path: Path, reason: str) -> None:
         super().__init__(f"{path} {reason}")
@@ -84,10 +80,7 @@ class RecordedFiles:
     digests: Mapping[str, str] | None
 
     def matching(self, pattern: str) -> list[Path]:
-        """The files in the folder itself that the run left, by name; see `fnmatch`.
-
-        Of a run that recorded no digests, those that are there.
-        """
+        """The files in the folder itself that the run left, by name; see `fnmatch`."""
         if self.digests is None:
             return sorted(self.folder.glob(pattern))
         names = (name for name in self.digests if "/" not in name and fnmatchcase(name, pattern))

@@ -13,7 +13,7 @@ import yaml
 
 from agents import ALGORITHMS
 from pipeline.errors import visible
-from pipeline.user_modules import copy_among
+from pipeline.user_modules import copy_of
 
 # What stands around an environment, and a plain script would have to put there too.
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
@@ -197,7 +197,10 @@ def _is_known(spec: Mapping[str, Any]) -> bool:
 
 def to_type(spec: Mapping[str, Any], files: Collection[str]) -> list[str]:
     """What to type after ``--gym-packages``: the copy of a module in the pack, or else its name."""
-    return [copy_among(files, str(name)) or str(name) for name in spec.get("gym_packages") or []]
+    return [
+        copy_of(str(name), files.__contains__) or str(name)
+        for name in spec.get("gym_packages") or []
+    ]
 
 
 def plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:

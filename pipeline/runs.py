@@ -1,9 +1,7 @@
 """One run folder: the names of its files, its number, and what it says of itself.
 
-The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, and so are names of files where it
-has them too, so that its tools read our runs; ``run.json`` is ours and says what was asked for, how
-far it came, and what came out. One process at a time is at work on a run; what processes that are
-gone have left among the runs is cleared away before the next is begun.
+The layout is rl_zoo3's, ``<log folder>/<algo>/<env>_<number>/``, and so are the names of files that
+it has too, so that its tools read our runs. ``run.json`` is ours.
 """
 
 from __future__ import annotations
@@ -129,10 +127,7 @@ def _run_number(name: str, env_name: str) -> int:
 
 @dataclass(frozen=True)
 class Run:
-    """A run folder, and what it says of itself.
-
-    It is held: nothing in it is read or written through a link.
-    """
+    """A run folder; nothing in it is read or written through a link."""
 
     path: Path
     env_name: str  # the environment's name in file names
@@ -142,10 +137,7 @@ class Run:
 
     @classmethod
     def claim(cls, log_folder: Path, algo: str, env_id: str, suffix: str = "") -> Run:
-        """Make the folder of a new run, with the first number that is free.
-
-        It says from its first moment on which process is at work on it.
-        """
+        """Make the folder of a new run, with the first number that is free."""
         name = environment_name(env_id)
         parent = log_folder / algo
         draft = cls(parent / f".{name}.{secrets.token_hex(8)}.tmp", name)
@@ -165,8 +157,7 @@ class Run:
     def find(cls, log_folder: Path, algo: str, env_id: str, number: int = 0) -> Run:
         """The run of that number, the newest where it is 0, that without a number where it is -1.
 
-        The one without a number lies in ``<log folder>/<algo>/`` itself, and is also the newest
-        where no other is, as in rl_zoo3.
+        The latter lies in ``<log folder>/<algo>/``, and is also the newest where no other is.
         """
         name = environment_name(env_id)
         runs = numbered_runs(log_folder / algo, name)
@@ -184,18 +175,15 @@ class Run:
         raise UserError(f"no run {number} of {algo} on {name} in {log_folder}: there is {numbers}")
 
     @property
-    def params_path(self) -> Path:
-        """The folder of the run's settings and normalisation statistics."""
+    def params_path(self) -> Path:  # settings and statistics of VecNormalize
         return self.path / self.env_name
 
     @property
-    def model_path(self) -> Path:
-        """The agent at the end of training."""
+    def model_path(self) -> Path:  # the agent at the end of training
         return self.path / f"{self.env_name}.zip"
 
     @property
-    def best_model_path(self) -> Path:
-        """The agent that evaluated best."""
+    def best_model_path(self) -> Path:  # the agent that evaluated best
         return self.path / "best_model.zip"
 
     def checkpoint_path(self, n_steps: int) -> Path:
@@ -210,43 +198,35 @@ class Run:
         return [self.checkpoint_path(n) for n in sorted(int(match[1]) for match in steps if match)]
 
     @property
-    def evaluations_path(self) -> Path:
-        """The evaluations during training."""
+    def evaluations_path(self) -> Path:  # during training
         return self.path / "evaluations.npz"
 
     @property
     def vecnormalize_path(self) -> Path:
-        """The running statistics of VecNormalize."""
         return self.params_path / "vecnormalize.pkl"
 
     @property
-    def state_path(self) -> Path:
-        """The folder of the states that a training under way goes on from."""
+    def state_path(self) -> Path:  # the folder of the states that a training goes on from
         return self.path / STATE_FOLDER
 
     @property
-    def info_path(self) -> Path:
-        """What the run was asked for and what came out."""
+    def info_path(self) -> Path:  # what the run was asked for and what came out
         return self.path / RECORD
 
     @property
     def curve_path(self) -> Path:
-        """The picture of the learning curve."""
         return self.path / "learning_curve.png"
 
     @property
-    def pulls_picture_path(self) -> Path:
-        """The picture of the pulls, on bandits."""
+    def pulls_picture_path(self) -> Path:  # on bandits
         return self.path / "pulls.png"
 
     @property
-    def value_maps_path(self) -> Path:
-        """The policy and its values during training, on grid worlds."""
+    def value_maps_path(self) -> Path:  # the policy and its values during training, on grid worlds
         return self.path / "value_maps.npz"
 
     @property
-    def value_map_path(self) -> Path:
-        """The picture of the policy at the end of training, on grid worlds."""
+    def value_map_path(self) -> Path:  # the picture of the policy at the end, on grid worlds
         return self.path / "value_map.png"
 
     @property
@@ -293,18 +273,15 @@ class Run:
         with replacing(self.path / ROOM) as file:
             file.write(bytes(ROOM_BYTES))
 
-    def _give_room(self) -> None:
-        (self.path / ROOM).unlink(missing_ok=True)
-
     def fail(self, reason: str) -> None:
         """Note in ``run.json`` that the run has failed, if anything can be written at all."""
         with contextlib.suppress(OSError):
-            self._give_room()
+            (self.path / ROOM).unlink(missing_ok=True)
             self.update_info(state=FAILED, reason=reason)
 
     def end(self, **fields: Any) -> None:
         """Set fields of ``run.json``, the last file of a run, with the digests of all others."""
-        self._give_room()
+        (self.path / ROOM).unlink(missing_ok=True)
         for draft in drafts_in(self.path):  # of a file that was not to be finished any more
             draft.unlink(missing_ok=True)
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
@@ -332,7 +309,7 @@ class Run:
 
 @dataclass(frozen=True)
 class ReadRun(Run):
-    """A run folder that is only read: all goes by what it said when it was first asked."""
+    """A run folder that is only read; caches ``run.json``."""
 
     @cached_property
     def _info(self) -> dict[str, Any]:
@@ -343,7 +320,6 @@ class ReadRun(Run):
 
     @cached_property
     def files(self) -> RecordedFiles:
-        """The files that the run left, each held against what it was then."""
         return super().files
 
 
@@ -446,8 +422,7 @@ _CLAIM = re.compile(r"\.(.+)\.[0-9a-f]{16}\.tmp")
 def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
     """Remove half-written files of runs that were killed, and runs killed before their first step.
 
-    Only what a process that is certainly gone has written is touched, and no folder that holds
-    anything else. What cannot be removed stays.
+    Only what a process that is certainly gone has written is touched.
     """
     for run in _unfinished(log_folder / algo, environment_name(env_id)):
         with contextlib.suppress(OSError, UserError):

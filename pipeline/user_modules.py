@@ -1,4 +1,10 @@
-"""Modules of the user's, and what a run remembers of them."""
+"""Modules of the user's: environments and agents that live outside of this project.
+
+They are imported because the user typed their names, and for no other reason: a file may say what
+it needs, and the user is told what to type. What lies beside them is found for their own code
+alone, and after all else, so that an ``agents.py`` of the user's never comes before ours; where two
+modules share a name, it is refused.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +16,7 @@ import re
 import shlex
 import sys
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
@@ -22,14 +28,6 @@ from pipeline.errors import UserError, one_line, shown
 from pipeline.files import files_below, replacing
 from safe_files.files import NO_LIMIT, read_file
 
-# Modules of the user's: environments and agents that live outside of this project.
-#
-# They are imported because the user typed their names on the command line, and for no other reason:
-# a
-# file may say what it needs, and is told what to type. What lies beside them is found for their own
-# code alone, and after all else, so that an ``agents.py`` of the user's never comes before ours;
-# where two modules share a name, it is refused instead.
-
 # Where this project is installed, libraries lie beside it.
 _PROJECT = Path(__file__).resolve().parents[1]
 _OWN = (
@@ -40,17 +38,11 @@ _OWN = (
 
 @dataclass(frozen=True)
 class UserModule:
-    """A module that the user asked for.
+    """A module that the user asked for."""
 
-    Attributes:
-        typed: the words for it on the command line.
-        name: what it is imported as.
-        path: its file, or the folder of a package, from the root; None where it is installed.
-    """
-
-    typed: str
-    name: str
-    path: str | None = None
+    typed: str  # the words for it on the command line
+    name: str  # what it is imported as
+    path: str | None = None  # its file, or a package's folder, from the root; None if installed
 
     @property
     def search_folder(self) -> str | None:
@@ -61,8 +53,7 @@ class UserModule:
 class _TypedFolder(MetaPathFinder):
     """Finds modules in a folder: one that was typed, and those that code from there names.
 
-    On Python's search path, the folder would give a library whatever that looks for and is not
-    installed, and the plugins that any ``*.dist-info`` in it announces.
+    On Python's search path, the folder would serve libraries too, and their plugins.
     """
 
     def __init__(self, folder: str, typed: str) -> None:
@@ -98,15 +89,7 @@ def _search(folder: str, typed: str) -> None:
 def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[UserModule, ...]:
     """Import what the user typed after ``--gym-packages``, and before the colon of ids.
 
-    Args:
-        words: names of modules, and paths of files and packages.
-        env_ids: ids that were typed, such as ``module:Env-v0``.
-
-    Returns:
-        The modules, as another process can `import_again`; without those of this project.
-
-    Raises:
-        UserError: if one is not there, cannot be imported, or shares its name with another.
+    The modules are returned as another process can `import_again`; without those of this project.
     """
     prefixes = [env_id.rpartition(":")[0] for env_id in env_ids]
     modules = []
@@ -119,11 +102,7 @@ def import_typed(words: Iterable[str], env_ids: Iterable[str] = ()) -> tuple[Use
 
 
 def import_again(modules: Iterable[UserModule]) -> None:
-    """Import what `import_typed` did, in another process and from any folder.
-
-    Raises:
-        UserError: as there.
-    """
+    """Import what `import_typed` did, in another process and from any folder."""
     for module in modules:
         if module.name not in sys.modules:
             _import(module)
@@ -199,11 +178,7 @@ def _import(module: UserModule) -> ModuleType:
 
 
 def _check_name(module: UserModule, folder: Path) -> None:
-    """Make sure that the user's module is the one that is found under its name.
-
-    Raises:
-        UserError: if that is one of ours, of Python's, or of a library.
-    """
+    """Make sure that the user's module is the one that is found under its name."""
     top = module.name.partition(".")[0]
     wanted = _source(folder, top) or folder / top
     found = _places(top)
@@ -238,7 +213,7 @@ def is_ours(name: str) -> bool:
 
 def _what_failed(error: BaseException, module: UserModule) -> str:
     """What went wrong in an import, with file and line."""
-    if isinstance(error, ModuleNotFoundError) and _is_within(module, error.name or "?"):
+    if isinstance(error, ModuleNotFoundError) and f"{module.name}.".startswith(f"{error.name}."):
         return f"cannot import {error.name}: it is neither in {Path.cwd()} nor installed"
     if isinstance(error, SyntaxError) and error.filename:
         return f"{error.filename}:{error.lineno}: {type(error).__name__}: {error.msg}"
@@ -246,11 +221,6 @@ def _what_failed(error: BaseException, module: UserModule) -> str:
     frames = traceback.extract_tb(error.__traceback__)[1:]
     own = [frame for frame in frames if _is_users(frame.filename, module)]
     return f"{own[-1].filename}:{own[-1].lineno}: {what}" if own else what
-
-
-def _is_within(module: UserModule, name: str) -> bool:
-    """Whether ``name`` is the module itself or a package that it lies in."""
-    return f"{module.name}.".startswith(f"{name}.")
 
 
 def _is_users(filename: str, module: UserModule) -> bool:
@@ -264,30 +234,21 @@ def _refused(typed: str, reason: str) -> UserError:
     return UserError(f"--gym-packages {shlex.quote(typed)}: {reason}")
 
 
-# What a run remembers of the user's modules, and how it asks for them: by saying what to type.
+# --- what a run remembers of them, and how it asks for them ---------------------------------------
 
-# The folder of a run that keeps copies of the user's modules.
-COPIES = "modules"
+COPIES = "modules"  # the folder of a run that keeps copies of them
 MAX_COPY_BYTES = 1_000_000  # of a module, with all that it imports from beside it
 _FOLDERS_ABOVE = 3  # that a study's modules may lie from the pack of one of its runs
 
 
 def as_flag(modules: Iterable[UserModule], env_id: str = "") -> str:
-    """The flag that imports the modules again, to be typed; empty where none is needed.
-
-    Args:
-        modules: as `import_typed` returned them.
-        env_id: typed beside it; the module before its colon needs no flag.
-    """
+    """The flag to type that imports the modules again; none for the one before an id's colon."""
     words = [m.typed for m in modules if m.typed != env_id.rpartition(":")[0]]
     return f" --gym-packages {shlex.join(words)}" if words else ""
 
 
 def keep_copies(modules: Iterable[UserModule], folder: Path) -> None:
-    """Put copies of the modules, and of what they import from beside them, into a run folder.
-
-    Of a module that is too large with these, there is none.
-    """
+    """Put copies of the modules, and of what they import from beside them, into a run folder."""
     for module in modules:
         sources = _sources(module)
         if sum(path.stat().st_size for path in sources.values()) > MAX_COPY_BYTES:
@@ -346,27 +307,20 @@ def changed_since(modules: Iterable[UserModule], folder: Path) -> list[Path]:
     ]
 
 
-def copy_among(names: Iterable[str], module: str) -> str | None:
+def copy_of(module: str, is_there: Callable[[str], bool]) -> str | None:
     """What to type for the copy of a module among the files of a run or pack; None without one."""
     place = f"{COPIES}/{module.replace('.', '/')}"
-    known = set(names)
-    if f"{place}/__init__.py" in known:
+    if is_there(f"{place}/__init__.py"):
         return place
-    return f"{place}.py" if f"{place}.py" in known else None
+    return f"{place}.py" if is_there(f"{place}.py") else None
 
 
 def check_recorded(
     recorded: Mapping[str, Any], folder: Path, zipped_in: Path | None = None
 ) -> None:
-    """Make sure that the modules that a run was trained with have been imported.
+    """Make sure that the modules that a run was trained with have been imported; say what to type.
 
-    Args:
-        recorded: what the run folder says was asked for.
-        folder: the run folder.
-        zipped_in: the pack that it was unpacked from.
-
-    Raises:
-        UserError: if one has not; it says what to type.
+    ``recorded`` is what the run folder says was asked for; it may come of a pack.
     """
     names = [name for name in recorded.get("gym_packages") or () if isinstance(name, str)]
     missing = [name for name in names if name not in sys.modules]
@@ -393,11 +347,9 @@ def check_recorded(
 
 def _copy_in(folder: Path, name: str) -> str | None:
     """What to type for the copy of a module in a folder, relative to it; None without one."""
-    parts = name.split(".")
-    if not all(part.isidentifier() for part in parts):
+    if not all(part.isidentifier() for part in name.split(".")):
         return None
-    names = (f"{COPIES}/{'/'.join(parts)}{end}" for end in (".py", "/__init__.py"))
-    return copy_among((name for name in names if (folder / name).is_file()), name)
+    return copy_of(name, lambda path: (folder / path).is_file())
 
 
 def _copy_near(pack: Path, name: str) -> str | None:
