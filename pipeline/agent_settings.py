@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -22,15 +23,9 @@ from pipeline.settings.hyperparams import component_specs, split
 from pipeline.settings.values import algorithm_parameters
 from pipeline.train_spec import TrainSpec
 
-# Whether there is such an agent, and whether it can work with an environment.
-
 
 def check_algorithm(algo: str) -> None:
-    """Make sure that there is such an agent and that what it needs is installed.
-
-    Raises:
-        UserError: otherwise.
-    """
+    """Make sure that there is such an agent and that what it needs is installed."""
     entry = ALGORITHMS.get(algo)
     if entry is None and algo.lower() == "her":
         raise UserError(
@@ -46,11 +41,7 @@ def check_algorithm(algo: str) -> None:
 
 
 def with_engine(algo: str, settings: Mapping[str, Any], word: str | None) -> dict[str, Any]:
-    """The typed settings of an agent, with what ``--engine`` says; None where it says nothing.
-
-    Raises:
-        UserError: if the settings say something else, or the agent has no such engine.
-    """
+    """The typed settings of an agent, with what ``--engine`` says; None where it says nothing."""
     if word is None or algo not in ALGORITHMS:
         return dict(settings)
     said = settings.get("engine", word)
@@ -77,28 +68,22 @@ def _engines_of(algo: str) -> Sequence[str]:
 
 
 def check_fit(spec: TrainSpec) -> None:
-    """Make sure that the agent can work with the environment as it is wrapped for it.
-
-    Raises:
-        UserError: if it cannot; it names the agents that could.
-    """
-    env = make_single_env(spec, training=True)
-    misfit = ALGORITHMS[spec.algo].env_misfit(env)
-    fitting = fitting_algorithms(
-        env.observation_space, env.action_space, is_bandit(env), has_masks(env)
-    )
-    env.close()
+    """Make sure that the agent can work with the environment as it is wrapped for it."""
+    with closing(make_single_env(spec, training=True)) as env:
+        misfit = ALGORITHMS[spec.algo].env_misfit(env)
+        fitting = fitting_algorithms(
+            env.observation_space, env.action_space, is_bandit(env), has_masks(env)
+        )
     if misfit:
         others = f"fitting agents: {', '.join(fitting)}" if fitting else "no agent here fits"
         raise UserError(f"{spec.algo} does not fit {spec.env_id}: {misfit}; {others}")
 
 
-# Settings of an entry that are worked out from the environment: what the word ``auto`` stands for.
+# --- what the word ``auto`` stands for ------------------------------------------------------------
 #
 # A number that suits one map does not suit the next: an entry that says ``auto`` holds for a family
-# of environments. The word is replaced by a number before anything else is made of the entry, so
-# that
-# agents, engines and model files know numbers alone. `TrainSpec.auto` keeps how each was found.
+# of environments. Agents, engines and model files know numbers alone. `TrainSpec.origins` keeps how
+# each was found.
 
 AUTO = "auto"
 # Steps of training for each pair of an observation and an action, where only ``auto`` is said, and
@@ -111,11 +96,8 @@ FIRST_STEP_SIZE = 0.3
 LAST_STEP_SIZES = (0.003, 0.05)
 _WORD = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
-Env = gym.Env[Any, Any]
 
-
-@dataclass(frozen=True)
-class Found:
+class Found(NamedTuple):
     """A number in the place of the word."""
 
     value: Any  # the setting
@@ -126,7 +108,7 @@ class Found:
 class _Asked:
     """A setting that says ``auto``."""
 
-    env: Env  # the environment that the agent is judged on
+    env: gym.Env[Any, Any]  # the environment that the agent is judged on
     amount: str  # what follows the word, as in ``auto_1000``; empty for nothing
     n_timesteps: int | None  # of the training, where that is known already
     where: str  # begins every error message
@@ -218,9 +200,8 @@ def _wrappers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, 
     for place, one in enumerate(wrappers):
         for key in [key for key in _REWARD_RULES if one.kwargs.get(key) == AUTO]:
             inner = replace(spec.hyperparams, train_env_wrapper=tuple(wrappers[:place]))
-            env = make_single_env(replace(spec, hyperparams=inner), training=True)
-            model = transition_model(env)
-            env.close()
+            with closing(make_single_env(replace(spec, hyperparams=inner), training=True)) as env:
+                model = transition_model(env)
             if model is None:
                 raise UserError(f"{where}: {key}: auto needs an environment whose model is known")
             found = _REWARD_RULES[key](model.reward[model.prob > 0])
@@ -241,16 +222,10 @@ def without_auto(entry: Mapping[str, Any]) -> dict[str, Any]:
 def training_follows(
     entry: Mapping[str, Any], typed: Mapping[str, Any]
 ) -> tuple[dict[str, Any], dict[str, str] | None]:
-    """Let arguments of the environment that somebody asked for hold in training too.
+    """Let arguments of the environment that were typed hold in training too, also on a variant.
 
-    An entry may train on a variant, such as cheaper shelves. What was asked for wins.
-
-    Args:
-        entry: with ``typed`` in it.
-        typed: what was asked for beside the file's entry.
-
-    Returns:
-        The entry, and for `TrainSpec.origins` what gave way; None for nothing.
+    The entry, which has what was typed in it, is returned with what gave way, for
+    `TrainSpec.origins`; None for nothing.
     """
     variant, own = entry.get("train_env_kwargs"), typed.get("train_env_kwargs")
     asked = typed.get("env_kwargs")
@@ -280,16 +255,8 @@ def resolved_spec(
     - ``scale: auto`` of a wrapper in ``train_env_wrapper`` is 1 by the largest reward of training,
       its sign aside; ``min_reward: auto`` a tenth of the highest reward, below zero.
 
-    In other settings the word is what it was, such as ``engine: auto``.
-
-    Args:
-        raw: an entry of hyperparameters.
-        where: begins every error message.
-        origins: what is known already for `TrainSpec.origins`.
-        fields: all others of `TrainSpec`.
-
-    Raises:
-        UserError: if a setting cannot be read, or the environment does not tell what it would be.
+    In other settings the word is what it was, such as ``engine: auto``. ``where`` begins every
+    error message; ``fields`` are all others of `TrainSpec`.
     """
     rest = without_auto(raw)
     spec = TrainSpec(hyperparams=split(rest, where), saved_hyperparams=rest, **fields)
@@ -315,13 +282,12 @@ def _answers(raw: Mapping[str, Any], spec: TrainSpec, where: str) -> dict[str, F
     """What each ``auto`` of an entry stands for; ``spec`` is without them."""
     found: dict[str, Found] = {}
     n_timesteps = spec.hyperparams.n_timesteps
-    env = make_single_env(spec)
-    for key, rule in _RULES.items():
-        match = _word(key, raw.get(key))
-        if match is not None:
-            found[key] = rule(_Asked(env, match[1] or "", n_timesteps, f"{where}: {key}"))
-            n_timesteps = found[key].value if key == "n_timesteps" else n_timesteps
-    env.close()
+    with closing(make_single_env(spec)) as env:
+        for key, rule in _RULES.items():
+            match = _word(key, raw.get(key))
+            if match is not None:
+                found[key] = rule(_Asked(env, match[1] or "", n_timesteps, f"{where}: {key}"))
+                n_timesteps = found[key].value if key == "n_timesteps" else n_timesteps
     return found
 
 

@@ -68,16 +68,9 @@ def shown(value: object) -> str:
 
 
 def did_you_mean(name: str, known: Iterable[str], n: int = 1) -> str:
-    """A hint at what ``name`` was meant to be.
+    """What ``name`` was meant to be, as a question; all known names where none is near.
 
-    Args:
-        name: what the user wrote.
-        known: what could have been written.
-        n: how many of the nearest names to offer.
-
-    Returns:
-        What the field calls it too, or the nearest names, as a question; all names where none is
-        near and the list is short; else nothing.
+    Where there are many known names and none is near, the hint is empty.
     """
     known = list(dict.fromkeys(known))
     by_lower_case = {option.lower(): option for option in known}

@@ -1,9 +1,7 @@
-"""What may go wrong in a run, whose fault it is, and what becomes of a run that breaks by it.
+"""What may go wrong in a run, and whose fault it is.
 
-A machine that has nothing left to give; code of the user's that raises what ends a program;
-libraries that give up in the midst of a training. Whatever it was, everything is closed, the reason
-noted, and the folder left true. Commands load this before their first words: what takes long to
-load is imported where it is needed.
+A machine that has nothing left to give; code of the user's that raises what ends a program; a
+library that gives up. Commands load this before their first words, so it imports little.
 """
 
 from __future__ import annotations
@@ -14,14 +12,10 @@ import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from pipeline.errors import UserError, one_line
 from pipeline.stopping import Stopped, current
-
-if TYPE_CHECKING:
-    pass
-
 
 # PyTorch's allocator, the dynamic linker, and Python's threads have no exception of their own.
 _SIGNS = {
@@ -50,11 +44,7 @@ class OwnExit(SystemExit):  # no more an error than the one it is derived from
 
 
 class ForeignExitError(UserError):
-    """SystemExit or KeyboardInterrupt from code of the user's, where nobody pressed Ctrl-C.
-
-    Args:
-        error: what was raised.
-    """
+    """SystemExit or KeyboardInterrupt from code of the user's, where nobody pressed Ctrl-C."""
 
     def __init__(self, error: BaseException) -> None:
         kind, text = type(error).__name__, str(error)
@@ -91,24 +81,10 @@ class LibraryError(UserError):
     """A library cannot work with the settings of an agent."""
 
 
-def blame_weights(model: Any, error: Exception) -> None:
-    """Say that an agent's weights are at fault, where they are.
-
-    PyTorch refuses distributions of nan, and does not say where they come from.
-    """
-    from pipeline.finite_numbers import NotFiniteError, check_model
-
-    try:
-        check_model(model)
-    except NotFiniteError as cause:
-        raise cause from error
-
-
 def blame_settings(algo: str, model: Any, error: Exception) -> None:
     """Say that an agent's settings are at fault, where a library gave up over them.
 
-    What went through an environment, a callback or a module of the user's may be a mistake in
-    there, and keeps its traceback.
+    What went through code of the user's may be a mistake in there, and keeps its traceback.
     """
     frames = list(traceback.walk_tb(error.__traceback__))
     packages = [str(frame.f_globals.get("__name__")).partition(".")[0] for frame, _ in frames]

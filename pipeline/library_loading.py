@@ -1,4 +1,4 @@
-"""Libraries imported without looking for garbage among what they make, which all stays."""
+"""Libraries imported without the garbage collector; apart since commands need it at once."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from typing import Any
 def loading_libraries() -> Iterator[None]:
     """Do without the garbage collector, and let it pass over what is there at the end.
 
-    It would go through all that libraries consist of, again and again: a fifth of what importing
-    them takes, and some of each training after it.
+    It takes a fifth of what importing libraries takes, and some of each training after it.
     """
     was_on = gc.isenabled()
     gc.disable()
@@ -28,10 +27,7 @@ def loading_libraries() -> Iterator[None]:
 def load_for_optimizer(model: Any) -> None:
     """Import what PyTorch's optimizers import at their first step: its compiler, which stays idle.
 
-    That takes them more than a second, and a quarter longer while garbage is looked for.
-
-    Args:
-        model: the agent; nothing is imported if it may well train without such steps.
+    That takes more than a second; nothing is imported for an agent that may do without such steps.
     """
     has_optimizer = getattr(getattr(model, "policy", None), "optimizer", None) is not None
     if has_optimizer and getattr(model, "engine", "library") == "library":

@@ -424,30 +424,27 @@ def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
 
     Only what a process that is certainly gone has written is touched.
     """
-    for run in _unfinished(log_folder / algo, environment_name(env_id)):
+    parent, env_name = log_folder / algo, environment_name(env_id)
+    names = {path: env_name for _, path in numbered_runs(parent, env_name)}
+    for path in list(parent.glob(".*.tmp")):  # that have no number yet
+        if claim := _CLAIM.fullmatch(path.name):
+            names[path] = claim[1]
+    for path, name in names.items():
+        if not path.is_dir() or path.is_symlink():
+            continue
+        run = Run(path, name)
         with contextlib.suppress(OSError, UserError):
-            drafts = drafts_in(run.path)  # before looking: who goes on with a run may write some
+            drafts = drafts_in(path)  # before looking: who goes on with a run may write some
+            if run.model_path.exists() and not drafts:
+                continue
             info = run.read_info()
             if info.get("state") != RUNNING or is_alive(info.get(PROCESS)) is not False:
                 continue
             if "spec" not in info and _is_mere_set_up(run):
-                _remove(run.path)
+                _remove(path)
                 continue
             for draft in drafts:
                 draft.unlink(missing_ok=True)
-
-
-def _unfinished(parent: Path, env_name: str) -> Iterator[Run]:
-    """The runs that have no model, or half-written files; also those that have no number yet."""
-    for _, path in numbered_runs(parent, env_name):
-        run = Run(path, env_name)
-        is_own = path.is_dir() and not path.is_symlink()
-        if is_own and (not run.model_path.exists() or drafts_in(path)):
-            yield run
-    for path in list(parent.glob(".*.tmp")):
-        claim = _CLAIM.fullmatch(path.name)
-        if claim is not None and path.is_dir() and not path.is_symlink():
-            yield Run(path, claim[1])
 
 
 def _is_mere_set_up(run: Run) -> bool:

@@ -79,11 +79,7 @@ def record_to_tell(info: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def check_secrets(settings: Any, place: str = "hyperparams") -> None:
-    """Refuse settings that look like something that nobody else should have.
-
-    Raises:
-        UserError: naming the key.
-    """
+    """Refuse settings that look like something that nobody else should have."""
     if isinstance(settings, dict):
         for key, value in settings.items():
             if isinstance(value, str) and value and _SECRET.search(str(key)):
@@ -157,11 +153,7 @@ def _without_paths(text: bytes, run: Run) -> bytes:
 
 
 def check_untold(files: Mapping[str, bytes], run: Run) -> None:
-    """Look through all files for the paths of this machine; models and pages are looked into.
-
-    Raises:
-        UserError: naming the file in which there is one.
-    """
+    """Look through all files for the paths of this machine, also into models and pages."""
     places = _places_of(run)
     for name, content in files.items():
         for piece in _pieces(name, content):

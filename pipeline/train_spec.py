@@ -120,9 +120,6 @@ def completed(recorded: Mapping[str, Any]) -> dict[str, Any]:
 
     A field that came later gets its default: a new field must have one under which a run does what
     it did before. A field that there is no more is left out.
-
-    Args:
-        recorded: what `TrainSpec.as_data` returned when the run was made.
     """
     known = _defaults()
     defaults = {key: value for key, value in known.items() if value is not MISSING}

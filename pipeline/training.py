@@ -17,8 +17,9 @@ from pipeline.curve_pictures import draw_learning_curve, draw_pulls
 from pipeline.errors import UserError, one_line
 from pipeline.evaluation.sampled import Evaluation, SampledEvaluator
 from pipeline.evaluation.value_maps import value_map
-from pipeline.failures import LibraryError, blame_settings, blame_weights, exits_as_mistakes
+from pipeline.failures import LibraryError, blame_settings, exits_as_mistakes
 from pipeline.files import DISK_ERRORS, naming
+from pipeline.finite_numbers import check_model
 from pipeline.library_loading import loading_libraries
 from pipeline.locks import FolderGoneError, is_gone
 from pipeline.map_pictures import draw_value_map
@@ -163,7 +164,7 @@ def _learn(training: Training) -> None:
                 **kwargs,
             )
     except (ArithmeticError, AssertionError, LookupError, RuntimeError, TypeError, ValueError) as e:
-        blame_weights(training.model, e)
+        check_model(training.model)  # PyTorch refuses distributions of nan, and says nothing of why
         blame_settings(spec.algo, training.model, e)
         raise
 
