@@ -2,49 +2,30 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import stable_baselines3
 import torch as th
 from gymnasium import spaces
 from numpy.typing import NDArray
-from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.type_aliases import ReplayBufferSamples, Schedule
-from stable_baselines3.common.vec_env import VecEnv, VecNormalize
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecNormalize
 from stable_baselines3.dqn.policies import QNetwork
-from torch import nn
 from torch.nn.functional import mse_loss
 from torch.nn.utils import clip_grad_norm_
 
 from agents.common.masks import check_masks_exist, checked_masks, present_masks
-from agents.common.settings import full_signature
-from agents.networks.engine_setting import (
-    CompiledNetworks,
-    NetworkEngineChoice,
-    Work,
-    check_policy_agent,
-    work_of,
-)
-from agents.networks.policy_training import (
-    PolicyTraining,
-    collect_rollout,
-    policy_networks,
-    policy_training,
-)
+from agents.networks.engine_setting import NetworkEngineChoice
+from agents.networks.policy_training import CompiledPolicyGradient
 from agents.networks.q_training import CompiledQLearning
-from agents.networks.torch_bridge import Network, check_optimizer
 from envs.wrappers import INFO_KEY
 from mdp.array_types import Bools
-
-# Stable-Baselines3's DQN, which can be told what the environment allows.
 
 # From observations of shape (batch, ...) to the values that targets are made of.
 NextValues = Callable[[th.Tensor], th.Tensor]
@@ -54,13 +35,10 @@ class MaskedReplayBuffer(ReplayBuffer):
     """Keeps with each transition what the state allows that it leads to.
 
     The masks lie beside the actions in the same array, so that both are drawn together.
-
-    Attributes:
-        sampled_masks: those of the batch that was drawn last, bool of shape (batch, n_actions).
     """
 
     action_space: spaces.Discrete
-    sampled_masks: th.Tensor
+    sampled_masks: th.Tensor  # of the batch that was drawn last, bool of shape (batch, n_actions)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -115,12 +93,6 @@ class DQN(CompiledQLearning):
         ValueError: if it does not, or with ``n_steps`` above 1, Dict observations, or another
             replay buffer.
     """
-
-    __signature__: ClassVar[inspect.Signature]
-
-    def __init_subclass__(cls, **kwargs: Any) -> None:
-        super().__init_subclass__(**kwargs)
-        cls.__signature__ = full_signature(cls)
 
     def __init__(self, *args: Any, mask_actions: bool = False, **kwargs: Any) -> None:
         self.mask_actions = mask_actions
@@ -237,23 +209,8 @@ def masked(values: th.Tensor, masks: th.Tensor) -> th.Tensor:
     return values.masked_fill(~masks, -th.inf)
 
 
-DQN.__signature__ = full_signature(DQN)
-
-
-# Deep agents written by hand on those of Stable-Baselines3.
-
-
 def double_q_values(online: NextValues, target: QNetwork, next_obs: th.Tensor) -> th.Tensor:
-    """The target network's value of the action that the online network prefers.
-
-    Args:
-        online: the network that is trained, or what counts of its values.
-        target: its lagging copy.
-        next_obs: observations, shape (batch, ...).
-
-    Returns:
-        Values, shape (batch, 1).
-    """
+    """The target network's value of the action that the online network prefers."""
     best_actions = online(next_obs).argmax(dim=1, keepdim=True)
     values: th.Tensor = target(next_obs).gather(dim=1, index=best_actions)
     return values
@@ -264,8 +221,6 @@ class DoubleDQN(DQN):
 
     Arguments are those of `agents.library.DQN`; ``engine`` is ``"auto"`` by default.
     """
-
-    __signature__: ClassVar[inspect.Signature]
 
     target_kind = "double_q"
 
@@ -287,8 +242,6 @@ class DeepQLearning(CompiledQLearning):
     `agents.networks.engine_setting.CompiledNetworks`, which is ``"auto"`` by default;
     ``target_update_interval`` is without effect.
     """
-
-    __signature__: ClassVar[inspect.Signature]
 
     target_kind = "online"
     largest_error = math.inf
@@ -323,104 +276,9 @@ class DeepQLearning(CompiledQLearning):
         return mse_loss(values, targets) / 2
 
 
-DoubleDQN.__signature__ = full_signature(DoubleDQN)
-DeepQLearning.__signature__ = full_signature(DeepQLearning)
-
-
-# Stable-Baselines3's PPO and A2C, which can train on compiled code.
-
-
-class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
-    """What PPO and A2C share: `CompiledNetworks` says what the argument ``engine`` does.
-
-    Attributes:
-        collected: steps of the rollout that the compiled loop has under way.
-    """
-
-    _training: PolicyTraining | None
-    _shared_training: Callable[[], PolicyTraining]
-    _own = (*CompiledNetworks._own, "collected")
-
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.collected = 0
-        super().__init__(*args, **kwargs)
-
-    @property
-    def minibatch_size(self) -> int | None:
-        """Steps that are learnt from at once; None for all of a rollout."""
-        return getattr(self, "batch_size", None)
-
-    @property
-    def is_within_rollout(self) -> bool:
-        return self.collected > 0
-
-    def _check_compilable(self) -> None:
-        check_policy_agent(self)
-        check_optimizer(self.policy.optimizer)
-        policy_networks(self.policy, self._seen_in_python())
-
-    def _work_of(self, n_steps: float) -> Work:
-        rollout = self.n_steps * self.n_envs
-        batch_size = self.minibatch_size or rollout
-        n_rollouts = math.ceil(n_steps / rollout)
-        n_updates = n_rollouts * getattr(self, "n_epochs", 1) * math.ceil(rollout / batch_size)
-        policy: Any = self.policy
-        extractor = policy.mlp_extractor
-        actor = nn.ModuleList([extractor.policy_net, policy.action_net])
-        critic = nn.ModuleList([extractor.value_net, policy.value_net])
-        return work_of(
-            "policy",
-            [actor, critic],
-            self.observation_space,
-            n_rollouts * rollout,
-            self.n_envs,
-            n_updates,
-            batch_size,
-        )
-
-    def _schedules(self) -> list[Schedule]:
-        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
-        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
-
-    def _compiled_training(self, seen: Any) -> AbstractContextManager[PolicyTraining]:
-        return policy_training(self, seen)
-
-    def _acting_network(self, seen: Any) -> Network:
-        return policy_networks(self.policy, seen)[0]
-
-    def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        rollout_buffer: RolloutBuffer,
-        n_rollout_steps: int,
-    ) -> bool:
-        """Fill the rollout buffer; False once a callback asks to stop."""
-        if self._sharing is None:
-            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-        rollout_buffer.pos, rollout_buffer.full = 0, False
-        callback.on_rollout_start()
-        return collect_rollout(self._shared_training(), env, callback)
-
-    def train(self) -> None:
-        """Learn from the rollout buffer."""
-        if self._sharing is None:
-            super().train()
-        else:
-            self._shared_training().train()
-
-
 class PPO(CompiledPolicyGradient, stable_baselines3.PPO):
     """Stable-Baselines3's PPO (Schulman et al., 2017), with the argument ``engine``."""
-
-    __signature__: ClassVar[inspect.Signature]
 
 
 class A2C(CompiledPolicyGradient, stable_baselines3.A2C):
     """Stable-Baselines3's A2C (Mnih et al., 2016), with the argument ``engine``."""
-
-    __signature__: ClassVar[inspect.Signature]
-
-
-PPO.__signature__ = full_signature(PPO)
-A2C.__signature__ = full_signature(A2C)

@@ -34,15 +34,11 @@ from mdp.array_types import Bools, Ints
 
 
 class ActionTablePolicy(TablePolicy):
-    """One action for each observation, or for each observation and number of steps left.
+    """One action for each observation, or for each observation and number of steps left."""
 
-    Attributes:
-        actions: int64 of shape (m, S): with 1, 2, ... steps left; with more than m, the last row.
-        horizon: steps of an episode, int64 of shape (); only looked at where m is above 1.
-    """
-
+    # int64 of shape (m, S): with 1, 2, ... steps left; with more than m, the last row
     actions: th.Tensor
-    horizon: th.Tensor
+    horizon: th.Tensor  # steps of an episode, int64 of shape (); only looked at where m is above 1
 
     def __init__(
         self,
@@ -72,11 +68,7 @@ class ActionTablePolicy(TablePolicy):
         return np.asarray(self.actions.numpy()[steps_left - 1, obs])
 
     def load_state_dict(self, state_dict: Any, strict: bool = True, assign: bool = False) -> Any:
-        """Take over a plan of any number of steps.
-
-        Raises:
-            ValueError: if it is a plan for other observations or actions.
-        """
+        """Take over a plan of any number of steps."""
         if "actions" in state_dict:
             n_actions = int(self.action_space.n)  # type: ignore[attr-defined]
             plan = state_dict["actions"]
@@ -141,11 +133,7 @@ class PlanningAgent(OnlineAlgorithm):
         super()._run(total_timesteps, callback, log_interval)
 
     def plan(self) -> None:
-        """Work out the policy from the transition model of the environment.
-
-        Raises:
-            ValueError: if the model is not known, or states look alike in which the plan differs.
-        """
+        """Work out the policy from the transition model of the environment."""
         assert self.env is not None
         name, vec_env = type(self).__name__, self.env.unwrapped
         if not isinstance(vec_env, DummyVecEnv):
@@ -173,13 +161,7 @@ class PlanningAgent(OnlineAlgorithm):
     def _plan(
         self, model: TransitionModel, limit: int | None, mask: Bools | None
     ) -> tuple[NDArray[np.integer[Any]], int]:
-        """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon.
-
-        Args:
-            model: the dynamics.
-            limit: the time limit, or None.
-            mask: the actions that may be taken, bool of shape (S, A), or None for all.
-        """
+        """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon."""
 
     def _choose_actions(self) -> Ints:
         actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)

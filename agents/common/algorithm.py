@@ -30,23 +30,14 @@ from mdp.array_types import Bools, Floats
 
 @dataclass(slots=True)
 class Transitions:
-    """One step of every environment.
+    """One step of every environment."""
 
-    Attributes:
-        obs: observations before the step, shape (n_envs, ...).
-        actions: what was done, shape (n_envs, ...).
-        rewards: float64 of shape (n_envs,).
-        terminated: the episode ended for good, bool of shape (n_envs,).
-        dones: it ended for good or was truncated, bool of shape (n_envs,).
-        next_obs: observations after the step, before any reset, shape (n_envs, ...).
-    """
-
-    obs: Any
-    actions: Any
-    rewards: Floats
-    terminated: Bools
-    dones: Bools
-    next_obs: Any
+    obs: Any  # observations before the step, shape (n_envs, ...)
+    actions: Any  # what was done, shape (n_envs, ...)
+    rewards: Floats  # float64 of shape (n_envs,)
+    terminated: Bools  # the episode ended for good, bool of shape (n_envs,)
+    dones: Bools  # it ended for good or was truncated, bool of shape (n_envs,)
+    next_obs: Any  # observations after the step, before any reset, shape (n_envs, ...)
 
 
 class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
@@ -263,14 +254,6 @@ def true_outcome(new_obs: Any, dones: Bools, infos: list[dict[str, Any]]) -> tup
     """What the environments showed before they were reset, and whether they had terminated.
 
     A VecEnv resets a finished environment within the same step.
-
-    Args:
-        new_obs: observations as ``VecEnv.step`` returns them, shape (n_envs, ...).
-        dones: bool of shape (n_envs,).
-        infos: one dictionary for each environment.
-
-    Returns:
-        The observations reached, shape (n_envs, ...), and ``terminated``, shape (n_envs,).
     """
     terminated = dones.copy()
     next_obs = deepcopy(new_obs)

@@ -45,12 +45,7 @@ def highest_value(values: Floats) -> float:
 
 @inlined
 def greedy_action(values: Floats, uniform: float) -> int:
-    """A best action; ``uniform`` picks among ties, and 0 picks the first, as argmax does.
-
-    Args:
-        values: action values, shape (A,).
-        uniform: a number in [0, 1).
-    """
+    """A best action; ``uniform`` picks among ties, and 0 picks the first, as argmax does."""
     # Without branches: which value is higher is hard to foresee, for a processor as well.
     highest = values[0]
     best_action = 0
@@ -73,14 +68,7 @@ def greedy_action(values: Floats, uniform: float) -> int:
 
 @inlined
 def random_action(strategy: int, n_actions: int, rate: float, draws: Floats) -> int:
-    """The action that is chosen whatever the values are; -1 where they decide.
-
-    Args:
-        strategy: one of `STRATEGIES`.
-        n_actions: number of actions.
-        rate: how much to explore.
-        draws: as in `choose_action`.
-    """
+    """The action that is chosen whatever the values are; -1 where they decide."""
     if strategy == EPSILON_GREEDY and draws[0] < rate:
         return int(draws[1] * n_actions)
     return -1
@@ -135,12 +123,8 @@ def choose_action(
 ) -> int:
     """Choose by ``strategy``.
 
-    Args:
-        strategy: one of `STRATEGIES`.
-        values: action values, shape (A,).
-        rate: how much to explore: epsilon, temperature or standard deviation.
-        tie_scale: 1 to break ties at random, 0 to take the first best action.
-        draws: random numbers, shape (draws_per_choice,).
+    ``rate`` is epsilon, a temperature or a standard deviation; ``tie_scale`` 1 breaks ties at
+    random, 0 takes the first; ``draws`` are random numbers, shape (draws_per_choice,).
     """
     if strategy == EPSILON_GREEDY:
         return epsilon_greedy_action(values, rate, tie_scale, draws)
@@ -175,15 +159,7 @@ def expected_value(strategy: int, values: Floats, rate: float) -> float:
 def action_probability(
     strategy: int, values: Floats, rate: float, tie_scale: float, action: int
 ) -> float:
-    """How probable one action is, as `action_probabilities` has it of all.
-
-    Args:
-        strategy: `EPSILON_GREEDY` or `BOLTZMANN`.
-        values: action values, shape (A,).
-        rate: epsilon or temperature.
-        tie_scale: 1 where tied best actions share their probability, 0 where the first has it all.
-        action: which action.
-    """
+    """How probable one action is, as `action_probabilities` has it of all."""
     highest = highest_value(values)
     if strategy == EPSILON_GREEDY:
         n_best, n_before = 0, 0
@@ -209,21 +185,9 @@ def action_probabilities(
     random_ties: bool,
     masks: Bools | None = None,
 ) -> Floats:
-    """The exploring policy as a matrix.
+    """The exploring policy as a matrix of the shape of ``values``, (S, A).
 
-    Args:
-        strategy: `EPSILON_GREEDY` or `BOLTZMANN`.
-        values: action values, shape (S, A).
-        rate: epsilon or temperature.
-        random_ties: whether tied greedy actions share their probability or the first has it all.
-        masks: the allowed actions, bool of shape (S, A), all where a row is False; None, or
-            no rows, for all.
-
-    Returns:
-        Probabilities, shape (S, A).
-
-    Raises:
-        ValueError: for Gaussian noise, whose probabilities have no closed form.
+    Where a row of ``masks`` is False, or there are no rows, all actions are allowed.
     """
     if strategy == GAUSSIAN_NOISE:
         raise ValueError("Gaussian noise on the values has no closed-form action probabilities")

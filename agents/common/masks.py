@@ -17,15 +17,7 @@ from mdp.array_types import Bools, Ints
 
 
 def numbers_in(space: Any, observations: Any) -> Ints:
-    """Observations as whole numbers, in their own shape.
-
-    Args:
-        space: `Discrete`, beginning at 0.
-        observations: of any shape.
-
-    Raises:
-        ValueError: if one is not in the space, which would be looked up in the row of another.
-    """
+    """Observations as whole numbers, in their own shape; ValueError for one outside the space."""
     given = np.asarray(observations)
     outside = given[~((given >= 0) & (given < space.n) & (given == np.floor(given)))]
     if outside.size:
@@ -37,11 +29,7 @@ def numbers_in(space: Any, observations: Any) -> Ints:
 
 
 def check_masks_exist(env: VecEnv) -> None:
-    """Refuse environments that do not say what may be done.
-
-    Raises:
-        ValueError: saying what they would have to have.
-    """
+    """Refuse environments that do not say what may be done."""
     inside = env.unwrapped
     if isinstance(inside, DummyVecEnv):
         found = all(mask_source(one) is not None for one in inside.envs)
@@ -55,15 +43,7 @@ def check_masks_exist(env: VecEnv) -> None:
 
 
 def present_masks(env: VecEnv, obs: Any) -> Bools:
-    """What may be done now, bool of shape (n_envs, n_actions).
-
-    Args:
-        env: the environments.
-        obs: what they show, to be named in errors, shape (n_envs, ...).
-
-    Raises:
-        ValueError: if an environment has no masks, or a malformed one.
-    """
+    """What may be done now, bool of shape (n_envs, n_actions); ``obs`` is named in errors."""
     inside = env.unwrapped
     if isinstance(inside, DummyVecEnv):
         masks = [action_masks(one) for one in inside.envs]
@@ -75,16 +55,7 @@ def present_masks(env: VecEnv, obs: Any) -> Bools:
 
 
 def checked_masks(masks: Any, obs: Any, n_actions: int) -> Bools:
-    """Masks as an array, bool of shape (n, n_actions).
-
-    Args:
-        masks: one for each observation.
-        obs: the observations, shape (n, ...).
-        n_actions: how many actions there are.
-
-    Raises:
-        ValueError: if one has another shape or allows nothing; the message names the observation.
-    """
+    """Masks as an array, bool of shape (n, n_actions)."""
     for mask, one in zip(masks, obs, strict=True):
         shape, shown = np.shape(mask), " ".join(str(one).split())
         if shape != (n_actions,):
@@ -100,9 +71,8 @@ def checked_masks(masks: Any, obs: Any, n_actions: int) -> Bools:
 def masks_of_observations(env: VecEnv, n_observations: int) -> Bools | None:
     """What may be done at each observation, bool of shape (n_observations, n_actions).
 
-    Returns:
-        The masks, all False for what is observed in no state; or None where they are not known for
-        all states, or differ between environments or between states that look alike.
+    A row is False for what is observed in no state. None where masks are not known for all states,
+    or differ between environments or between states that look alike.
     """
     inside = env.unwrapped
     if not isinstance(inside, DummyVecEnv):
@@ -126,13 +96,9 @@ def masks_of_observations(env: VecEnv, n_observations: int) -> Bools | None:
 
 
 class MaskBufferPolicy(TablePolicy):
-    """A policy that may hold a mask for each observation, in its model file too.
+    """A policy that may hold a mask for each observation, in its model file too."""
 
-    Attributes:
-        allowed_actions: what the environment allows at each observation, bool of shape (S, A), a
-            row of False where that is not known; only there after `keep_masks`.
-    """
-
+    # Bool of shape (S, A), a row of False where masks are not known; there after `keep_masks`.
     allowed_actions: th.Tensor
 
     def keep_masks(self) -> None:

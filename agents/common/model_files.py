@@ -72,25 +72,16 @@ class UnknownTypeError(TypeError):
 
 @dataclass(frozen=True)
 class Codec:
-    """How objects of one class are taken apart and built again.
-
-    Attributes:
-        cls: the class.
-        fields: for each field of the file, how it is read off an object.
-        build: makes the object from its fields.
-    """
+    """How objects of one class are taken apart and built again."""
 
     cls: type
+    # For each field of the file, how it is read off an object.
     fields: Mapping[str, Callable[[Any], Any]]
     build: Callable[..., Any]
 
 
 def encode(value: Any) -> Any:
-    """Turn ``value`` into JSON.
-
-    Raises:
-        UnknownTypeError: if it, or a part of it, is not of a type that the format knows.
-    """
+    """Turn ``value`` into JSON."""
     if type(value) in _AS_THEY_ARE:
         return value
     if type(value) is dict:  # as its codec has it, for the hundred of them that Monitor has told of
@@ -113,12 +104,7 @@ def _encode_all(values: Iterable[Any]) -> list[Any]:
 
 
 def decode(data: Any) -> Any:
-    """Rebuild what `encode` wrote.
-
-    Raises:
-        ValueError: if the data names a type that the format does not know, or if its fields are not
-            those of that type.
-    """
+    """Rebuild what `encode` wrote."""
     if isinstance(data, list):
         return [decode(item) for item in data]
     if not isinstance(data, dict):
@@ -488,11 +474,7 @@ class TablePolicy(BasePolicy):
         return {**super()._get_constructor_parameters(), **self._sizes()}
 
     def save(self, path: str) -> None:
-        """Write tensors, and what else the policy is made of as JSON: no pickle that is run.
-
-        Args:
-            path: where to.
-        """
+        """Write tensors, and what else the policy is made of as JSON: no pickle that is run."""
         data = {
             "observation_space": self.observation_space,
             "action_space": self.action_space,
@@ -503,15 +485,7 @@ class TablePolicy(BasePolicy):
 
     @classmethod
     def load(cls, path: str, device: th.device | str = "cpu") -> Self:
-        """Load a policy that `save` wrote; nothing in the file is run.
-
-        Args:
-            path: where the file lies.
-            device: ignored, as tables live on the CPU.
-
-        Raises:
-            ValueError: if the file holds anything else.
-        """
+        """Load a policy that `save` wrote; nothing in the file is run."""
         content = read_file(Path(path), MAX_ARCHIVE_BYTES)
         budget = Budget(len(content))
         saved = load_tensors(content, budget)

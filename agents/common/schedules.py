@@ -22,19 +22,12 @@ EXPONENTIAL = 1.0
 
 
 class ScheduleRow(NamedTuple):
-    """A schedule as four numbers, which a record of compiled code holds as well.
+    """A schedule as four numbers, which a record of compiled code holds as well."""
 
-    Attributes:
-        kind: `LINEAR` or `EXPONENTIAL`.
-        start: the value at the first step.
-        end: the value from ``end_fraction`` on.
-        end_fraction: the share of training after which the value is ``end``.
-    """
-
-    kind: float
-    start: float
-    end: float
-    end_fraction: float
+    kind: float  # `LINEAR` or `EXPONENTIAL`
+    start: float  # the value at the first step
+    end: float  # the value from ``end_fraction`` on
+    end_fraction: float  # the share of training after which the value is ``end``
 
 
 @inlined
@@ -99,14 +92,7 @@ def library_schedule(schedule: ExponentialSchedule) -> Schedule:
 
 
 def epsilon_schedule(decay: str, start: float, end: float, end_fraction: float) -> Schedule:
-    """Epsilon over training.
-
-    Args:
-        decay: ``"constant"`` (stays at the start), ``"linear"`` or ``"exponential"``.
-        start: the value at the first step.
-        end: the value from ``end_fraction`` on.
-        end_fraction: the share of training over which it falls, in [0, 1].
-    """
+    """Epsilon over training, which falls over its first ``end_fraction``."""
     if decay == "constant":
         return FloatSchedule(start)
     if end_fraction == 0:

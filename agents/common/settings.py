@@ -96,13 +96,7 @@ SAMPLE_AVERAGE = "sample_average"
 
 @inlined
 def step_size(learning_rate: float, sample_average: bool, visit_count: int) -> float:
-    """1/N for the N-th visit where ``sample_average``, else the learning rate.
-
-    Args:
-        learning_rate: the constant or scheduled step size.
-        sample_average: whether to average all targets seen so far.
-        visit_count: number of visits, this one included.
-    """
+    """1/N for the N-th visit where ``sample_average``, else the learning rate."""
     if sample_average:
         return 1.0 / visit_count
     return learning_rate
@@ -119,11 +113,7 @@ def settings_of(agent: object, *names: str) -> Settings:
 
 
 def check_space(agent: object, role: str, space: spaces.Space[Any]) -> None:
-    """Refuse spaces other than Discrete ones that start at 0.
-
-    Raises:
-        ValueError: naming the agent, what the space is for, and the space.
-    """
+    """Refuse spaces other than Discrete ones that start at 0."""
     if not isinstance(space, spaces.Discrete) or space.start != 0:
         raise ValueError(
             f"{type(agent).__name__} needs {role} in a Discrete space that starts at 0, not {space}"
@@ -131,32 +121,20 @@ def check_space(agent: object, role: str, space: spaces.Space[Any]) -> None:
 
 
 def check_option(name: str, value: object, options: Any) -> None:
-    """Refuse words that are not in the Literal ``options``.
-
-    Raises:
-        ValueError: naming the argument and the words that it can be.
-    """
+    """Refuse words that are not in the Literal ``options``."""
     if value not in get_args(options):
         raise ValueError(f"{name} must be one of {', '.join(get_args(options))}, not {value!r}")
 
 
 def check_at_least(low: float, settings: Settings) -> None:
-    """Refuse numbers below ``low``; what is no number is left alone.
-
-    Raises:
-        ValueError: naming the argument.
-    """
+    """Refuse numbers below ``low``; what is no number is left alone."""
     for name, value in settings:
         if isinstance(value, int | float) and not value >= low:
             raise ValueError(f"{name} must be at least {low:g}, not {value}")
 
 
 def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
-    """Refuse what is no whole number, and numbers below ``low`` or above ``high``.
-
-    Raises:
-        ValueError: naming the argument.
-    """
+    """Refuse what is no whole number, and numbers below ``low`` or above ``high``."""
     for name, value in settings:
         if isinstance(value, bool) or not isinstance(value, Integral) or value < low:
             raise ValueError(f"{name} must be a whole number of at least {low}, not {value!r}")
@@ -165,55 +143,35 @@ def check_whole(low: int, settings: Settings, high: int = 10**9) -> None:
 
 
 def check_above_zero(settings: Settings) -> None:
-    """Refuse numbers that are not above 0; what is no number is left alone.
-
-    Raises:
-        ValueError: naming the argument.
-    """
+    """Refuse numbers that are not above 0; what is no number is left alone."""
     for name, value in settings:
         if isinstance(value, int | float) and not value > 0:
             raise ValueError(f"{name} must be above 0, not {value}")
 
 
 def check_share(settings: Settings) -> None:
-    """Refuse numbers outside [0, 1].
-
-    Raises:
-        ValueError: naming the argument.
-    """
+    """Refuse numbers outside [0, 1]."""
     for name, value in settings:
         if not 0 <= value <= 1:
             raise ValueError(f"{name} must lie between 0 and 1, not {value}")
 
 
 def check_finite(settings: Settings) -> None:
-    """Refuse infinite numbers and nan.
-
-    Raises:
-        ValueError: naming the argument.
-    """
+    """Refuse infinite numbers and nan."""
     for name, value in settings:
         if not math.isfinite(value):
             raise ValueError(f"{name} must be finite, not {value}")
 
 
 def check_epsilons(agent: Any) -> None:
-    """Check what says how epsilon falls.
-
-    Raises:
-        ValueError: naming the argument and what it must be.
-    """
+    """Check what says how epsilon falls."""
     check_option("exploration_decay", agent.exploration_decay, ExplorationDecay)
     names = ("exploration_fraction", "exploration_initial_eps", "exploration_final_eps")
     check_share(settings_of(agent, *names))
 
 
 def check_learning_rate(learning_rate: object) -> None:
-    """Refuse words other than that for sample averages, and numbers that are no step sizes.
-
-    Raises:
-        ValueError: naming what it can be.
-    """
+    """Refuse words other than that for sample averages, and numbers that are no step sizes."""
     if isinstance(learning_rate, int | float):
         check_at_least(0.0, [("learning_rate", learning_rate)])
         check_finite([("learning_rate", learning_rate)])

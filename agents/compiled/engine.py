@@ -83,9 +83,6 @@ def interrupts_held() -> Iterator[Callable[[], bool]]:
     That is KeyboardInterrupt on Ctrl-C, and whatever the handlers raise that a program has set for
     SIGINT, SIGTERM and SIGHUP; they are called at once. Outside the main thread, where Python
     delivers no signals, nothing is held.
-
-    Yields:
-        A function that tells whether an exception is waiting.
     """
     hold = _Hold()
     try:
@@ -109,18 +106,9 @@ MAX_BLOCK_STEPS = 262_144
 
 
 class CompiledEngine:
-    """One call of ``learn`` on the compiled loop.
+    """One call of ``learn`` on the compiled loop."""
 
-    Args:
-        agent: the algorithm, whose tables and generator are used in place.
-        world: the compiled counterpart of its environments.
-        callback: what is told of the steps.
-        log_interval: episodes between two log records, or None.
-
-    Attributes:
-        counts_where_stopped: whether statistics hear of a step on which a callback ends training.
-    """
-
+    # whether statistics hear of a step on which a callback ends training
     counts_where_stopped = True
 
     def __init__(
@@ -247,13 +235,7 @@ class CompiledEngine:
         return self.log_interval - int(self.agent._episode_num) % self.log_interval
 
     def _tell(self, episodes: Episodes, n_steps: int, began: int = 0) -> bool:
-        """Monitor, statistics and callbacks; False once a callback asks to stop.
-
-        Args:
-            episodes: those of the block.
-            n_steps: of the block.
-            began: when it did, in nanoseconds since the epoch.
-        """
+        """Monitor, statistics and callbacks; False once a callback asks to stop."""
         agent = self.agent
         records = self.log.records[: self.progress[0]["n_records"]]
         before = Statistics(agent) if len(records) else None
@@ -402,16 +384,6 @@ def choose_engine(
     An environment that draws in its own way is equal to its compiled copy in distribution alone:
     such a copy has to be asked for, so that results do not hang on what else kept an agent from
     compiling. The choice and its reason are left in ``agent.engine_in_use``.
-
-    Args:
-        agent: the algorithm.
-        callback: as in `CompiledEngine`.
-        log_interval: likewise.
-        make_world: from its environments to what the engine is handed as the world.
-        engine: the class of the engine.
-
-    Raises:
-        ValueError: if the agent insists on compiled and it cannot be had.
     """
     if agent.engine == "interpreted":
         agent.engine_in_use = "interpreted: asked for"
@@ -453,11 +425,7 @@ def _world_for(
 
 
 def check_class(algorithm: type) -> None:
-    """Make sure that compiled functions do all that the algorithm does at a step.
-
-    Raises:
-        NotCompilable: naming what a class of its own does in Python instead.
-    """
+    """Make sure that compiled functions do all that the algorithm does at a step."""
     order = algorithm.__mro__
     for place, cls in enumerate(order[: order.index(LearningAlgorithm)]):
         if cls.__module__.startswith("agents."):

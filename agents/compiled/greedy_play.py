@@ -61,20 +61,12 @@ VECTOR_STATES: dict[type, tuple[tuple[str, ...], np.dtype[np.void]]] = {
 
 
 class EnvStates:
-    """Environments of a training, and a record for each of them.
-
-    Args:
-        vec_env: the environments.
-        world: their compiled counterpart.
-
-    Attributes:
-        records: of `FINITE_ENV`, or as `VECTOR_STATES` has them, shape (n_envs,).
-        vector_state: what the state consists of, where it is a vector; else nothing.
-    """
+    """Environments of a training, and a record for each of them."""
 
     def __init__(self, vec_env: DummyVecEnv, world: World) -> None:
         self.vec_env = vec_env
         self.vector_state, self._record_type = VECTOR_STATES.get(type(world), ((), FINITE_ENV))
+        # of `FINITE_ENV`, or as `VECTOR_STATES` has them, shape (n_envs,)
         self.records = env_records(vec_env.num_envs, self.record_type())
         self.monitors = [monitor_of(env) for env in vec_env.envs]
         # Monitor holds the rewards of the episode that is under way: so must we.
@@ -89,11 +81,7 @@ class EnvStates:
         return self.records[i]["obs"]
 
     def observations(self, records: Any, prefix: str) -> Any:
-        """What environments show now (no prefix), before (``next_``) or after a reset (``new_``).
-
-        Returns:
-            Observations of shape (n, ...).
-        """
+        """What is shown now (no prefix), before (``next_``) or after a reset (``new_``)."""
         return records[f"{prefix}obs"].copy()
 
     def take_observations(self, last_obs: Any) -> None:
@@ -145,12 +133,7 @@ class EnvStates:
             base.pulls_done = int(record["elapsed"])
 
     def keep_rewards(self, episodes: Episodes, rewards: Floats) -> None:
-        """Keep the rewards of episodes under way after a block.
-
-        Args:
-            episodes: those that have ended in it.
-            rewards: as in `agents.compiled.loop.EpisodeLog`, as many as steps were done.
-        """
+        """Keep the rewards of episodes under way after a block."""
         for i in range(len(self.records)):
             ends = episodes.steps[episodes.envs == i]
             if len(ends):
@@ -193,13 +176,9 @@ Playground = tuple[Any, EnvStates, Any]
 
 
 class Plan(NamedTuple):
-    """Does at each number that is observed what is written down.
+    """Does at each number that is observed what is written down."""
 
-    Attributes:
-        actions: one for each number, shape (S,).
-    """
-
-    actions: Ints
+    actions: Ints  # one for each number, shape (S,)
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
@@ -214,15 +193,10 @@ class Plan(NamedTuple):
 
 
 class Explorer(NamedTuple):
-    """Acts as an agent does in training, at a moment of it.
+    """Acts as an agent does in training, at a moment of it."""
 
-    Attributes:
-        agent: as compiled functions see it, drawing from another generator.
-        progress: how far the training is, of type `PROGRESS`, alone in an array.
-    """
-
-    agent: Any
-    progress: Any
+    agent: Any  # as compiled functions see it, drawing from another generator
+    progress: Any  # how far the training is, of type `PROGRESS`, alone in an array
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
@@ -244,16 +218,6 @@ def play_episodes(
 
     All of them step until each has ended as many episodes as are wanted of it. The environments,
     their generators and their Monitors end where the library's `evaluate_policy` would leave them.
-
-    Args:
-        world: their compiled counterpart.
-        player: what acts, such as `Plan`.
-        states: the environments.
-        observations: what they show, shape (n_envs, ...).
-        wanted: of each environment, shape (n_envs,).
-
-    Returns:
-        These episodes, in the order in which they ended.
     """
     states.read()
     states.take_observations(observations)
@@ -310,11 +274,6 @@ class CompiledEvaluations:
     What is not covered is handed on to that: environments or agents that are not, or not all,
     compiled bit for bit; networks that draw their actions, which PyTorch's generator does; what is
     shown on the screen.
-
-    Args:
-        agent: what is trained.
-        callback: what is told of the steps.
-        playground: the compiled counterpart of environments to evaluate on.
     """
 
     def __init__(

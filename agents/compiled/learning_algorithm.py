@@ -137,11 +137,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         return self.exploration_schedule(self._current_progress_remaining)
 
     def check_compilable(self) -> None:
-        """Make sure that compiled functions are handed all that the training asks for.
-
-        Raises:
-            NotCompilable: saying what is missing.
-        """
+        """Make sure that compiled functions are handed all that the training asks for."""
 
     def _make_workspace(self, rng: np.random.Generator, n: int) -> Any:
         """What compiled functions work on: for ``n`` environments, drawing from ``rng``."""
@@ -171,11 +167,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         return known[1]
 
     def log_columns(self, records: NDArray[np.void]) -> dict[str, list[float]]:
-        """What `_record_training` hands to the logger, at many moments of the training.
-
-        Args:
-            records: of type `RECORD`, shape (n,).
-        """
+        """What `_record_training` hands to the logger, at many moments of the training."""
         return {
             "rollout/exploration_rate": records["exploration"].tolist(),
             "train/mean_absolute_td_error": records["mean_td_error"].tolist(),
@@ -186,11 +178,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
         """Tell a workspace how far the training is."""
 
     def _exploring_actions(self, observation: Any) -> Ints:
-        """An action for an observation, or n for n of them, chosen as in training.
-
-        Raises:
-            ValueError: if it is neither.
-        """
+        """An action for an observation, or n for n of them, chosen as in training."""
         obs = np.asarray(observation)
         many = is_vectorized_observation(obs, self.observation_space)
         workspace = self._workspace_for(self.predict_rng, len(obs) if many else 1)
@@ -225,11 +213,7 @@ class LearningAlgorithm(OnlineAlgorithm, metaclass=CompiledClass):
 
 
 def compiled_schedule(schedule: Schedule) -> ScheduleRow:
-    """The schedule as compiled code reads it.
-
-    Raises:
-        NotCompilable: if it is a Python function.
-    """
+    """The schedule as compiled code reads it."""
     row = schedule_row(schedule)
     if row is None:
         raise NotCompilable("a schedule is a Python function")

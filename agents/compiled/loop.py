@@ -84,11 +84,7 @@ class CompiledClass(CheckedConstructor):
 
 
 def check_functions(algorithm: type) -> None:
-    """Make sure that what the compiled loop calls of an algorithm is compiled.
-
-    Raises:
-        TypeError: naming the function that is not, and what to do.
-    """
+    """Make sure that what the compiled loop calls of an algorithm is compiled."""
     for name in _NAMES & vars(algorithm).keys():
         if not hasattr(vars(algorithm)[name], "py_func"):
             raise TypeError(
@@ -98,12 +94,7 @@ def check_functions(algorithm: type) -> None:
 
 
 def settings_dtype(algorithm: type, fields: Mapping[str, Any]) -> np.dtype[np.void]:
-    """The type of the record that holds an algorithm's settings.
-
-    Args:
-        algorithm: the class.
-        fields: types of the settings by their names, which are those of the agent's attributes.
-    """
+    """The type of the record that holds an algorithm's settings."""
     name = f"{RULE_PREFIX}{algorithm.__module__} {algorithm.__qualname__}"
     _DEFINITIONS[name] += 1
     if _DEFINITIONS[name] > 1:
@@ -186,18 +177,14 @@ def note_progress(log: Any, progress: Any, step: int) -> None:
 
 
 class EpisodeLog(NamedTuple):
-    """What Monitor and the logger are told of a block.
+    """What Monitor and the logger are told of a block."""
 
-    Attributes:
-        episodes: records of type `EPISODE`, filled with those that end, shape (capacity,).
-        rewards: filled with what Monitor sees of the episode under way, from its first step in the
-            block on, shape (steps, n_envs).
-        records: of type `RECORD`, filled where the log is due, shape (capacity,).
-    """
-
+    # records of type `EPISODE`, filled with those that end, shape (capacity,)
     episodes: NDArray[Any]
+    # What Monitor sees of the episode under way, from its first step in the block on; of shape
+    # (steps, n_envs).
     rewards: Floats
-    records: NDArray[Any]
+    records: NDArray[Any]  # of type `RECORD`, filled where the log is due, shape (capacity,)
 
     @inlined
     def note_step(self, env: Any, i: int, step: int) -> None:
@@ -277,20 +264,6 @@ def run_block(
 
     The last step is left to be learnt from by `learn_from_last_step`, since callbacks come before
     that.
-
-    Args:
-        world: the dynamics.
-        agent: how it acts and learns.
-        envs: a record for each environment, with the state that the world needs, shape (n,).
-        handles: of the environments' generators, shape (n,).
-        progress: a record of type `PROGRESS`.
-        log: what is written down.
-        n_steps: steps of every environment.
-        max_episodes: stop after the step on which so many episodes have ended.
-        compensated: how Python's `sum` adds.
-
-    Returns:
-        The number of steps taken.
     """
     progress.logged_episodes = 0
     for t in range(n_steps):

@@ -30,13 +30,7 @@ Bytes = NDArray[np.uint8]
 
 
 def whole_rows(returns: Floats, lengths: Ints, end: str) -> str | None:
-    """A row ``<return>.0,<length>,<end>`` for each episode; None where a return is not whole.
-
-    Args:
-        returns: of the episodes, shape (n,).
-        lengths: numbers of their steps, shape (n,).
-        end: what all rows end with, in ASCII.
-    """
+    """A row ``<return>.0,<length>,<end>`` for each episode; None where a return is not whole."""
     room = np.empty(len(returns) * (2 * MOST_DIGITS + len(end) + 5), dtype=np.uint8)
     n_bytes = _write_all(returns, lengths, np.frombuffer(end.encode("ascii"), np.uint8), room)
     return None if n_bytes < 0 else room[:n_bytes].tobytes().decode("ascii")
@@ -89,21 +83,13 @@ MOST_BEGINNINGS = 10_000
 
 @dataclass(frozen=True)
 class Episodes:
-    """Episodes that ended in a block, in the order in which they did.
+    """Episodes that ended in a block, in the order in which they did."""
 
-    Attributes:
-        envs: which environment each ran in, shape (n_episodes,).
-        steps: at which step of the block it ended, shape (n_episodes,).
-        returns: sum of its rewards, shape (n_episodes,).
-        lengths: number of its steps, shape (n_episodes,).
-        successes: whether it was a success, shape (n_episodes,).
-    """
-
-    envs: Ints
-    steps: Ints
-    returns: Floats
-    lengths: Ints
-    successes: Bools
+    envs: Ints  # which environment each ran in, shape (n_episodes,)
+    steps: Ints  # at which step of the block it ended, shape (n_episodes,)
+    returns: Floats  # sum of its rewards, shape (n_episodes,)
+    lengths: Ints  # number of its steps, shape (n_episodes,)
+    successes: Bools  # whether it was a success, shape (n_episodes,)
 
     @classmethod
     def of(cls, log: NDArray[np.void]) -> Episodes:
@@ -133,9 +119,6 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
     """Do for a block of episodes what each Monitor does at the end of each.
 
     All of them get the time of the end of the block.
-
-    Returns:
-        That time for each environment, in seconds since its Monitor was made.
     """
     times = []
     for i, monitor in enumerate(monitors):
@@ -244,11 +227,7 @@ def _is_ours(algorithm: type, name: str) -> bool:
 
 
 class Statistics:
-    """The episodes that the log's means are taken of, before a block.
-
-    Args:
-        agent: the algorithm.
-    """
+    """The episodes that the log's means are taken of, before a block."""
 
     def __init__(self, agent: Any) -> None:
         self.size = int(agent._stats_window_size)
@@ -290,11 +269,6 @@ def write_records(agent: Any, columns: Mapping[str, Any], times: Ints) -> None:
 
     What they consist of is asked of the agent: once with what callbacks have recorded since the
     last one, and once without.
-
-    Args:
-        agent: the algorithm, whose counters may be anywhere in the block.
-        columns: all that changes from record to record, under its key, each of shape (n,).
-        times: of the records, in nanoseconds since the epoch, shape (n,).
     """
     steps = columns["time/total_timesteps"]
     begin = 0
@@ -369,14 +343,7 @@ def _append(
 
 
 def event_bytes(tags: Sequence[str], numbers: NDArray[Any], steps: Ints, times: Floats) -> bytes:
-    """A piece of an event file, one event for each number.
-
-    Args:
-        tags: what the numbers are called.
-        numbers: in single precision, shape (tags, n).
-        steps: shape (n,).
-        times: in seconds since the epoch, shape (n,).
-    """
+    """A piece of an event file, one event for each number."""
     encoded = [tag.encode() for tag in tags]
     tag_bytes = np.frombuffer(b"".join(encoded), np.uint8)
     ends = np.cumsum([len(tag) for tag in encoded])

@@ -179,21 +179,13 @@ def pick_start(starts: Ints, start_cumulative: Floats, uniform: float) -> int:
 
 
 class FiniteModel(NamedTuple):
-    """Dynamics, shared by all environments of a training.
+    """Dynamics, shared by all environments of a training."""
 
-    Attributes:
-        time_limit: steps after which an episode is truncated, or 0 for never.
-        outcomes: records of type `OUTCOME`, shape (S, A, K).
-        starts: states where an episode may begin, shape (m,).
-        start_cumulative: their cumulative probabilities, shape (m,).
-        observation: what is observed in each state, shape (S,).
-    """
-
-    time_limit: int
-    outcomes: NDArray[np.void]
-    starts: Ints
-    start_cumulative: Floats
-    observation: Ints
+    time_limit: int  # steps after which an episode is truncated, or 0 for never
+    outcomes: NDArray[np.void]  # records of type `OUTCOME`, shape (S, A, K)
+    starts: Ints  # states where an episode may begin, shape (m,)
+    start_cumulative: Floats  # their cumulative probabilities, shape (m,)
+    observation: Ints  # what is observed in each state, shape (S,)
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
@@ -271,17 +263,9 @@ def bin_index(world: CartPole, env: Any) -> int:
 
 
 class CartPole(NamedTuple):
-    """CartPole's constants, as Gymnasium names them, and the bins that it is seen through, if any.
+    """CartPole's constants, as Gymnasium names them, and the bins it is seen through, if any."""
 
-    Attributes:
-        time_limit: steps after which an episode is truncated, or 0 for never.
-        theta_threshold: in radians.
-        semi_implicit: whether velocities move before positions.
-        dims: the dimensions of the observation that count, shape (d,).
-        bins: number of bins, lower end and upper end of each, shape (d, 3).
-    """
-
-    time_limit: int
+    time_limit: int  # steps after which an episode is truncated, or 0 for never
     gravity: float
     masspole: float
     total_mass: float
@@ -289,11 +273,11 @@ class CartPole(NamedTuple):
     polemass_length: float
     force_mag: float
     tau: float
-    semi_implicit: bool
+    semi_implicit: bool  # whether velocities move before positions
     x_threshold: float
-    theta_threshold: float
-    dims: Ints
-    bins: Floats
+    theta_threshold: float  # in radians
+    dims: Ints  # the dimensions of the observation that count, shape (d,)
+    bins: Floats  # number of bins, lower end and upper end of each, shape (d, 3)
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
@@ -345,13 +329,9 @@ def drive(world: MountainCar, env: Any) -> bool:
 
 
 class MountainCar(NamedTuple):
-    """MountainCar's constants, as Gymnasium names them.
+    """MountainCar's constants, as Gymnasium names them."""
 
-    Attributes:
-        time_limit: steps after which an episode is truncated, or 0 for never.
-    """
-
-    time_limit: int
+    time_limit: int  # steps after which an episode is truncated, or 0 for never
     force: float
     gravity: float
     max_speed: float
@@ -422,11 +402,7 @@ def monitor_of(env: Env) -> Monitor | None:
 
 
 def compile_envs(vec_env: VecEnv) -> World:
-    """The compiled counterpart of environments that are all alike.
-
-    Raises:
-        NotCompilable: where there is none; the message says why.
-    """
+    """The compiled counterpart of environments that are all alike."""
     if type(vec_env) is not DummyVecEnv:
         raise NotCompilable(f"{type(vec_env).__name__} is not DummyVecEnv")
     for env in vec_env.envs:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
-from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.callbacks import (
-    NEVER,
     EpisodeBudget,
     Horizon,
     heeds_rollouts,
@@ -27,30 +24,25 @@ from agents.compiled.greedy_play import COMPENSATED_SUM, Playground
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import learn_from_last_step, run_block
 from agents.compiled.records import Episodes
+from agents.compiled.worlds import NotCompilable
 from agents.networks.network_worlds import NetworkEnvStates, network_playground
 from agents.networks.observations import Numbers
-from agents.networks.torch_bridge import Reference, SharedTensors, address_of
+from agents.networks.torch_bridge import FlatTensors, Reference, SharedOptimizer, address_of
 
-# Telling callbacks where rollouts begin and end, which blocks of compiled steps may pass over.
+if TYPE_CHECKING:
+    from agents.networks.policy_training import PolicyTraining
+    from agents.networks.q_training import QTraining
 
 
 class RolloutEvents:
-    """What the callbacks of a training are told of its rollouts.
-
-    Args:
-        agent: the agent.
-        callback: all of its callbacks.
-
-    Attributes:
-        are_heeded: whether one acts on rollouts, so that blocks have to end with them.
-    """
+    """What the callbacks of a training are told of its rollouts, which blocks may pass over."""
 
     def __init__(self, agent: Any, callback: BaseCallback) -> None:
         self.agent = agent
         asked = [member for member in members(callback) if type(member) is not CallbackList]
+        # Where one acts on rollouts, blocks have to end with them.
         self.of_rollouts = [member for member in asked if heeds_rollouts(member)]
         self.of_blocks = [member for member in asked if not heeds_rollouts(member)]
-        self.are_heeded = bool(self.of_rollouts)
 
     def begin(self) -> None:
         """A block begins, and perhaps a rollout; a run that was cut off goes back to its state."""
@@ -71,76 +63,60 @@ class RolloutEvents:
             member.on_rollout_end()
 
 
-# What an agent of the library and compiled code hand to each other while it trains.
-
 # An address that is filled in once there is a reference to what it belongs to.
 NOWHERE = np.uintp(0)
 
 
-class NetworkTraining(ABC):
-    """An agent of the library in training.
+class NetworkTraining:
+    """An agent of the library in training, whose networks lie in the memory of compiled code.
 
-    Args:
-        agent: the agent.
-        seen: how its networks see compiled environments.
-        tensors: of its networks and its optimizer.
-
-    Attributes:
-        learner: the agent as compiled functions see it, by reference.
-        held: the same itself.
-        shown: observations of environments in Python, shape (n_envs, d).
-        waits: whether rollouts are learnt from by `learn_from_rollout`, and not by the loop.
-        heeds_budgets: whether a number of episodes to train for moves the schedules.
-        improves_by: the compiled function that learns from a minibatch.
+    What `QTraining` and `PolicyTraining` share, who make the learner.
     """
 
-    held: Any
-    heeds_budgets: ClassVar[bool]
-    improves_by: ClassVar[Callable[[Any, float, float], int]]
+    held: Any  # the agent as compiled functions see it
+    learner: Reference  # the same by reference
 
-    def __init__(self, agent: Any, seen: Any, tensors: SharedTensors) -> None:
+    def __init__(self, agent: Any, seen: Any) -> None:
         self.agent = agent
-        self.seen = seen
-        self.tensors = tensors
-        self.waits = False
+        self.seen = seen  # how its networks see compiled environments
+        self.waits = False  # whether rollouts wait for `learn_from_rollout`, and not in the loop
         # A handle does not keep it alive.
         self.generator = agent.rng
-        self.held = self._make_learner()
-        self.learner = Reference(self.held)
-        self.hold(improve=address_of(type(self).improves_by, self.learner))
-        width = 1 if isinstance(seen, Numbers) else int(tensors.networks[0].layers.sizes[0])
+        self.networks, lagging = agent.shared_networks(seen)
+        self.trained, self.lagging = FlatTensors(self.networks), FlatTensors(lagging)
+        self.trained.take_over()
+        self.lagging.take_over()
+        self.optimizer = SharedOptimizer(agent.policy, self.networks)
+        # Observations of environments in Python.
+        width = 1 if isinstance(seen, Numbers) else int(self.networks[0].layers.sizes[0])
         self.shown = np.zeros((agent.n_envs, width))
 
-    @abstractmethod
-    def _make_learner(self) -> Any:
-        """The agent as compiled functions see it."""
+    def close(self) -> None:
+        """Let networks and optimizer have memory of their own again."""
+        for part in (self.trained, self.lagging, self.optimizer):
+            part.give_back()
 
-    @abstractmethod
-    def in_loop(self) -> Any:
-        """What the compiled loop asks."""
-
-    @abstractmethod
-    def schedules(self) -> dict[str, Schedule]:
-        """What compiled code works out after each step, by the names in its record."""
-
-    @abstractmethod
-    def read_settings(self) -> None:
-        """Take over what a callback has changed."""
-
-    def read_tensors(self) -> None:
-        """Go on with the weights and the optimizer that a callback may have put there.
-
-        Raises:
-            ValueError: if the optimizer has become one that compiled code does not know.
-        """
-        optimizer = self.tensors.take_over()
-        if optimizer is not self.held.optimizer:
-            self.hold(optimizer=optimizer)
+    def begin(self, held: Any, improve: Callable[[Any, float, float], int]) -> None:
+        """Take the learner, and the compiled function by which it learns from a minibatch."""
+        self.held = held
+        self.learner = Reference(held)
+        self.hold(improve=address_of(improve, self.learner))
 
     def hold(self, **parts: Any) -> None:
         """Put other parts in the place of the learner's."""
         self.held = self.held._replace(**parts)
         self.learner.hold(self.held)
+
+    def read_tensors(self) -> None:
+        """Go on with the weights and the optimizer that a callback may have put there."""
+        self.trained.take_over()
+        self.lagging.take_over()
+        try:
+            optimizer = self.optimizer.current()
+        except NotCompilable as reason:
+            raise ValueError(f"engine: compiled cannot go on: {reason}") from None
+        if optimizer is not self.held.optimizer:
+            self.hold(optimizer=optimizer)
 
     def read_generator(self) -> None:
         """Draw from the agent's generator, which a callback may have replaced."""
@@ -149,73 +125,20 @@ class NetworkTraining(ABC):
             self.held.rng[:] = handles_of([self.generator])
 
     def show(self, observations: Any) -> None:
-        """Take observations of environments in Python, of as many numbers as there is room for.
-
-        Raises:
-            ValueError: if one lies outside of its space, where no weights are.
-        """
+        """Take observations of environments in Python, of as many numbers as there is room for."""
         self.shown[:] = np.reshape(observations, self.shown.shape)
         self.check_numbers(self.shown)
 
     def check_numbers(self, shown: Any) -> None:
-        """Make sure that numbers of states are within their space; anything goes for vectors.
-
-        Raises:
-            ValueError: if they are not.
-        """
+        """Refuse numbers of states outside their space, where no weights are."""
         if isinstance(self.seen, Numbers) and not (shown.min() >= 0 and shown.max() < self.seen.n):
             wrong = int(shown[(shown < 0) | (shown >= self.seen.n)][0])
             raise ValueError(f"observation {wrong} is not in {self.agent.observation_space}")
-
-    @abstractmethod
-    def take_over_progress(self, remaining: float) -> None:
-        """Let the agent know how much of the training remains, at the moments when it finds out."""
-
-    @abstractmethod
-    def give_up_rollout(self) -> None:
-        """Forget how much was collected since the last training."""
-
-    @abstractmethod
-    def read(self) -> None:
-        """Begin where the agent is."""
-
-    @abstractmethod
-    def write(self) -> None:
-        """Let the agent know where compiled code is."""
 
     def until_end(self, total_timesteps: int) -> int:
         """Steps of every environment until the training is over."""
         left: int = total_timesteps - self.agent.num_timesteps
         return -(-left // int(self.agent.n_envs))
-
-    def until_log(self, log_interval: int | None) -> Horizon:
-        """When something is logged next."""
-        return Horizon(NEVER, NEVER)
-
-    @abstractmethod
-    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
-        """Let the agent know of episodes that have ended, and log where it is time to."""
-
-    @property
-    @abstractmethod
-    def is_rollout_over(self) -> bool:
-        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
-
-    @abstractmethod
-    def until_rollout_end(self) -> Horizon:
-        """When a rollout ends that is to wait."""
-
-    @abstractmethod
-    def learn_from_rollout(self, remaining: float) -> None:
-        """Learn from the rollout that waits, with that share of the training left."""
-
-    @abstractmethod
-    def before_training(self, log_interval: int | None) -> None:
-        """What comes before learning from a rollout that ends with the last step of a block."""
-
-    @abstractmethod
-    def record(self) -> None:
-        """Hand what the last training has given to the agent's logger."""
 
 
 def record_of(kind: np.dtype[np.void], **values: Any) -> Any:
@@ -226,21 +149,12 @@ def record_of(kind: np.dtype[np.void], **values: Any) -> Any:
     return records
 
 
-# Trains an agent of the library on the compiled loop, and keeps the rest from noticing.
-
 # Between two blocks signals are seen to, and displays move.
 SECONDS_PER_BLOCK = 0.2
 
 
 class NetworkEngine(CompiledEngine):
-    """One call of ``learn`` on the compiled loop.
-
-    Args:
-        training: the agent, as it and compiled code share it.
-        world: the compiled counterpart of its environments.
-        callback: what is told of the steps.
-        log_interval: episodes between two log records, or rollouts, or None.
-    """
+    """One call of ``learn`` on the compiled loop."""
 
     counts_where_stopped = False  # as in the library
 
@@ -248,14 +162,14 @@ class NetworkEngine(CompiledEngine):
 
     def __init__(
         self,
-        training: NetworkTraining,
+        training: QTraining | PolicyTraining,
         world: Any,
         callback: BaseCallback,
         log_interval: int | None,
     ) -> None:
         self.training = training
         self.rollouts = RolloutEvents(training.agent, callback)
-        training.waits = self.rollouts.are_heeded
+        training.waits = bool(self.rollouts.of_rollouts)
         self.steps_at_once = 1
         self.has_begun = False
         self.in_loop = training.in_loop()
@@ -270,7 +184,6 @@ class NetworkEngine(CompiledEngine):
         return network_playground(vec_env)
 
     def _learner(self) -> Any:
-        """The agent as compiled functions see it, also after a callback has changed it."""
         for name, schedule in self.training.schedules().items():
             self.progress[0][f"{name}_schedule"] = compiled_schedule(schedule)
         self.training.read_settings()

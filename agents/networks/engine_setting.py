@@ -8,7 +8,7 @@ import sys
 import time
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, ClassVar, Literal, Self
@@ -17,37 +17,32 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
 from stable_baselines3.common.torch_layers import FlattenExtractor
-from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
+from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.dqn.policies import DQNPolicy
 from torch import nn
 from torch.optim import Optimizer
 
 from agents.common.callbacks import EpisodeBudget, members, unknown_callbacks
-from agents.common.settings import check_option
+from agents.common.settings import check_option, full_signature
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.worlds import NotCompilable
-from agents.networks.engine import NetworkEngine, NetworkTraining, RolloutEvents
+from agents.networks.engine import NetworkEngine, RolloutEvents
 from agents.networks.network_worlds import network_world
 from agents.networks.observations import Numbers, OwnVectors
 from agents.networks.perceptron import Inputs, one_thread
 from agents.networks.playing import NetworkPlayer, network_player
-from agents.networks.torch_bridge import Network, in_rows
+from agents.networks.torch_bridge import Network, check_optimizer, in_rows
 from machine_code.cache import is_compiled_before
 
 # Which trainings of the library's agents have a compiled counterpart.
 
 
 def check_agent(agent: Any) -> None:
-    """Make sure that compiled functions do all that an agent of the library does.
-
-    Raises:
-        NotCompilable: naming what they do not.
-    """
+    """Make sure that compiled functions do all that an agent of the library does."""
     if not type(agent).__module__.startswith("agents."):
         raise NotCompilable(f"{type(agent).__name__} may do things in Python of its own")
     _check_spaces(agent)
@@ -76,41 +71,11 @@ def _check_spaces(agent: Any) -> None:
         raise NotCompilable(f"observations are of {observations.dtype}")
 
 
-def check_q_agent(agent: Any) -> None:
-    """As `check_agent`, for DQN and its kin.
-
-    Raises:
-        NotCompilable: naming what has no compiled counterpart.
-    """
-    check_agent(agent)
-    if getattr(agent, "mask_actions", False):
-        raise NotCompilable("it masks actions")
-    buffer = agent.replay_buffer
-    if type(buffer) not in {ReplayBuffer, NStepReplayBuffer} or buffer.optimize_memory_usage:
-        raise NotCompilable("its replay buffer is of another kind")
-    if agent.n_envs > 1 and agent.train_freq.unit == TrainFrequencyUnit.EPISODE:
-        raise NotCompilable("train_freq counts the episodes of several environments")
-
-
-def check_policy_agent(agent: Any) -> None:
-    """As `check_agent`, for PPO and A2C.
-
-    Raises:
-        NotCompilable: naming what has no compiled counterpart.
-    """
-    check_agent(agent)
-    if agent.use_sde:
-        raise NotCompilable("it explores by the state (use_sde)")
-    if type(agent.rollout_buffer) is not RolloutBuffer:
-        raise NotCompilable("its rollout buffer is of another kind")
-
-
 # What a training of networks takes, in the library's loop and in compiled code.
 #
 # For ``engine: auto`` this decides which of them runs. It goes by the settings alone, never by the
 # machine or by what has been compiled before: the two draw other random numbers, so the same
-# settings
-# and the same seed must always choose the same one.
+# settings and the same seed must always choose the same one.
 
 # Processor seconds, measured on one core with one thread; `machine_pace` compares other machines.
 # Of the library's loop:
@@ -139,27 +104,16 @@ PACE_AT_HOME = 3.9e-3  # of `machine_pace`'s work, where the others were measure
 
 @dataclass(frozen=True)
 class Work:
-    """What a training does.
+    """What a training does."""
 
-    Attributes:
-        kind: ``"q"`` or ``"policy"``, which is a network of values too.
-        n_steps: environment steps, over all environments.
-        n_envs: environments at once.
-        n_updates: minibatches that are learnt from.
-        batch_size: rows of a minibatch.
-        n_layers: of one network.
-        n_weights: of all networks that learn.
-        n_dense_weights: of them, those that are multiplied where observations are one-hot.
-    """
-
-    kind: Literal["q", "policy"]
-    n_steps: float
-    n_envs: int
-    n_updates: float
-    batch_size: float
-    n_layers: int
-    n_weights: int
-    n_dense_weights: int
+    kind: Literal["q", "policy"]  # ``"q"`` or ``"policy"``, which is a network of values too
+    n_steps: float  # environment steps, over all environments
+    n_envs: int  # environments at once
+    n_updates: float  # minibatches that are learnt from
+    batch_size: float  # rows of a minibatch
+    n_layers: int  # of one network
+    n_weights: int  # of all networks that learn
+    n_dense_weights: int  # of them, those that are multiplied where observations are one-hot
 
     @property
     def library_seconds(self) -> float:
@@ -200,17 +154,7 @@ def work_of(
     n_updates: float,
     batch_size: float,
 ) -> Work:
-    """The work of perceptrons; other arguments are attributes of `Work`.
-
-    Args:
-        kind: of the agent.
-        networks: that learn.
-        observations: what they see.
-        n_steps: likewise.
-        n_envs: likewise.
-        n_updates: likewise.
-        batch_size: likewise.
-    """
+    """The work of perceptrons; other arguments are attributes of `Work`."""
     linears = [[m for m in net.modules() if isinstance(m, nn.Linear)] for net in networks]
     n_weights = sum(layer.weight.numel() for layers in linears for layer in layers)
     is_one_hot = isinstance(observations, spaces.Discrete)
@@ -275,19 +219,14 @@ def _call_without_compiler(
 
 @dataclass(frozen=True)
 class EnginePlan:
-    """Which engine a training runs on, and why.
+    """Which engine a training runs on, and why."""
 
-    Attributes:
-        is_compiled: whether networks act and learn in compiled code, and not in the library's loop.
-        reason: why they do not although that would do; empty where nobody asked for it.
-        world: the compiled environments, and how networks see them; None where they run in Python.
-        in_python: why they do; empty where they do not, or nothing is compiled.
-    """
-
+    # whether networks act and learn in compiled code, and not in the library's loop
     is_compiled: bool
-    reason: str = ""
+    reason: str = ""  # why they do not although that would do; empty where nobody asked for it
+    # the compiled environments, and how networks see them; None where they run in Python
     world: tuple[Any, Any] | None = None
-    in_python: str = ""
+    in_python: str = ""  # why they do; empty where they do not, or nothing is compiled
 
     def __str__(self) -> str:
         if not self.is_compiled:
@@ -313,18 +252,26 @@ class CompiledNetworks(BaseAlgorithm):
         engine_in_use: what the last training ran on, and why.
     """
 
+    __signature__: ClassVar[inspect.Signature]
+
     rng: np.random.Generator
+    # A `QTraining` or a `PolicyTraining`.
+    training_kind: ClassVar[Any]
 
     # Of the training under way.
     excluded_from_states = ("_training", "_sharing")
     _own: ClassVar[tuple[str, ...]] = ("engine", "engine_in_use", "rng", "_training", "_sharing")
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        cls.__signature__ = full_signature(cls)
 
     def __init__(self, *args: Any, engine: NetworkEngineChoice = "library", **kwargs: Any) -> None:
         check_option("engine", engine, NetworkEngineChoice)
         self.engine: NetworkEngineChoice = engine
         self.engine_in_use = ""
         self._training: Any = None
-        self._sharing: ExitStack | None = None
+        self._sharing = False  # whether the library's loop acts and learns by compiled code
         do_without_torch_compiler()
         super().__init__(*args, **kwargs)
 
@@ -333,29 +280,23 @@ class CompiledNetworks(BaseAlgorithm):
         super().set_random_seed(seed)
         (self.rng,) = np.random.default_rng(seed).spawn(1)
 
-    @abstractmethod
     def _check_compilable(self) -> None:
         """Raise `NotCompilable` where compiled code does not do all that the agent does."""
-
-    @property
-    @abstractmethod
-    def is_within_rollout(self) -> bool:
-        """Whether the compiled loop has a rollout under way."""
-
-    @abstractmethod
-    def _compiled_training(self, seen: Any) -> AbstractContextManager[NetworkTraining]:
-        """Let the agent and compiled code share memory for a while."""
+        check_agent(self)
+        self._check_own()
+        check_optimizer(self.policy.optimizer)
+        self.shared_networks(self._seen_in_python())
 
     @abstractmethod
-    def _acting_network(self, seen: Any) -> Network:
-        """The network whose largest output is the best action."""
+    def _check_own(self) -> None:
+        """Raise `NotCompilable` for what this kind of agent cannot have."""
+
+    @abstractmethod
+    def shared_networks(self, seen: Any) -> tuple[list[Network], list[Network]]:
+        """The networks that learn, the acting one first, and their lagging copies."""
 
     def greedy_player(self, seen: Any) -> NetworkPlayer:
-        """What plays as `predict` does on compiled environments.
-
-        Args:
-            seen: how observations are read, of `agents.networks.observations`.
-        """
+        """What plays as `predict` does on compiled environments; ``seen`` reads observations."""
         space = self.observation_space
 
         def predicted(inputs: Inputs) -> int:
@@ -364,7 +305,7 @@ class CompiledNetworks(BaseAlgorithm):
             actions, _ = self.predict(observation[None], deterministic=True)
             return int(actions[0])
 
-        return network_player(self._acting_network(seen), seen, predicted)
+        return network_player(self.shared_networks(seen)[0][0], seen, predicted)
 
     def _schedules(self) -> list[Schedule]:
         """What a training in the compiled loop works out by itself."""
@@ -391,13 +332,7 @@ class CompiledNetworks(BaseAlgorithm):
     def engine_plan(
         self, total_timesteps: int, callback: Any, engine: NetworkEngineChoice | None = None
     ) -> EnginePlan:
-        """Which engine `learn` would run on, and why.
-
-        Args:
-            total_timesteps: its argument.
-            callback: likewise.
-            engine: as if the agent had this one.
-        """
+        """Which engine `learn` would run on, and why."""
         engine = self.engine if engine is None else engine
         if engine == "library":
             return EnginePlan(is_compiled=False)
@@ -406,9 +341,7 @@ class CompiledNetworks(BaseAlgorithm):
         except NotCompilable as reason:
             return EnginePlan(is_compiled=False, reason=str(reason))
         if engine == "auto" and not self.work(total_timesteps, callback).is_worth_compiling:
-            return EnginePlan(
-                is_compiled=False, reason="so short a training is not worth compiling"
-            )
+            return EnginePlan(is_compiled=False, reason=TOO_SHORT)
         try:
             return EnginePlan(is_compiled=True, world=self._world_for(callback))
         except NotCompilable as reason:
@@ -429,31 +362,26 @@ class CompiledNetworks(BaseAlgorithm):
     @contextmanager
     def _learning_compiled(self) -> Iterator[None]:
         """Let the library's loop act and learn by compiled code."""
-        with one_thread(), ExitStack() as sharing:
-            self._sharing = sharing
+        with one_thread():
+            self._sharing = True
             try:
                 yield
             finally:
-                self._sharing = self._training = None
+                if self._training is not None:
+                    self._training.close()
+                self._training, self._sharing = None, False
 
-    def _shared_training(self) -> NetworkTraining:
+    def _shared_training(self) -> Any:
         """The training under way, which begins with the first rollout.
 
         Not before: a run that was cut off goes back to its last state there.
         """
         if self._training is None:
-            assert self._sharing is not None
-            training = self._compiled_training(self._seen_in_python())
-            self._training = self._sharing.enter_context(training)
-        training_now: NetworkTraining = self._training
-        return training_now
+            self._training = self.training_kind(self, self._seen_in_python())
+        return self._training
 
     def _world_for(self, callback: Any) -> tuple[Any, Any]:
-        """The environments as compiled code, and how networks see them.
-
-        Raises:
-            NotCompilable: if they have to be called step by step.
-        """
+        """The environments as compiled code, and how networks see them."""
         known = isinstance(callback, BaseCallback | list | None)
         unknown = unknown_callbacks(CallbackList(_each(callback))) if known else ["a function"]
         if unknown:
@@ -487,7 +415,7 @@ class CompiledNetworks(BaseAlgorithm):
         if self.num_timesteps < total_timesteps:
             # A run that was cut off goes back to its last state here.
             RolloutEvents(self, callback).begin()
-            with one_thread(), self._compiled_training(seen) as training:
+            with one_thread(), closing(self.training_kind(self, seen)) as training:
                 NetworkEngine(training, world, callback, log_interval).run(total_timesteps)
         callback.on_training_end()
 

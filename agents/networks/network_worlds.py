@@ -23,15 +23,10 @@ _FINITE_ENV = env_dtype(("state", np.int64), *_ESTIMATES)
 
 
 class InFull(NamedTuple):
-    """CartPole or MountainCar, showing its state.
+    """CartPole or MountainCar, showing its state."""
 
-    Attributes:
-        time_limit: steps after which an episode is truncated, or 0 for never.
-        dynamics: what moves it.
-    """
-
-    time_limit: int
-    dynamics: CartPole | MountainCar
+    time_limit: int  # steps after which an episode is truncated, or 0 for never
+    dynamics: CartPole | MountainCar  # what moves it
 
     @inlined
     def step(self, env: Any, handle: Any) -> None:
@@ -62,14 +57,7 @@ def _record_in_full(names: tuple[str, ...]) -> np.dtype[np.void]:
 
 
 def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
-    """The compiled counterpart of environments, and how networks see it.
-
-    Returns:
-        What `agents.compiled.loop` steps, and one of the kinds of `agents.networks.observations`.
-
-    Raises:
-        NotCompilable: where there is none; the message says why.
-    """
+    """The compiled counterpart of environments, and how networks see it."""
     world = compile_envs(vec_env)
     space = vec_env.observation_space
     if isinstance(space, spaces.Discrete):
@@ -84,13 +72,7 @@ def network_world(vec_env: VecEnv) -> tuple[Any, Any]:
 
 
 class NetworkEnvStates(EnvStates):
-    """Environments of a training whose observations networks see.
-
-    Args:
-        vec_env: the environments.
-        world: their compiled counterpart.
-        seen: how networks see them.
-    """
+    """Environments of a training whose observations networks see."""
 
     def __init__(self, vec_env: Any, world: Any, seen: Any) -> None:
         self.seen = seen
@@ -105,11 +87,7 @@ class NetworkEnvStates(EnvStates):
         return self.observations(self.records[i : i + 1], "")[0]
 
     def observations(self, records: Any, prefix: str) -> Any:
-        """What environments show now (no prefix), before (``next_``) or after a reset (``new_``).
-
-        Returns:
-            Observations of shape (n, ...).
-        """
+        """What is shown now (no prefix), before (``next_``) or after a reset (``new_``)."""
         if isinstance(self.seen, Numbers):
             return records[f"{prefix}obs"].copy()
         if isinstance(self.seen, OwnVectors):
@@ -137,10 +115,6 @@ class NetworkEnvStates(EnvStates):
 
 
 def network_playground(vec_env: VecEnv) -> tuple[Any, NetworkEnvStates, Any]:
-    """Environments to evaluate networks or tiles on: compiled, their states, how they are seen.
-
-    Raises:
-        NotCompilable: where there is none; the message says why.
-    """
+    """Environments to evaluate networks or tiles on: compiled, their states, how they are seen."""
     world, seen = network_world(vec_env)
     return world, NetworkEnvStates(vec_env, world, seen), seen

@@ -57,13 +57,9 @@ def show(inputs: Inputs, i: int, row: Any, one_hot: int) -> None:
 
 
 class Numbers(NamedTuple):
-    """Observations are numbers, which networks see as one-hot vectors.
+    """Observations are numbers, which networks see as one-hot vectors."""
 
-    Attributes:
-        n: how many there are.
-    """
-
-    n: int
+    n: int  # how many there are
 
     @inlined
     def observe(self, env: Any, moment: int, row: Any) -> None:
@@ -77,13 +73,9 @@ class Numbers(NamedTuple):
 
 
 class StateVectors(NamedTuple):
-    """Observations are vectors, one for each state of a known model.
+    """Observations are vectors, one for each state of a known model."""
 
-    Attributes:
-        table: what is observed in each state, shape (S, d).
-    """
-
-    table: Singles
+    table: Singles  # what is observed in each state, shape (S, d)
 
     @inlined
     def observe(self, env: Any, moment: int, row: Any) -> None:
@@ -99,13 +91,9 @@ class StateVectors(NamedTuple):
 
 
 class OwnVectors(NamedTuple):
-    """Observations are vectors that the environments' records hold.
+    """Observations are vectors that the environments' records hold."""
 
-    Attributes:
-        n: length of the vectors.
-    """
-
-    n: int
+    n: int  # length of the vectors
 
     @inlined
     def observe(self, env: Any, moment: int, row: Any) -> None:

@@ -14,14 +14,12 @@ from numba.extending import get_cython_function_address, intrinsic
 from numpy.typing import NDArray
 from threadpoolctl import ThreadpoolController
 
-from machine_code.compiling import called, internal, vectorised, view
+from machine_code.compiling import internal, vectorised, view
 from mdp.array_types import Ints
 
-# Products of matrices in single precision, by the BLAS that SciPy brings.
-#
-# Numba's own `numpy.dot` wants to count references, which compiled loops here do without. BLAS
-# counts
-# by columns, so that it is handed the transposed problem: the rows of one matrix are its columns.
+# Products of matrices in single precision, by the BLAS that SciPy brings: Numba's own `numpy.dot`
+# counts references, which compiled loops here do without. BLAS counts by columns, so it is handed
+# the transposed problem: the rows of one matrix are its columns.
 
 Singles = NDArray[np.float32]
 
@@ -112,10 +110,10 @@ _call: Any = _sgemm
 
 
 @internal
-def _multiply(
+def multiply(
     sgemm: Any, left: Singles, left_kind: int, right: Singles, right_kind: int, product: Singles
 ) -> None:
-    """The product of two matrices, each as it is or transposed."""
+    """The product of two matrices, each `AS_IT_IS` or `TRANSPOSED`."""
     m, n = product.shape
     inner = left.shape[1] if left_kind == AS_IT_IS else left.shape[0]
     _call(
@@ -134,36 +132,9 @@ def _multiply(
     )
 
 
-@internal
-def multiply(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
-    """``product = left @ right``, of shapes (m, k), (k, n) and (m, n)."""
-    _multiply(sgemm, left, AS_IT_IS, right, AS_IT_IS, product)
+# Activation functions in single precision, and their derivatives, which outputs alone decide.
 
-
-@internal
-def multiply_transposed_left(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
-    """``product = left.T @ right``, of shapes (k, m), (k, n) and (m, n)."""
-    _multiply(sgemm, left, TRANSPOSED, right, AS_IT_IS, product)
-
-
-@internal
-def multiply_transposed_right(sgemm: Any, left: Singles, right: Singles, product: Singles) -> None:
-    """``product = left @ right.T``, of shapes (m, k), (n, k) and (m, n)."""
-    _multiply(sgemm, left, AS_IT_IS, right, TRANSPOSED, product)
-
-
-# Activation functions in single precision, and their derivatives.
-#
-# Those of the first can be told from the output alone. Of the others inputs are kept.
-#
-# Sources: Clevert, Unterthiner and Hochreiter (2016) for ELU, Klambauer et al. (2017) for SELU,
-# Hendrycks and Gimpel (2016) for GELU and SiLU, Misra (2020) for Mish.
-
-IDENTITY, RELU, TANH, ELU, LEAKY_RELU, SIGMOID = range(6)
-SELU, SOFTPLUS, SILU, GELU, FAST_GELU, MISH = range(6, 12)
-
-# From here on inputs are kept for the derivative.
-FIRST_BY_INPUT = SELU
+IDENTITY, RELU, TANH = range(3)
 
 # Coefficients of a rational function of x squared, from the highest power on, as Eigen's
 # `generic_fast_tanh_float` has them: within a few units in the last place, and without a call, so
@@ -187,11 +158,6 @@ _DENOMINATOR = (
 _BOUND = np.float32(7.90531110763549805)
 _ZERO, _ONE = np.float32(0), np.float32(1)
 
-_SELU_SCALE, _SELU_ALPHA = 1.0507009873554805, 1.6732632423543772
-_SQRT_HALF, _SQRT_PI = math.sqrt(0.5), math.sqrt(math.pi)
-# Of GELU's approximation, 0.5 (1 + tanh(u)) being sigmoid(2 u).
-_GELU_SCALE, _GELU_CUBE = math.sqrt(2 / math.pi), 0.044715
-
 
 @internal
 def tanh(x: Any) -> Any:
@@ -209,7 +175,7 @@ def tanh(x: Any) -> Any:
 
 
 @vectorised
-def activate(rows: Singles, bias: Singles, kind: int, slope: Any) -> None:
+def activate(rows: Singles, bias: Singles, kind: int) -> None:
     """Add the bias to each row, shape (n, d), and apply the function of that kind."""
     for i in range(len(rows)):
         row = rows[i]
@@ -222,70 +188,11 @@ def activate(rows: Singles, bias: Singles, kind: int, slope: Any) -> None:
                 row[j] = tanh(row[j] + bias[j])
         else:
             for j in range(len(row)):
-                row[j] = _one_by_one(row[j] + bias[j], kind, slope)
-
-
-@internal
-def _one_by_one(x: Any, kind: int, slope: Any) -> Any:
-    if kind == ELU:
-        return x if x > _ZERO else slope * np.float32(math.expm1(x))
-    if kind == LEAKY_RELU:
-        return x if x > _ZERO else slope * x
-    if kind == SIGMOID:
-        return np.float32(1 / (1 + math.exp(-x)))
-    return x
-
-
-# Those of the other kinds are rare: by functions of their own, which are called for each number,
-# they add little to what has to be compiled.
-
-
-@called
-def activate_kept(
-    inputs: Singles, bias: Singles, outputs: Singles, kind: int, slope: float
-) -> None:
-    """As `activate`, of a function from `FIRST_BY_INPUT` on; ``inputs`` keep what it is given."""
-    for i in range(len(inputs)):
-        row, to = inputs[i], outputs[i]
-        for j in range(len(row)):
-            row[j] += bias[j]
-            to[j] = np.float32(_by_input(float(row[j]), kind, slope))
-
-
-@called
-def _by_input(x: float, kind: int, slope: float) -> float:
-    if kind == SELU:
-        return _SELU_SCALE * (x if x > 0 else _SELU_ALPHA * math.expm1(x))
-    if kind == SOFTPLUS:
-        return _softplus(x * slope) / slope
-    if kind == SILU:
-        return x * _sigmoid(x)
-    if kind == GELU:
-        return x * _normal_probability(x)
-    if kind == FAST_GELU:
-        return x * _sigmoid(2 * _GELU_SCALE * (x + _GELU_CUBE * x**3))
-    return x * math.tanh(_softplus(x))
-
-
-@internal
-def _sigmoid(x: float) -> float:
-    return 1 / (1 + math.exp(-x))
-
-
-@internal
-def _softplus(x: float) -> float:
-    """Logarithm of 1 + exp(x), without running over."""
-    return max(x, 0.0) + math.log1p(math.exp(-abs(x)))
-
-
-@internal
-def _normal_probability(x: float) -> float:
-    """That a standard normal number is below."""
-    return 0.5 * math.erfc(-x * _SQRT_HALF)
+                row[j] += bias[j]
 
 
 @vectorised
-def pull_back(errors: Singles, outputs: Singles, kind: int, slope: Any) -> None:
+def pull_back(errors: Singles, outputs: Singles, kind: int) -> None:
     """Turn derivatives by the outputs into those by the inputs, in place; both of shape (n, d)."""
     for i in range(len(errors)):
         error, output = errors[i], outputs[i]
@@ -295,97 +202,34 @@ def pull_back(errors: Singles, outputs: Singles, kind: int, slope: Any) -> None:
         elif kind == TANH:
             for j in range(len(error)):
                 error[j] *= _ONE - output[j] * output[j]
-        else:
-            for j in range(len(error)):
-                error[j] *= _derivative(output[j], kind, slope)
-
-
-@internal
-def _derivative(output: Any, kind: int, slope: Any) -> Any:
-    if kind == ELU:
-        return _ONE if output > _ZERO else output + slope
-    if kind == LEAKY_RELU:
-        return _ONE if output > _ZERO else slope
-    if kind == SIGMOID:
-        return output * (_ONE - output)
-    return _ONE
-
-
-@called
-def pull_back_kept(errors: Singles, inputs: Singles, kind: int, slope: float) -> None:
-    """As `pull_back`, of a function from `FIRST_BY_INPUT` on."""
-    for i in range(len(errors)):
-        error, row = errors[i], inputs[i]
-        for j in range(len(error)):
-            error[j] *= np.float32(_derivative_by_input(float(row[j]), kind, slope))
-
-
-@called
-def _derivative_by_input(x: float, kind: int, slope: float) -> float:
-    if kind == SELU:
-        return _SELU_SCALE * (1.0 if x > 0 else _SELU_ALPHA * math.exp(x))
-    if kind == SOFTPLUS:
-        return _sigmoid(x * slope)
-    if kind == SILU:
-        share = _sigmoid(x)
-        return share * (1 + x * (1 - share))
-    if kind == GELU:
-        density = math.exp(-0.5 * x * x) * _SQRT_HALF / _SQRT_PI
-        return _normal_probability(x) + x * density
-    if kind == FAST_GELU:
-        share = _sigmoid(2 * _GELU_SCALE * (x + _GELU_CUBE * x**3))
-        inner = 2 * _GELU_SCALE * (1 + 3 * _GELU_CUBE * x * x)
-        return share * (1 + x * (1 - share) * inner)
-    gate = math.tanh(_softplus(x))
-    return gate + x * (1 - gate * gate) * _sigmoid(x)
 
 
 # A multilayer perceptron and its gradient, with all parameters in one flat vector.
 #
 # Weights of a layer lie as (inputs, outputs), the transpose of PyTorch's: of an input that is
-# one-hot
-# a row is all that has to be read. What layers put out lies in one array as well, a layer after the
-# other, so that nothing is allocated while training; behind it what activation functions were
-# given,
-# where their derivatives ask for that.
+# one-hot a row is all that has to be read. What layers put out lies in one array as well, a layer
+# after the other, so that nothing is allocated while training.
 #
 # Source: Goodfellow, Bengio and Courville, Deep Learning (2016), algorithms 6.3 and 6.4.
 
 
 class Layers(NamedTuple):
-    """The shape of a perceptron of L layers.
+    """The shape of a perceptron of L layers."""
 
-    Attributes:
-        sizes: number of inputs, then of outputs of each layer, shape (L + 1,).
-        weights_at: where the weights of each layer begin in the flat vector, shape (L,).
-        biases_at: where its biases do, shape (L,).
-        outputs_at: where its outputs begin in an array of outputs, for each row, shape (L,).
-        activation: what follows each layer but the last, of `agents.networks.perceptron`.
-        slope: the one parameter of that function, where it has one.
-        one_hot: 1 where inputs are numbers that stand for one-hot vectors.
-        sgemm: the address of BLAS's routine.
-    """
-
-    sizes: Ints
-    weights_at: Ints
-    biases_at: Ints
-    outputs_at: Ints
-    activation: int
-    slope: float
-    one_hot: int
-    sgemm: np.uintp
+    sizes: Ints  # number of inputs, then of outputs of each layer, shape (L + 1,)
+    weights_at: Ints  # where the weights of each layer begin in the flat vector, shape (L,)
+    biases_at: Ints  # where its biases do, shape (L,)
+    outputs_at: Ints  # where its outputs begin in an array of outputs, for each row, shape (L,)
+    activation: int  # what follows each layer but the last: `IDENTITY`, `RELU` or `TANH`
+    one_hot: int  # 1 where inputs are numbers that stand for one-hot vectors
+    sgemm: np.uintp  # the address of BLAS's routine
 
 
 class Inputs(NamedTuple):
-    """Rows that a perceptron is evaluated on.
+    """Rows that a perceptron is evaluated on."""
 
-    Attributes:
-        vectors: shape (n, sizes[0]); not read with one-hot inputs.
-        indices: the numbers that stand for one-hot vectors, shape (n,).
-    """
-
-    vectors: Singles
-    indices: Ints
+    vectors: Singles  # shape (n, sizes[0]); not read with one-hot inputs
+    indices: Ints  # the numbers that stand for one-hot vectors, shape (n,)
 
 
 def make_inputs(layers: Layers, n: int) -> Inputs:
@@ -394,9 +238,7 @@ def make_inputs(layers: Layers, n: int) -> Inputs:
     return Inputs(np.zeros((n, width), np.float32), np.zeros(n, np.int64))
 
 
-def make_layers(
-    sizes: Sequence[int], start: int, activation: int, slope: float, *, one_hot: bool
-) -> Layers:
+def make_layers(sizes: Sequence[int], start: int, activation: int, *, one_hot: bool) -> Layers:
     """The shape of a perceptron whose parameters begin at ``start`` of the flat vector."""
     inputs, outputs = np.array(sizes[:-1], np.int64), np.array(sizes[1:], np.int64)
     ends = start + np.cumsum(inputs * outputs + outputs)
@@ -406,7 +248,6 @@ def make_layers(
         ends - outputs,
         np.cumsum(outputs) - outputs,
         activation,
-        float(slope),
         int(one_hot),
         sgemm_address(),
     )
@@ -418,9 +259,8 @@ def n_parameters(layers: Layers) -> int:
 
 
 def make_outputs(layers: Layers, n: int) -> Singles:
-    """Room for all that the layers put out for ``n`` rows, and for what functions are given."""
-    n_kept = 2 if layers.activation >= FIRST_BY_INPUT else 1
-    return np.zeros(n * n_kept * int(layers.sizes[1:].sum()), np.float32)
+    """Room for all that the layers put out for ``n`` rows."""
+    return np.zeros(n * int(layers.sizes[1:].sum()), np.float32)
 
 
 @view
@@ -447,14 +287,6 @@ def outputs_of(layers: Layers, outputs: Singles, layer: int, n: int) -> Singles:
 
 
 @view
-def kept_inputs_of(layers: Layers, outputs: Singles, layer: int, n: int) -> Singles:
-    """What a layer's activation function is given for ``n`` rows, shape (n, outputs)."""
-    width = layers.sizes[layer + 1]
-    begin = n * (layers.outputs_at[-1] + layers.sizes[-1] + layers.outputs_at[layer])
-    return outputs[begin : begin + n * width].reshape((n, width))
-
-
-@view
 def last_outputs(layers: Layers, outputs: Singles, n: int) -> Singles:
     """What the perceptron puts out for ``n`` rows, shape (n, sizes[-1])."""
     return outputs_of(layers, outputs, len(layers.sizes) - 2, n)
@@ -468,18 +300,11 @@ def forward(layers: Layers, flat: Singles, inputs: Inputs, n: int, outputs: Sing
     for layer in range(n_layers):
         weights, bias = weights_of(layers, flat, layer), biases_of(layers, flat, layer)
         above = outputs_of(layers, outputs, layer, n)
-        kind = layers.activation if layer < n_layers - 1 else IDENTITY
-        product = above
-        if kind >= FIRST_BY_INPUT:
-            product = kept_inputs_of(layers, outputs, layer, n)
         if layer == 0 and layers.one_hot:
-            _pick_rows(weights, inputs.indices, product)
+            _pick_rows(weights, inputs.indices, above)
         else:
-            multiply(layers.sgemm, below, weights, product)
-        if kind >= FIRST_BY_INPUT:
-            activate_kept(product, bias, above, kind, layers.slope)
-        else:
-            activate(above, bias, kind, np.float32(layers.slope))
+            multiply(layers.sgemm, below, AS_IT_IS, weights, AS_IT_IS, above)
+        activate(above, bias, layers.activation if layer < n_layers - 1 else IDENTITY)
         below = above
 
 
@@ -501,16 +326,9 @@ def backward(
     errors: Singles,
     gradient: Singles,
 ) -> None:
-    """The gradient by all parameters, from the derivatives by the perceptron's outputs.
+    """Write the gradient, given what `forward` left and the derivatives by the last outputs.
 
-    Args:
-        layers: the shape.
-        flat: the parameters.
-        inputs: what `forward` was given.
-        n: the number of rows.
-        outputs: what `forward` has left.
-        errors: as long; `last_outputs` of it are the derivatives, the rest is for work.
-        gradient: where to write, as long as the parameters.
+    The derivatives are `last_outputs` of ``errors``, the rest of which is for work.
     """
     for layer in range(len(layers.sizes) - 2, -1, -1):
         error = outputs_of(layers, errors, layer, n)
@@ -520,17 +338,14 @@ def backward(
             if layers.one_hot:
                 _add_rows(error, inputs.indices, slot)
             else:
-                multiply_transposed_left(layers.sgemm, inputs.vectors[:n], error, slot)
+                multiply(layers.sgemm, inputs.vectors[:n], TRANSPOSED, error, AS_IT_IS, slot)
             return
         below = outputs_of(layers, outputs, layer - 1, n)
         error_below = outputs_of(layers, errors, layer - 1, n)
-        multiply_transposed_left(layers.sgemm, below, error, slot)
-        multiply_transposed_right(layers.sgemm, error, weights_of(layers, flat, layer), error_below)
-        if layers.activation >= FIRST_BY_INPUT:
-            kept = kept_inputs_of(layers, outputs, layer - 1, n)
-            pull_back_kept(error_below, kept, layers.activation, layers.slope)
-        else:
-            pull_back(error_below, below, layers.activation, np.float32(layers.slope))
+        weights = weights_of(layers, flat, layer)
+        multiply(layers.sgemm, below, TRANSPOSED, error, AS_IT_IS, slot)
+        multiply(layers.sgemm, error, AS_IT_IS, weights, TRANSPOSED, error_below)
+        pull_back(error_below, below, layers.activation)
 
 
 @vectorised
@@ -568,28 +383,17 @@ _TINY, _TINY_SQUARE = np.float32(1e-17), np.float32(1e-36)
 
 
 class Optimizer(NamedTuple):
-    """An optimizer and what it remembers.
+    """An optimizer and what it remembers."""
 
-    Attributes:
-        kind: `ADAM`, `ADAMW`, `RMSPROP` or `RMSPROP_TENSORFLOW`.
-        momentum: Adam's beta_1.
-        smoothing: Adam's beta_2, RMSprop's alpha.
-        epsilon: keeps divisors from zero.
-        weight_decay: how much parameters are drawn to zero: by a part of the gradient, or with
-            `ADAMW` beside it.
-        mean: running mean of gradients, as long as the parameters.
-        mean_square: of their squares.
-        n_steps: steps taken so far, alone in an array, in single precision as PyTorch has it.
-    """
-
-    kind: int
-    momentum: float
-    smoothing: float
-    epsilon: float
+    kind: int  # `ADAM`, `ADAMW`, `RMSPROP` or `RMSPROP_TENSORFLOW`
+    momentum: float  # Adam's beta_1
+    smoothing: float  # Adam's beta_2, RMSprop's alpha
+    epsilon: float  # keeps divisors from zero
+    # how much parameters are drawn to zero: by a part of the gradient, or with `ADAMW` beside it
     weight_decay: float
-    mean: Singles
-    mean_square: Singles
-    n_steps: Singles
+    mean: Singles  # running mean of gradients, as long as the parameters
+    mean_square: Singles  # of their squares
+    n_steps: Singles  # steps taken so far, alone in an array, in single precision as PyTorch has it
 
 
 @vectorised

@@ -35,21 +35,13 @@ _ASKED = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_double, ctyp
 
 
 class GreedyNetwork(NamedTuple):
-    """A network whose largest output is the best action, by reference.
+    """A network whose largest output is the best action, by reference."""
 
-    Attributes:
-        layers: its shape.
-        flat: its parameters.
-        single: one observation, to act on.
-        single_outputs: for what is put out for it.
-        ask: the address of what says the action where two are close.
-    """
-
-    layers: Layers
-    flat: Singles
-    single: Inputs
-    single_outputs: Singles
-    ask: np.uintp
+    layers: Layers  # its shape
+    flat: Singles  # its parameters
+    single: Inputs  # one observation, to act on
+    single_outputs: Singles  # for what is put out for it
+    ask: np.uintp  # the address of what says the action where two are close
 
 
 @kernel
@@ -69,23 +61,16 @@ def choose_surely(network: Any, _: float, __: float) -> int:
 
 
 class Oracle:
-    """Asks Python which action is best, for compiled code.
-
-    Args:
-        predict: from the first row of a network's inputs to an action.
-
-    Attributes:
-        address: where compiled code calls it.
-        inputs: what that code shows.
-        errors: what `predict` has raised, which cannot pass through compiled code.
-    """
+    """Asks Python which action is best, for compiled code."""
 
     def __init__(self, predict: Callable[[Inputs], int]) -> None:
         self.predict = predict
-        self.inputs: Any = None
+        self.inputs: Any = None  # what that code shows
+        # what `predict` has raised, which cannot pass through compiled code
         self.errors: list[BaseException] = []
         # Compiled code does not keep it alive.
         self._called = _ASKED(self._answer)
+        # where compiled code calls it
         self.address = np.uintp(ctypes.cast(self._called, ctypes.c_void_p).value or 0)
 
     def _answer(self, _: int | None, __: float, ___: float) -> int:
@@ -99,12 +84,7 @@ class Oracle:
 
 
 class PlayedNetwork(Reference):
-    """A reference to a `GreedyNetwork`.
-
-    Args:
-        held: the network.
-        oracle: what it asks.
-    """
+    """A reference to a `GreedyNetwork`."""
 
     def __init__(self, held: GreedyNetwork, oracle: Oracle) -> None:
         super().__init__(held)
@@ -113,17 +93,11 @@ class PlayedNetwork(Reference):
 
 
 class NetworkPlayer(NamedTuple):
-    """What the compiled loop asks.
+    """What the compiled loop asks."""
 
-    Attributes:
-        network: a `PlayedNetwork`.
-        seen: how observations are read, of `agents.networks.observations`.
-        choose: the address of `choose_surely`.
-    """
-
-    network: Any
-    seen: Any
-    choose: np.uintp
+    network: Any  # a `PlayedNetwork`
+    seen: Any  # how observations are read, of `agents.networks.observations`
+    choose: np.uintp  # the address of `choose_surely`
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:
@@ -144,13 +118,7 @@ class NetworkPlayer(NamedTuple):
 
 
 def network_player(network: Network, seen: Any, predict: Callable[[Inputs], int]) -> NetworkPlayer:
-    """A network as it is now, whose parameters are copied.
-
-    Args:
-        network: its largest output is the best action.
-        seen: how observations are read, of `agents.networks.observations`.
-        predict: the action for the first row of inputs, where two are close.
-    """
+    """A network as it is now, whose parameters are copied."""
     tensors, layers = FlatTensors([network]), network.layers
     with th.no_grad():
         for parameter, place in tensors.places:

@@ -80,17 +80,7 @@ def turn_into_slopes(
     by_log: float,
     by_entropy: float,
 ) -> None:
-    """Derivatives by the logits of what depends on them in two ways, in place of probabilities.
-
-    Args:
-        probabilities: what `fill_probabilities` has left, shape (n,).
-        logits: the outputs of the network.
-        normalizer: their `log_normalizer`.
-        entropy: of the distribution.
-        action: the action taken.
-        by_log: derivative by the logarithm of its probability.
-        by_entropy: derivative by the entropy.
-    """
+    """Derivatives by the logits of what depends on them in two ways, in place of probabilities."""
     for k in range(len(logits)):
         probability = float(probabilities[k])
         surplus = float(logits[k]) - normalizer + entropy
@@ -102,43 +92,25 @@ def turn_into_slopes(
 
 
 class Rollout(NamedTuple):
-    """The library's rollout buffer but for observations: T steps of E environments.
+    """The library's rollout buffer but for observations: T steps of E environments."""
 
-    Attributes:
-        actions: shape (T, E, 1).
-        rewards: shape (T, E).
-        episode_starts: 1 where an episode began with the observation, shape (T, E).
-        values: of the observations, shape (T, E).
-        log_probs: of the actions, shape (T, E).
-        advantages: shape (T, E).
-        returns: what the values are to be, shape (T, E).
-    """
-
-    actions: Ints
-    rewards: Singles
-    episode_starts: Singles
-    values: Singles
-    log_probs: Singles
-    advantages: Singles
-    returns: Singles
+    actions: Ints  # shape (T, E, 1)
+    rewards: Singles  # shape (T, E)
+    episode_starts: Singles  # 1 where an episode began with the observation, shape (T, E)
+    values: Singles  # of the observations, shape (T, E)
+    log_probs: Singles  # of the actions, shape (T, E)
+    advantages: Singles  # shape (T, E)
+    returns: Singles  # what the values are to be, shape (T, E)
 
 
 class RolloutMemory(NamedTuple):
-    """What minibatches are taken from, by reference.
+    """What minibatches are taken from, by reference."""
 
-    Attributes:
-        observations: shape (T, E, d); numbers of states have d = 1.
-        rollout: the rest of the buffer.
-        order: numbers of the rollout's steps, shuffled, shape (T * E,).
-        batch: what is filled, a `RolloutMinibatch`.
-        one_hot: whether observations are numbers of states.
-    """
-
-    observations: Any
-    rollout: Rollout
-    order: Ints
-    batch: Any
-    one_hot: int
+    observations: Any  # shape (T, E, d); numbers of states have d = 1
+    rollout: Rollout  # the rest of the buffer
+    order: Ints  # numbers of the rollout's steps, shuffled, shape (T * E,)
+    batch: Any  # what is filled, a `RolloutMinibatch`
+    one_hot: int  # whether observations are numbers of states
 
 
 @kernel
@@ -228,37 +200,19 @@ LOSSES = np.dtype(
 
 
 class RolloutMinibatch(NamedTuple):
-    """Steps that are learnt from at once.
+    """Steps that are learnt from at once."""
 
-    Attributes:
-        states: observations, of B rows.
-        actions: shape (B,).
-        log_probs: of the actions when they were taken, shape (B,).
-        advantages: shape (B,).
-        returns: what the values are to be, shape (B,).
-        values: what they were, shape (B,).
-    """
-
-    states: Inputs
-    actions: Ints
-    log_probs: Singles
-    advantages: Singles
-    returns: Singles
-    values: Singles
+    states: Inputs  # observations, of B rows
+    actions: Ints  # shape (B,)
+    log_probs: Singles  # of the actions when they were taken, shape (B,)
+    advantages: Singles  # shape (B,)
+    returns: Singles  # what the values are to be, shape (B,)
+    values: Singles  # what they were, shape (B,)
 
 
 @kernel
 def learn_from_rollout_minibatch(learner: Any, n_rows: float, learning_rate: float) -> int:
-    """Take one step of gradient descent on the first ``n_rows`` rows of `learner.batch`.
-
-    Args:
-        learner: both networks, the optimizer and the minibatch.
-        n_rows: number of rows.
-        learning_rate: of the optimizer.
-
-    Returns:
-        0 where the policy has moved too far already, and nothing was done; otherwise 1.
-    """
+    """Take one step of gradient descent on the first ``n_rows`` rows of `learner.batch`."""
     batch, rules, losses = learner.batch, learner.rules[0], learner.losses[0]
     n = int(n_rows)
     if rules.normalize_advantage and n > 1:
@@ -386,55 +340,30 @@ PLACE = np.dtype(
 
 
 class PolicyLearner(NamedTuple):
-    """Networks of action probabilities and of values as compiled functions see them, by reference.
+    """Networks of action probabilities and of values, as compiled functions see them."""
 
-    Attributes:
-        rules: a record of type `RULES`, alone in an array.
-        place: one of type `PLACE`, likewise.
-        losses: one of type `LOSSES`, likewise.
-        policy: the shape of the one network.
-        value: the shape of the other.
-        flat: the parameters of both.
-        gradient: for work, as long.
-        optimizer: what moves the parameters.
-        rollout: what has been done, and come of it.
-        pick: the address of `pick_steps`, which goes by the type of observations.
-        memory: that of what it takes steps from.
-        starts: whether the present observations begin episodes, shape (E,).
-        last_values: values of what the rollout ends with, shape (E,).
-        improve: the address of `learn_from_rollout_minibatch`.
-        order: numbers of the rollout's steps, to be shuffled, shape (T * E,).
-        batch: the minibatch.
-        policy_outputs: for what the network puts out for the minibatch.
-        policy_errors: for derivatives.
-        value_outputs: as for the policy.
-        value_errors: as for the policy.
-        single: one observation, to act on.
-        rng: a handle of the agent's generator, alone in an array.
-    """
-
-    rules: NDArray[np.void]
-    place: NDArray[np.void]
-    losses: NDArray[np.void]
-    policy: Layers
-    value: Layers
-    flat: Singles
-    gradient: Singles
-    optimizer: Optimizer
-    rollout: Rollout
-    pick: np.uintp
-    memory: np.uintp
-    starts: Singles
-    last_values: Singles
-    improve: np.uintp
-    order: Ints
-    batch: RolloutMinibatch
-    policy_outputs: Singles
-    policy_errors: Singles
-    value_outputs: Singles
-    value_errors: Singles
-    single: Inputs
-    rng: NDArray[np.void]
+    rules: NDArray[np.void]  # a record of type `RULES`, alone in an array
+    place: NDArray[np.void]  # one of type `PLACE`, likewise
+    losses: NDArray[np.void]  # one of type `LOSSES`, likewise
+    policy: Layers  # the shape of the one network
+    value: Layers  # the shape of the other
+    flat: Singles  # the parameters of both
+    gradient: Singles  # for work, as long
+    optimizer: Optimizer  # what moves the parameters
+    rollout: Rollout  # what has been done, and come of it
+    pick: np.uintp  # the address of `pick_steps`, which goes by the type of observations
+    memory: np.uintp  # that of what it takes steps from
+    starts: Singles  # whether the present observations begin episodes, shape (E,)
+    last_values: Singles  # values of what the rollout ends with, shape (E,)
+    improve: np.uintp  # the address of `learn_from_rollout_minibatch`
+    order: Ints  # numbers of the rollout's steps, to be shuffled, shape (T * E,)
+    batch: RolloutMinibatch  # the minibatch
+    policy_outputs: Singles  # for what the network puts out for the minibatch
+    policy_errors: Singles  # for derivatives
+    value_outputs: Singles  # as for the policy
+    value_errors: Singles  # as for the policy
+    single: Inputs  # one observation, to act on
+    rng: NDArray[np.void]  # a handle of the agent's generator, alone in an array
 
 
 @kernel
@@ -459,16 +388,7 @@ def choose_randomly(learner: Any, _: float, __: float) -> int:
 
 @kernel
 def train(learner: Any, remaining: float, learning_rate: float) -> int:
-    """Learn from the whole rollout as often as there are epochs.
-
-    Args:
-        learner: with the advantages of the rollout.
-        remaining: share of the training that is left.
-        learning_rate: of the optimizer.
-
-    Returns:
-        The number of minibatches.
-    """
+    """Learn from the whole rollout as often as there are epochs."""
     place, rules = learner.place[0], learner.rules[0]
     place.step, place.remaining = 0, remaining
     place.n_rollouts += 1
@@ -493,11 +413,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
 
 @inlined
 def learn_for_an_epoch(learner: Any, learning_rate: float) -> tuple[int, bool]:
-    """Learn from all of the rollout once.
-
-    Returns:
-        The number of minibatches, and False where the policy has moved too far.
-    """
+    """Learn from all of the rollout once."""
     place, losses = learner.place[0], learner.losses[0]
     n_steps, size = len(learner.order), len(learner.batch.actions)
     place.kl, n_batches, goes_on = 0.0, 0, True
@@ -518,25 +434,15 @@ def learn_for_an_epoch(learner: Any, learning_rate: float) -> tuple[int, bool]:
 
 
 class PolicyAgent(NamedTuple):
-    """What the compiled loop asks.
+    """What the compiled loop asks."""
 
-    Attributes:
-        learner: a reference to a `PolicyLearner`.
-        memory: one to the `RolloutMemory` that it learns from.
-        seen: how observations are read, of `agents.networks.observations`.
-        choose: the address of `choose_randomly`.
-        evaluate: that of `evaluate`.
-        estimate: that of `estimate_advantages`.
-        train: that of `train`.
-    """
-
-    learner: Any
-    memory: Any
-    seen: Any
-    choose: np.uintp
-    evaluate: np.uintp
-    estimate: np.uintp
-    train: np.uintp
+    learner: Any  # a reference to a `PolicyLearner`
+    memory: Any  # one to the `RolloutMemory` that it learns from
+    seen: Any  # how observations are read, of `agents.networks.observations`
+    choose: np.uintp  # the address of `choose_randomly`
+    evaluate: np.uintp  # that of `evaluate`
+    estimate: np.uintp  # that of `estimate_advantages`
+    train: np.uintp  # that of `train`
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:

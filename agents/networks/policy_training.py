@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from itertools import chain
+import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import Schedule
 from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
 from agents.common.callbacks import NEVER, Horizon
 from agents.common.schedules import ScheduleRow
 from agents.compiled.generators import handles_of
 from agents.compiled.learning_algorithm import compiled_schedule
+from agents.compiled.worlds import NotCompilable
 from agents.networks.engine import NOWHERE, NetworkTraining, record_of
+from agents.networks.engine_setting import CompiledNetworks, Work, work_of
 from agents.networks.observations import Numbers
 from agents.networks.perceptron import Singles, make_inputs, make_outputs, n_parameters
 from agents.networks.policy_learner import (
@@ -39,10 +43,8 @@ from agents.networks.policy_learner import (
     pick_steps,
     train,
 )
-from agents.networks.torch_bridge import Network, Reference, address_of, network_of, shared_tensors
+from agents.networks.torch_bridge import Network, Reference, address_of, network_of
 from mdp.array_types import Bools
-
-# PPO and A2C on compiled code.
 
 # How far a number may move that nothing bounds.
 UNBOUNDED = 1e30
@@ -51,43 +53,19 @@ UNBOUNDED = 1e30
 _MOST_ROLLOUTS = 10_000
 
 
-def policy_networks(policy: Any, seen: Any) -> tuple[Network, Network]:
-    """The networks of action probabilities and of values, in the order of the flat vector.
-
-    Raises:
-        NotCompilable: if one is no multilayer perceptron.
-    """
-    one_hot, extractor = isinstance(seen, Numbers), policy.mlp_extractor
-    actor = network_of(chain(extractor.policy_net, [policy.action_net]), 0, one_hot=one_hot)
-    critic = network_of(
-        chain(extractor.value_net, [policy.value_net]),
-        n_parameters(actor.layers),
-        one_hot=one_hot,
-    )
-    return actor, critic
-
-
-@contextmanager
-def policy_training(agent: Any, seen: Any) -> Iterator[PolicyTraining]:
-    """Let the agent's networks and its optimizer lie in the memory of compiled code for a while."""
-    with shared_tensors(agent.policy, policy_networks(agent.policy, seen)) as tensors:
-        yield PolicyTraining(agent, seen, tensors)
-
-
 class PolicyTraining(NetworkTraining):
     """PPO or A2C in training; of its networks the first gives action probabilities."""
 
     # The library's rollouts take what remains from the steps to do.
     heeds_budgets = False
-    improves_by = learn_from_rollout_minibatch
 
-    def _make_learner(self) -> PolicyLearner:
-        agent, tensors = self.agent, self.tensors
-        actor, critic = (network.layers for network in tensors.networks)
+    def __init__(self, agent: Any, seen: Any) -> None:
+        super().__init__(agent, seen)
+        actor, critic = (network.layers for network in self.networks)
         n_steps = agent.n_steps * agent.n_envs
         size = min(agent.minibatch_size or n_steps, n_steps)
         rows = max(size, agent.n_envs)
-        flat = tensors.trained.vector
+        flat = self.trained.vector
         self.recorded, self.place = 0, record_of(PLACE)
         batch = RolloutMinibatch(
             make_inputs(actor, size),
@@ -98,7 +76,7 @@ class PolicyTraining(NetworkTraining):
         observations = agent.rollout_buffer.observations
         observations = observations.reshape(*observations.shape[:2], -1)
         self.memory = Reference(RolloutMemory(observations, rollout, order, batch, actor.one_hot))
-        return PolicyLearner(
+        learner = PolicyLearner(
             self._rules(self._bound_now),
             self.place,
             record_of(LOSSES),
@@ -106,7 +84,7 @@ class PolicyTraining(NetworkTraining):
             critic,
             flat,
             np.zeros_like(flat),
-            tensors.take_over(),
+            self.optimizer.compiled,
             rollout,
             address_of(pick_steps, self.memory),
             np.uintp(self.memory.address),
@@ -122,6 +100,7 @@ class PolicyTraining(NetworkTraining):
             make_inputs(actor, 1),
             handles_of([agent.rng]),
         )
+        self.begin(learner, learn_from_rollout_minibatch)
 
     def _rules(self, bound: Callable[[Schedule | None], ScheduleRow]) -> Any:
         agent = self.agent
@@ -149,6 +128,7 @@ class PolicyTraining(NetworkTraining):
         return _bound(FloatSchedule(schedule(self.agent._current_progress_remaining)))
 
     def read_settings(self) -> None:
+        """Take over what a callback has changed."""
         self.read_generator()
         self.read_tensors()
         self.held.rules[:] = self._rules(_bound)
@@ -169,21 +149,25 @@ class PolicyTraining(NetworkTraining):
         )
 
     def in_loop(self) -> PolicyAgent:
+        """What the compiled loop asks."""
         functions = (choose_randomly, evaluate, estimate_advantages, train)
         addresses = (address_of(function, self.learner) for function in functions)
         return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
 
     def schedules(self) -> dict[str, Schedule]:
+        """What compiled code works out after each step, by the names in its record."""
         return {"learning_rate": self.agent.lr_schedule}
 
     def take_over_progress(self, remaining: float) -> None:
-        """That of the end of the last rollout."""
+        """Let the agent know how much of the training remained at the end of the last rollout."""
         self.agent._current_progress_remaining = float(self.place["remaining"][0])
 
     def give_up_rollout(self) -> None:
+        """Forget how much was collected since the last training."""
         self.place["step"] = self.place["n_rollouts"] = 0
 
     def read(self) -> None:
+        """Begin where the agent is."""
         agent, place = self.agent, self.place
         place["step"] = agent.collected
         place["remaining"] = agent._current_progress_remaining
@@ -191,6 +175,7 @@ class PolicyTraining(NetworkTraining):
         self.held.starts[:] = agent._last_episode_starts
 
     def write(self) -> None:
+        """Let the agent know where compiled code is."""
         agent, place = self.agent, self.place[0]
         agent._n_updates = int(place["n_updates"])
         agent.collected = int(place["step"])
@@ -205,6 +190,7 @@ class PolicyTraining(NetworkTraining):
         return -(-(begun + super().until_end(total_timesteps)) // whole) * whole - begun
 
     def until_log(self, log_interval: int | None) -> Horizon:
+        """When something is logged next."""
         in_rollout = self.agent.n_steps - int(self.place["step"][0])
         if log_interval is None:
             return Horizon(NEVER, NEVER)
@@ -221,13 +207,16 @@ class PolicyTraining(NetworkTraining):
 
     @property
     def is_rollout_over(self) -> bool:
+        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
         return bool(self.place["step"][0] == self.agent.n_steps)
 
     def until_rollout_end(self) -> Horizon:
+        """When a rollout ends that is to wait."""
         in_rollout = self.agent.n_steps - int(self.place["step"][0])
         return Horizon(in_rollout if self.waits else NEVER, NEVER)
 
     def learn_from_rollout(self, remaining: float) -> None:
+        """Learn from the rollout that waits, with that share of the training left."""
         train(self.learner, remaining, float(self.agent.lr_schedule(remaining)))
 
     def before_training(self, log_interval: int | None) -> None:
@@ -249,6 +238,7 @@ class PolicyTraining(NetworkTraining):
         self.record()
 
     def record(self) -> None:
+        """Hand what the last training has given to the agent's logger."""
         agent, place = self.agent, self.place[0]
         if place["n_rollouts"] == self.recorded:
             return
@@ -275,23 +265,12 @@ class PolicyTraining(NetworkTraining):
 
 
 def _bound(schedule: Schedule | None) -> ScheduleRow:
-    """The schedule of a bound as compiled code reads it.
-
-    Raises:
-        NotCompilable: if it is a Python function.
-    """
+    """The schedule of a bound as compiled code reads it."""
     return compiled_schedule(FloatSchedule(UNBOUNDED) if schedule is None else schedule)
 
 
-# Rollouts of environments in Python, with compiled acting, in the library's order of events.
-
-
 def collect_rollout(training: PolicyTraining, env: VecEnv, callback: BaseCallback) -> bool:
-    """Fill the rollout buffer, once callbacks have been told that it begins.
-
-    Returns:
-        False once a callback asks to stop.
-    """
+    """Fill the rollout buffer, once callbacks have been told that it begins."""
     agent, held, buffer = training.agent, training.held, training.agent.rollout_buffer
     agent.collected = 0
     training.read()
@@ -321,7 +300,7 @@ def _act(training: PolicyTraining, step: int) -> Any:
     actions = np.zeros(training.agent.n_envs, np.int64)
     training.place["step"] = step
     training.read_generator()
-    training.tensors.trained.take_over()
+    training.trained.take_over()
     training.show(training.agent._last_obs)
     act_on_rows(training.learner, training.shown, actions)
     training.memory.held.observations[step] = training.shown
@@ -354,3 +333,84 @@ def _cut_off(training: PolicyTraining, dones: Bools, infos: list[dict[str, Any]]
             evaluate_rows(training.learner, shown, values)
             lost[i] = np.float32(training.agent.gamma) * values[0]
     return lost
+
+
+class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
+    """What PPO and A2C share; `CompiledNetworks` says what the argument ``engine`` does."""
+
+    training_kind = PolicyTraining
+    _own = (*CompiledNetworks._own, "collected")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.collected = 0  # steps of the rollout that the compiled loop has under way
+        super().__init__(*args, **kwargs)
+
+    @property
+    def minibatch_size(self) -> int | None:
+        """Steps that are learnt from at once; None for all of a rollout."""
+        return getattr(self, "batch_size", None)
+
+    @property
+    def is_within_rollout(self) -> bool:
+        return self.collected > 0
+
+    def _check_own(self) -> None:
+        if type(self.rollout_buffer) is not RolloutBuffer:
+            raise NotCompilable("its rollout buffer is of another kind")
+
+    def _parts(self) -> list[list[Any]]:
+        """The bodies and heads of the networks of action probabilities and of values."""
+        policy: Any = self.policy
+        extractor = policy.mlp_extractor
+        return [
+            [extractor.policy_net, policy.action_net],
+            [extractor.value_net, policy.value_net],
+        ]
+
+    def shared_networks(self, seen: Any) -> tuple[list[Network], list[Network]]:
+        one_hot = isinstance(seen, Numbers)
+        (body, head), (value_body, value_head) = self._parts()
+        actor = network_of([*body, head], 0, one_hot=one_hot)
+        start = n_parameters(actor.layers)
+        critic = network_of([*value_body, value_head], start, one_hot=one_hot)
+        return [actor, critic], []
+
+    def _work_of(self, n_steps: float) -> Work:
+        rollout = self.n_steps * self.n_envs
+        batch_size = self.minibatch_size or rollout
+        n_rollouts = math.ceil(n_steps / rollout)
+        n_updates = n_rollouts * getattr(self, "n_epochs", 1) * math.ceil(rollout / batch_size)
+        return work_of(
+            "policy",
+            [nn.ModuleList(parts) for parts in self._parts()],
+            self.observation_space,
+            n_rollouts * rollout,
+            self.n_envs,
+            n_updates,
+            batch_size,
+        )
+
+    def _schedules(self) -> list[Schedule]:
+        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
+        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fill the rollout buffer; False once a callback asks to stop."""
+        if not self._sharing:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        rollout_buffer.pos, rollout_buffer.full = 0, False
+        callback.on_rollout_start()
+        return collect_rollout(self._shared_training(), env, callback)
+
+    def train(self) -> None:
+        """Learn from the rollout buffer."""
+        if self._sharing:
+            self._shared_training().train()
+        else:
+            super().train()

@@ -32,65 +32,38 @@ from mdp.array_types import Floats, Ints
 
 
 class Replay(NamedTuple):
-    """Transitions of E environments in rings of N places.
+    """Transitions of E environments in rings of N places."""
 
-    Attributes:
-        observations: shape (N, E, d); numbers of states have d = 1.
-        next_observations: what followed, before any reset, likewise.
-        actions: shape (N, E, 1).
-        rewards: shape (N, E).
-        dones: 1 where the episode ended, shape (N, E).
-        timeouts: 1 where it ended by its time limit alone, shape (N, E).
-    """
-
-    observations: Any
-    next_observations: Any
-    actions: Ints
-    rewards: Singles
-    dones: Singles
-    timeouts: Singles
+    observations: Any  # shape (N, E, d); numbers of states have d = 1
+    next_observations: Any  # what followed, before any reset, likewise
+    actions: Ints  # shape (N, E, 1)
+    rewards: Singles  # shape (N, E)
+    dones: Singles  # 1 where the episode ended, shape (N, E)
+    timeouts: Singles  # 1 where it ended by its time limit alone, shape (N, E)
 
 
 class Minibatch(NamedTuple):
-    """Transitions that are learnt from at once.
+    """Transitions that are learnt from at once."""
 
-    Attributes:
-        states: observations, of B rows.
-        next_states: what followed.
-        actions: shape (B,).
-        rewards: discounted sums of the rewards in between, shape (B,).
-        discounts: factor of the value of what followed, 0 where nothing does, shape (B,).
-    """
-
-    states: Inputs
-    next_states: Inputs
-    actions: Ints
-    rewards: Singles
-    discounts: Singles
+    states: Inputs  # observations, of B rows
+    next_states: Inputs  # what followed
+    actions: Ints  # shape (B,)
+    rewards: Singles  # discounted sums of the rewards in between, shape (B,)
+    discounts: Singles  # factor of the value of what followed, 0 where nothing does, shape (B,)
 
 
 class Memory(NamedTuple):
-    """What minibatches are drawn from, by reference.
+    """What minibatches are drawn from, by reference."""
 
-    Attributes:
-        replay: the transitions.
-        batch: what is filled.
-        place: says where the next transition will lie, and whether the ring is full.
-        rules: with the discount factor, the number of steps and what VecNormalize does.
-        centre: what it takes from observations, shape (d,).
-        spread: what it divides them by, shape (d,).
-        rng: a handle of the agent's generator, alone in an array.
-        one_hot: whether observations are numbers of states.
-    """
-
-    replay: Replay
-    batch: Minibatch
-    place: NDArray[np.void]
+    replay: Replay  # the transitions
+    batch: Minibatch  # what is filled
+    place: NDArray[np.void]  # says where the next transition will lie, and whether the ring is full
+    # with the discount factor, the number of steps and what VecNormalize does
     rules: NDArray[np.void]
-    centre: Floats
-    spread: Floats
-    rng: NDArray[np.void]
-    one_hot: int
+    centre: Floats  # what it takes from observations, shape (d,)
+    spread: Floats  # what it divides them by, shape (d,)
+    rng: NDArray[np.void]  # a handle of the agent's generator, alone in an array
+    one_hot: int  # whether observations are numbers of states
 
 
 @inlined
@@ -173,14 +146,6 @@ def learn_from_minibatch(learner: Any, learning_rate: float, _: float) -> int:
     """Take one step of gradient descent on `learner.batch`.
 
     The loss before it is added to ``place.losses``: Huber's, or half the squared error.
-
-    Args:
-        learner: both networks, the optimizer and the minibatch.
-        learning_rate: of the optimizer.
-        _: nothing; what is called by its address takes two numbers, whoever learns.
-
-    Returns:
-        The number of rows.
     """
     layers, batch, rules = learner.layers, learner.batch, learner.rules[0]
     n = len(batch.actions)
@@ -283,45 +248,25 @@ PLACE = np.dtype(
 
 
 class QLearner(NamedTuple):
-    """A network of action values as compiled functions see it, by reference.
+    """A network of action values as compiled functions see it, by reference."""
 
-    Attributes:
-        rules: a record of type `RULES`, alone in an array.
-        place: one of type `PLACE`, likewise.
-        layers: the shape of the network.
-        flat: its parameters.
-        target: those of its lagging copy.
-        gradient: for work, as long.
-        optimizer: what moves the parameters.
-        draw: the address of `draw_minibatch`, which goes by the type of observations.
-        memory: that of what it draws from.
-        improve: the address of `learn_from_minibatch`.
-        batch: the minibatch.
-        outputs: for what the network puts out for the minibatch.
-        next_outputs: for what is put out for its next states.
-        errors: for derivatives.
-        single: one observation, to act on.
-        single_outputs: for what is put out for it.
-        rng: a handle of the agent's generator, alone in an array.
-    """
-
-    rules: NDArray[np.void]
-    place: NDArray[np.void]
-    layers: Layers
-    flat: Singles
-    target: Singles
-    gradient: Singles
-    optimizer: Optimizer
-    draw: np.uintp
-    memory: np.uintp
-    improve: np.uintp
-    batch: Minibatch
-    outputs: Singles
-    next_outputs: Singles
-    errors: Singles
-    single: Inputs
-    single_outputs: Singles
-    rng: NDArray[np.void]
+    rules: NDArray[np.void]  # a record of type `RULES`, alone in an array
+    place: NDArray[np.void]  # one of type `PLACE`, likewise
+    layers: Layers  # the shape of the network
+    flat: Singles  # its parameters
+    target: Singles  # those of its lagging copy
+    gradient: Singles  # for work, as long
+    optimizer: Optimizer  # what moves the parameters
+    draw: np.uintp  # the address of `draw_minibatch`, which goes by the type of observations
+    memory: np.uintp  # that of what it draws from
+    improve: np.uintp  # the address of `learn_from_minibatch`
+    batch: Minibatch  # the minibatch
+    outputs: Singles  # for what the network puts out for the minibatch
+    next_outputs: Singles  # for what is put out for its next states
+    errors: Singles  # for derivatives
+    single: Inputs  # one observation, to act on
+    single_outputs: Singles  # for what is put out for it
+    rng: NDArray[np.void]  # a handle of the agent's generator, alone in an array
 
 
 @kernel
@@ -344,21 +289,13 @@ def train(learner: Any, n_updates: float, learning_rate: float) -> int:
 
 
 class QAgent(NamedTuple):
-    """What the compiled loop asks.
+    """What the compiled loop asks."""
 
-    Attributes:
-        learner: a reference to a `QLearner`.
-        memory: one to the `Memory` that it learns from.
-        seen: how observations are read, of `agents.networks.observations`.
-        choose: the address of `choose_greedily`.
-        train: that of `train`.
-    """
-
-    learner: Any
-    memory: Any
-    seen: Any
-    choose: np.uintp
-    train: np.uintp
+    learner: Any  # a reference to a `QLearner`
+    memory: Any  # one to the `Memory` that it learns from
+    seen: Any  # how observations are read, of `agents.networks.observations`
+    choose: np.uintp  # the address of `choose_greedily`
+    train: np.uintp  # that of `train`
 
     @inlined
     def act(self, env: Any, progress: Any) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -17,14 +15,9 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from agents.common.callbacks import NEVER, Horizon
 from agents.compiled.generators import handles_of
+from agents.compiled.worlds import NotCompilable
 from agents.networks.engine import NOWHERE, NetworkTraining, record_of
-from agents.networks.engine_setting import (
-    STEPS_OF_EPISODE,
-    CompiledNetworks,
-    Work,
-    check_q_agent,
-    work_of,
-)
+from agents.networks.engine_setting import STEPS_OF_EPISODE, CompiledNetworks, Work, work_of
 from agents.networks.observations import Numbers
 from agents.networks.perceptron import make_inputs, make_outputs
 from agents.networks.q_learner import (
@@ -44,48 +37,21 @@ from agents.networks.q_learner import (
     learn_from_minibatch,
     train,
 )
-from agents.networks.torch_bridge import (
-    Network,
-    Reference,
-    address_of,
-    check_optimizer,
-    network_of,
-    shared_tensors,
-)
+from agents.networks.torch_bridge import Network, Reference, address_of, network_of
 from mdp.array_types import Ints
 
-# DQN and its kin on compiled code.
-
 _TARGETS = {"double_q": DOUBLE, "online": ONLINE_NETWORK, "target": TARGET_NETWORK}
-
-
-def q_network(network: Any, seen: Any) -> Network:
-    """A network of action values.
-
-    Raises:
-        NotCompilable: if it is no multilayer perceptron.
-    """
-    return network_of(network.q_net, 0, one_hot=isinstance(seen, Numbers))
-
-
-@contextmanager
-def q_training(agent: Any, seen: Any) -> Iterator[QTraining]:
-    """Let the agent's networks and its optimizer lie in the memory of compiled code for a while."""
-    networks = ([q_network(network, seen)] for network in (agent.q_net, agent.q_net_target))
-    with shared_tensors(agent.policy, *networks) as tensors:
-        yield QTraining(agent, seen, tensors)
 
 
 class QTraining(NetworkTraining):
     """DQN, double DQN or deep Q-learning in training."""
 
-    heeds_budgets = True
-    improves_by = learn_from_minibatch
+    heeds_budgets = True  # a number of episodes to train for moves the schedules
 
-    def _make_learner(self) -> QLearner:
-        agent, tensors = self.agent, self.tensors
+    def __init__(self, agent: Any, seen: Any) -> None:
+        super().__init__(agent, seen)
         self.recorded = agent._n_updates
-        layers, n = tensors.networks[0].layers, agent.batch_size
+        layers, n = self.networks[0].layers, agent.batch_size
         rules, self.place = self._rules(), record_of(PLACE, decided_at=-1)
         batch = Minibatch(
             make_inputs(layers, n),
@@ -99,15 +65,15 @@ class QTraining(NetworkTraining):
         self.memory = Reference(
             Memory(self._replay(), batch, self.place, rules, centre, spread, rng, layers.one_hot)
         )
-        flat = tensors.trained.vector
-        return QLearner(
+        flat = self.trained.vector
+        learner = QLearner(
             rules,
             self.place,
             layers,
             flat,
-            tensors.lagging.vector,
+            self.lagging.vector,
             np.zeros_like(flat),
-            tensors.take_over(),
+            self.optimizer.compiled,
             address_of(draw_minibatch, self.memory),
             np.uintp(self.memory.address),
             NOWHERE,
@@ -119,6 +85,7 @@ class QTraining(NetworkTraining):
             make_outputs(layers, 1),
             rng,
         )
+        self.begin(learner, learn_from_minibatch)
 
     def _rules(self) -> Any:
         agent = self.agent
@@ -155,17 +122,20 @@ class QTraining(NetworkTraining):
         )
 
     def in_loop(self) -> QAgent:
+        """What the compiled loop asks."""
         learner = self.learner
         choose, learn = (address_of(function, learner) for function in (choose_greedily, train))
         return QAgent(learner, self.memory, self.seen, choose, learn)
 
     def schedules(self) -> dict[str, Schedule]:
+        """What compiled code works out after each step, by the names in its record."""
         return {
             "exploration": self.agent.exploration_schedule,
             "learning_rate": self.agent.lr_schedule,
         }
 
     def read_settings(self) -> None:
+        """Take over what a callback has changed."""
         self.read_generator()
         self.read_tensors()
         self.held.rules[:] = self._rules()
@@ -176,12 +146,15 @@ class QTraining(NetworkTraining):
             memory.spread[:] = np.sqrt(env.obs_rms.var + env.epsilon).ravel()
 
     def take_over_progress(self, remaining: float) -> None:
+        """Let the agent know how much of the training remains, after each step."""
         self.agent._current_progress_remaining = remaining
 
     def give_up_rollout(self) -> None:
+        """Forget how much was collected since the last training."""
         self.place["collected"] = self.place["collected_episodes"] = 0
 
     def read(self) -> None:
+        """Begin where the agent is."""
         agent, place = self.agent, self.place
         place["position"], place["full"] = agent.replay_buffer.pos, agent.replay_buffer.full
         place["n_calls"], place["n_updates"] = agent._n_calls, agent._n_updates
@@ -189,6 +162,7 @@ class QTraining(NetworkTraining):
         place["collected"], place["collected_episodes"] = agent.collected
 
     def write(self) -> None:
+        """Let the agent know where compiled code is."""
         agent, place = self.agent, self.place[0]
         buffer = agent.replay_buffer
         buffer.pos, buffer.full = int(place["position"]), bool(place["full"])
@@ -205,11 +179,13 @@ class QTraining(NetworkTraining):
         return -(-(begun + left) // whole) * whole - begun
 
     def until_log(self, log_interval: int | None) -> Horizon:
+        """When something is logged next."""
         if log_interval is None:
             return Horizon(NEVER, NEVER)
         return Horizon(NEVER, log_interval - self.agent._episode_num % log_interval)
 
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
+        """Let the agent know of episodes that have ended, and log where it is time to."""
         agent = self.agent
         agent.logger.record("rollout/exploration_rate", agent.exploration_rate)
         for _ in range(n_episodes):
@@ -221,7 +197,7 @@ class QTraining(NetworkTraining):
         """Actions for the agent's present observations, where environments are Python's."""
         self.read()
         self.read_generator()
-        self.tensors.trained.take_over()
+        self.trained.take_over()
         self.held.rules["learning_starts"] = learning_starts
         self.show(self.agent._last_obs)
         actions = np.zeros(len(self.shown), np.int64)
@@ -243,9 +219,11 @@ class QTraining(NetworkTraining):
 
     @property
     def is_rollout_over(self) -> bool:
+        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
         return bool(self.place["is_over"][0])
 
     def until_rollout_end(self) -> Horizon:
+        """When a rollout ends that is to wait."""
         place, rules = self.place[0], self.held.rules[0]
         if not self.waits:
             return Horizon(NEVER, NEVER)
@@ -254,11 +232,13 @@ class QTraining(NetworkTraining):
         return Horizon(int(rules["train_freq"] - place["collected"]), NEVER)
 
     def learn_from_rollout(self, remaining: float) -> None:
+        """Learn from the rollout that waits, with that share of the training left."""
         n_due, self.place["is_over"] = int(self.place["n_due"][0]), False
         if n_due:
             train(self.learner, float(n_due), float(self.agent.lr_schedule(remaining)))
 
     def record(self) -> None:
+        """Hand what the last training has given to the agent's logger."""
         self.agent.logger.record("rollout/exploration_rate", self.agent.exploration_rate)
         self._record_training()
 
@@ -286,38 +266,44 @@ def normalising_rules(env: VecNormalize | None) -> dict[str, Any]:
     }
 
 
-# What DQN and its kin share: training on compiled code.
-
-
 class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
-    """`CompiledNetworks` says what the argument ``engine`` does.
+    """What DQN and its kin share; `CompiledNetworks` says what the argument ``engine`` does."""
 
-    Attributes:
-        target_kind: where the value of the next state is taken from: the lagging copy, the same
-            for the action that the online network prefers, or the online network.
-        largest_error: from where on the loss is no longer a square.
-        collected: steps and episodes since the last training.
-    """
-
+    training_kind = QTraining
+    # Where the value of the next state is taken from: the lagging copy, the same for the action
+    # that the online network prefers, or the online network.
     target_kind: ClassVar[Literal["target", "double_q", "online"]] = "target"
-    largest_error: ClassVar[float] = 1.0
+    largest_error: ClassVar[float] = 1.0  # from where on the loss is no longer a square
 
     _training: QTraining | None
-    _shared_training: Callable[[], QTraining]
     _own = (*CompiledNetworks._own, "collected")
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self.collected = (0, 0)
+        self.collected = (0, 0)  # steps and episodes since the last training
         super().__init__(*args, **kwargs)
 
     @property
     def is_within_rollout(self) -> bool:
         return self.collected != (0, 0)
 
-    def _check_compilable(self) -> None:
-        check_q_agent(self)
-        check_optimizer(self.policy.optimizer)
-        q_network(self.q_net, self._seen_in_python())
+    def _check_own(self) -> None:
+        if getattr(self, "mask_actions", False):
+            raise NotCompilable("it masks actions")
+        buffer = self.replay_buffer
+        known = type(buffer) in {ReplayBuffer, NStepReplayBuffer}
+        if not known or buffer.optimize_memory_usage:  # type: ignore[union-attr]
+            raise NotCompilable("its replay buffer is of another kind")
+        train_freq: Any = self.train_freq
+        if self.n_envs > 1 and train_freq.unit == TrainFrequencyUnit.EPISODE:
+            raise NotCompilable("train_freq counts the episodes of several environments")
+
+    def shared_networks(self, seen: Any) -> tuple[list[Network], list[Network]]:
+        one_hot = isinstance(seen, Numbers)
+        ours, lagging = (
+            network_of(network.q_net, 0, one_hot=one_hot)
+            for network in (self.q_net, self.q_net_target)
+        )
+        return [ours], [lagging]
 
     def _work_of(self, n_steps: float) -> Work:
         train_freq: Any = self.train_freq
@@ -333,16 +319,10 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
     def _schedules(self) -> list[Schedule]:
         return [*super()._schedules(), self.exploration_schedule]
 
-    def _compiled_training(self, seen: Any) -> AbstractContextManager[QTraining]:
-        return q_training(self, seen)
-
-    def _acting_network(self, seen: Any) -> Network:
-        return q_network(self.q_net, seen)
-
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[NDArray[Any], NDArray[Any]]:
-        if self._sharing is None:
+        if not self._sharing:
             return super()._sample_action(learning_starts, action_noise, n_envs)
         actions = self._shared_training().act(learning_starts)
         return actions, actions
@@ -354,10 +334,10 @@ class CompiledQLearning(CompiledNetworks, stable_baselines3.DQN):
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """Take ``gradient_steps`` on batches of ``batch_size`` from the replay buffer."""
-        if self._sharing is None:
-            self._train_in_python(gradient_steps, batch_size)
-        else:
+        if self._sharing:
             self._shared_training().train(gradient_steps)
+        else:
+            self._train_in_python(gradient_steps, batch_size)
 
     def _train_in_python(self, gradient_steps: int, batch_size: int) -> None:
         """The same in the library's way, or the agent's own."""

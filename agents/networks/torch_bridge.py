@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -27,12 +26,14 @@ from stable_baselines3.common.sb2_compat.rmsprop_tf_like import RMSpropTFLike
 from torch import nn
 
 from agents.compiled.worlds import NotCompilable
-from agents.networks import perceptron
 from agents.networks.perceptron import (
     ADAM,
     ADAMW,
+    IDENTITY,
+    RELU,
     RMSPROP,
     RMSPROP_TENSORFLOW,
+    TANH,
     Layers,
     Optimizer,
     Singles,
@@ -41,25 +42,7 @@ from agents.networks.perceptron import (
 )
 from machine_code.compiling import internal
 
-# From networks and optimizers of Stable-Baselines3 to those of compiled code.
-
-# The classes, what they are here, and the attribute that holds their parameter.
-_ACTIVATIONS: dict[type[nn.Module], tuple[int, str | None]] = {
-    nn.Identity: (perceptron.IDENTITY, None),
-    nn.ReLU: (perceptron.RELU, None),
-    nn.Tanh: (perceptron.TANH, None),
-    nn.ELU: (perceptron.ELU, "alpha"),
-    nn.LeakyReLU: (perceptron.LEAKY_RELU, "negative_slope"),
-    nn.Sigmoid: (perceptron.SIGMOID, None),
-    nn.SELU: (perceptron.SELU, None),
-    nn.Softplus: (perceptron.SOFTPLUS, "beta"),
-    nn.SiLU: (perceptron.SILU, None),
-    nn.GELU: (perceptron.GELU, None),
-    nn.Mish: (perceptron.MISH, None),
-}
-
-# From here on Softplus takes its input for its output, which rounding does as well.
-_SOFTPLUS_THRESHOLD = 20
+_ACTIVATIONS: dict[type[nn.Module], int] = {nn.Identity: IDENTITY, nn.ReLU: RELU, nn.Tanh: TANH}
 
 # Settings of optimizers that compiled steps do not have, as they have to be.
 _PLAIN = {"amsgrad": False, "maximize": False, "momentum": 0, "centered": False}
@@ -68,68 +51,44 @@ _OPTIMIZERS = {th.optim.Adam, th.optim.AdamW, th.optim.RMSprop, RMSpropTFLike}
 
 @dataclass(frozen=True)
 class Network:
-    """A perceptron of the library.
-
-    Attributes:
-        linears: its layers, the first one first.
-        layers: the same as compiled code sees them.
-    """
+    """A perceptron of the library: its layers in order, and their shape for compiled code."""
 
     linears: Sequence[nn.Linear]
     layers: Layers
+
+    @property
+    def parameters(self) -> list[th.Tensor]:
+        """The weights and biases, in the order of the flat vector."""
+        return [p for linear in self.linears for p in (linear.weight, linear.bias)]
 
 
 def network_of(modules: Iterable[nn.Module], start: int, *, one_hot: bool) -> Network:
     """What linear layers with one activation function in between come to.
 
-    Args:
-        modules: the layers and functions, in order.
-        start: where its parameters begin in the flat vector.
-        one_hot: whether inputs are numbers that stand for one-hot vectors.
-
-    Raises:
-        NotCompilable: if it is anything else.
+    Its parameters begin at ``start`` of the flat vector. NotCompilable for anything else.
     """
     linears: list[nn.Linear] = []
-    functions: list[tuple[int, float]] = []
+    functions: list[int] = []
     for module in modules:
         if type(module) is nn.Linear and module.bias is not None:
             if len(linears) != len(functions):
                 raise NotCompilable("a network has linear layers without a function in between")
             linears.append(module)
-        elif len(functions) == len(linears) - 1:
-            functions.append(_activation(module))
+        elif len(functions) == len(linears) - 1 and type(module) in _ACTIVATIONS:
+            functions.append(_ACTIVATIONS[type(module)])
         else:
             raise NotCompilable(f"a network has a layer of {type(module).__name__}")
     if len(set(functions)) > 1:
         raise NotCompilable("a network has several activation functions")
     if len(functions) != len(linears) - 1:
         raise NotCompilable("a network ends with an activation function")
-    kind, slope = functions[0] if functions else (perceptron.IDENTITY, 0.0)
     sizes = [linears[0].in_features, *(linear.out_features for linear in linears)]
-    return Network(linears, make_layers(sizes, start, kind, slope, one_hot=one_hot))
-
-
-def _activation(module: nn.Module) -> tuple[int, float]:
-    if type(module) not in _ACTIVATIONS:
-        raise NotCompilable(f"a network has a layer of {type(module).__name__}")
-    kind, parameter = _ACTIVATIONS[type(module)]
-    if isinstance(module, nn.GELU) and module.approximate == "tanh":
-        kind = perceptron.FAST_GELU
-    if isinstance(module, nn.Softplus) and module.threshold != _SOFTPLUS_THRESHOLD:
-        raise NotCompilable(f"a network has a Softplus with a threshold of {module.threshold:g}")
-    slope = 0.0 if parameter is None else float(getattr(module, parameter))
-    if slope < 0:
-        raise NotCompilable(f"a network has a layer of {type(module).__name__} that falls")
-    return kind, slope
+    activation = functions[0] if functions else IDENTITY
+    return Network(linears, make_layers(sizes, start, activation, one_hot=one_hot))
 
 
 def check_optimizer(optimizer: th.optim.Optimizer) -> None:
-    """Make sure that compiled steps are those of the optimizer.
-
-    Raises:
-        NotCompilable: if they are not; the message says why.
-    """
+    """Make sure that compiled steps are those of the optimizer; NotCompilable says why not."""
     if type(optimizer) not in _OPTIMIZERS:
         raise NotCompilable(f"its optimizer is {type(optimizer).__name__}, not Adam or RMSprop")
     if len(optimizer.param_groups) != 1:
@@ -144,53 +103,30 @@ def check_optimizer(optimizer: th.optim.Optimizer) -> None:
         raise NotCompilable("its parameters are not in single precision")
 
 
-# The tensors of an agent's networks and of its optimizer, in memory that compiled code works on.
-#
 # While an agent trains, its tensors look into flat vectors, so that callbacks see at any time what
 # has been learnt, and what they change counts. Afterwards the tensors have memory of their own
-# again,
-# laid out as PyTorch does it.
+# again, laid out as PyTorch does it.
 
 # What an optimizer's group holds that compiled steps go by.
 _SETTINGS = ("betas", "alpha", "eps", "weight_decay", "decoupled_weight_decay")
 
 
 class FlatTensors:
-    """Tensors of linear layers that look into a flat vector.
-
-    Args:
-        networks: whose layers, one network after the other.
-
-    Attributes:
-        vector: all of the numbers.
-        places: the layers' parameters, each with its part of the vector in its shape.
-    """
+    """A flat vector for the parameters of networks, and for each its part, in its shape."""
 
     def __init__(self, networks: Sequence[Network]) -> None:
         self.vector: Singles = np.zeros(sum(n_parameters(n.layers) for n in networks), np.float32)
-        linears = [linear for network in networks for linear in network.linears]
-        self.places = list(self._places(linears))
-
-    def _places(self, linears: Sequence[nn.Linear]) -> Iterator[tuple[th.Tensor, th.Tensor]]:
+        self.places: list[tuple[th.Tensor, th.Tensor]] = []
         begin = 0
-        for linear in linears:
-            for parameter in (linear.weight, linear.bias):
-                end = begin + parameter.numel()
-                # Compiled code has weights as (inputs, outputs).
-                turned = self.vector[begin:end].reshape(tuple(parameter.shape)[::-1])
-                yield parameter, th.from_numpy(turned.T)
-                begin = end
-
-
-class SharedParameters(FlatTensors):
-    """The parameters of networks, in one flat vector."""
-
-    def __init__(self, networks: Sequence[Network]) -> None:
-        super().__init__(networks)
-        self.take_over()
+        for parameter in (p for network in networks for p in network.parameters):
+            end = begin + parameter.numel()
+            # Compiled code has weights as (inputs, outputs).
+            turned = self.vector[begin:end].reshape(tuple(parameter.shape)[::-1])
+            self.places.append((parameter, th.from_numpy(turned.T)))
+            begin = end
 
     def take_over(self) -> None:
-        """Copy those into the vector that lie elsewhere, as somebody has put them there."""
+        """Let those look into the vector that lie elsewhere, as somebody has put them there."""
         for parameter, place in self.places:
             if parameter.data_ptr() != place.data_ptr():
                 place.copy_(parameter.data)
@@ -203,24 +139,18 @@ class SharedParameters(FlatTensors):
 
 
 class SharedOptimizer:
-    """What the optimizer of a policy remembers, in flat vectors.
-
-    Args:
-        policy: the policy.
-        networks: those that are trained.
-    """
+    """What the optimizer of a policy remembers of the networks' parameters, in flat vectors."""
 
     def __init__(self, policy: Any, networks: Sequence[Network]) -> None:
         self.policy = policy
         self.networks = networks
-        self.parameters = [parameter for parameter, _ in FlatTensors(networks).places]
+        self.parameters = [p for network in networks for p in network.parameters]
         self._share()
 
     def current(self) -> Optimizer:
         """The optimizer as compiled code sees it; another one where somebody has changed it.
 
-        Raises:
-            NotCompilable: if it has become one that compiled code does not know.
+        NotCompilable if it has become one that compiled code does not know.
         """
         if self._made_from() != self.made_from:
             self.give_back()
@@ -265,7 +195,11 @@ class SharedOptimizer:
         group = optimizer.param_groups[0]
         settings = [group.get(name) for name in _SETTINGS]
         states = [optimizer.state.get(parameter, {}) for parameter in self.parameters]
-        memory = [_place_of(value) for state in states for value in state.values()]
+        memory = [
+            value.data_ptr() if isinstance(value, th.Tensor) else value
+            for state in states
+            for value in state.values()
+        ]
         trained = [parameter.requires_grad for parameter in self.parameters]
         return id(optimizer), settings, memory, trained
 
@@ -280,62 +214,6 @@ class SharedOptimizer:
             known.clear()
 
 
-class SharedTensors:
-    """All tensors of an agent that lie in the memory of compiled code.
-
-    Args:
-        policy: the agent's policy.
-        networks: those that are trained, in the order of the flat vector.
-        lagging: copies of them that lag behind.
-
-    Attributes:
-        networks: the same.
-        trained: the parameters of the networks.
-        lagging: those of the copies.
-        optimizer: what moves the networks.
-    """
-
-    def __init__(
-        self, policy: Any, networks: Sequence[Network], lagging: Sequence[Network] = ()
-    ) -> None:
-        self.networks = networks
-        self.trained, self.lagging = SharedParameters(networks), SharedParameters(lagging)
-        self.optimizer = SharedOptimizer(policy, networks)
-
-    def take_over(self) -> Optimizer:
-        """Let count what somebody has put in the place of tensors.
-
-        Returns:
-            The optimizer as compiled code sees it.
-
-        Raises:
-            ValueError: if it has become one that compiled code does not know.
-        """
-        self.trained.take_over()
-        self.lagging.take_over()
-        try:
-            return self.optimizer.current()
-        except NotCompilable as reason:
-            raise ValueError(f"engine: compiled cannot go on: {reason}") from None
-
-    def give_back(self) -> None:
-        """Let all have memory of their own."""
-        for part in (self.trained, self.lagging, self.optimizer):
-            part.give_back()
-
-
-@contextmanager
-def shared_tensors(
-    policy: Any, networks: Sequence[Network], lagging: Sequence[Network] = ()
-) -> Iterator[SharedTensors]:
-    """`SharedTensors` for a while."""
-    shared = SharedTensors(policy, networks, lagging)
-    try:
-        yield shared
-    finally:
-        shared.give_back()
-
-
 def in_rows(state: Any) -> Any:
     """What a ``state_dict`` holds, with tensors that lie in memory as the library lays them out."""
     if isinstance(state, dict):
@@ -343,10 +221,6 @@ def in_rows(state: Any) -> Any:
         copied.update({name: in_rows(value) for name, value in state.items()})
         return copied
     return state.contiguous() if isinstance(state, th.Tensor) else state
-
-
-def _place_of(value: Any) -> Any:
-    return value.data_ptr() if isinstance(value, th.Tensor) else value
 
 
 def _own_memory(state: dict[str, Any], kind: int) -> dict[str, Any]:
@@ -375,13 +249,10 @@ def _kind(optimizer: th.optim.Optimizer) -> tuple[int, tuple[str, ...]]:
 # Named tuples and functions that compiled functions are handed by address.
 #
 # LLVM optimises a function anew as a part of each that calls it, and Numba hands a named tuple on
-# as
-# all the numbers that its arrays are described by. With a learner of thirty arrays, four calls
-# below
-# the loop, compiling takes the better part of a minute. A reference is one address: compiled
+# as all the numbers that its arrays are described by. With a learner of thirty arrays, four calls
+# below the loop, compiling takes the better part of a minute. A reference is one address: compiled
 # functions read ``reference.name`` from there, as they would from the tuple. What learning comes to
 # lies behind an address as well, so that it is compiled by itself, and once for all environments.
-
 ir: Any = vars(cgutils)["ir"]  # llvmlite's, which comes with Numba
 
 # Numba ships no types.
@@ -394,26 +265,14 @@ WORD = 8
 
 
 class Reference:
-    """A named tuple of arrays and numbers, to be handed on by address.
-
-    Args:
-        held: the named tuple, whose parts may be such tuples as well; arrays stay where they are.
-
-    Attributes:
-        held: the same; its arrays live as long as the reference.
-        address: where compiled functions find it.
-        kind: Numba's type of the reference.
-
-    Raises:
-        TypeError: if a part is anything else.
-    """
+    """A named tuple of arrays and numbers, to be handed on by address."""
 
     def __init__(self, held: Any) -> None:
-        self.held = held
+        self.held = held  # the same; its arrays live as long as the reference
         self._words = np.array(list(_words(held)), dtype=np.int64)
-        self.address = int(self._words.ctypes.data)
+        self.address = int(self._words.ctypes.data)  # where compiled functions find it
         # To find it takes Numba longer than most functions that a reference is handed to.
-        self.kind = ReferenceType(typeof(held))
+        self.kind = ReferenceType(typeof(held))  # Numba's type of the reference
 
     def hold(self, held: Any) -> None:
         """Refer to another tuple of the same kind from now on, at the same address."""
@@ -447,19 +306,11 @@ def _n_words(kind: Any) -> int:
 
 
 class ReferenceType(types.Type):
-    """The type of a reference.
-
-    Args:
-        content: the type of what it holds.
-
-    Attributes:
-        content: the same.
-        types: the same, for what looks into the parts of types.
-    """
+    """The type of a reference."""
 
     def __init__(self, content: Any) -> None:
         self.content = content
-        self.types = (content,)
+        self.types = (content,)  # the same, for what looks into the parts of types
         super().__init__(name=f"Reference({content})")
 
 
@@ -501,12 +352,7 @@ def _read(context: Any, builder: Any, kind: Any, address: Any, name: str) -> Any
 
 
 def address_of(function: Any, reference: Reference) -> np.uintp:
-    """Where the machine code of a compiled function lies, for `call`.
-
-    Args:
-        function: of a reference and two floating-point numbers, with a whole number as its result.
-        reference: what it is to be called with.
-    """
+    """Where the machine code of a compiled function lies, for `call`."""
     arguments = reference.kind, types.float64, types.float64
     code = function.get_compile_result(types.int64(*arguments))
     name = code.fndesc.llvm_cfunc_wrapper_name

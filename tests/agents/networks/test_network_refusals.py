@@ -82,14 +82,7 @@ REFUSALS = {
         with_policy("ppo", activation_fn=nn.Hardtanh),
         "a network has a layer of Hardtanh",
     ),
-    "softer": (
-        with_policy("dqn", activation_fn=lambda: nn.Softplus(threshold=5)),
-        "a network has a Softplus with a threshold of 5",
-    ),
-    "falling": (
-        with_policy("dqn", activation_fn=lambda: nn.LeakyReLU(-0.1)),
-        "a network has a layer of LeakyReLU that falls",
-    ),
+    "ELU": (with_policy("dqn", activation_fn=nn.ELU), "a network has a layer of ELU"),
     "NAdam": (
         with_policy("ppo", optimizer_class=th.optim.NAdam),
         "its optimizer is NAdam, not Adam or RMSprop",
