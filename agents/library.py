@@ -22,8 +22,8 @@ from torch.nn.utils import clip_grad_norm_
 
 from agents.common.masks import check_masks_exist, checked_masks, present_masks
 from agents.networks.engine_setting import NetworkEngineChoice
-from agents.networks.policy_training import CompiledPolicyGradient
-from agents.networks.q_training import CompiledQLearning
+from agents.networks.policy_gradients import CompiledPolicyGradient
+from agents.networks.q_learning import CompiledQLearning
 from envs.wrappers import INFO_KEY
 from mdp.array_types import Bools
 

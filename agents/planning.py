@@ -36,7 +36,7 @@ from mdp.array_types import Bools, Ints
 class ActionTablePolicy(TablePolicy):
     """One action for each observation, or for each observation and number of steps left."""
 
-    # int64 of shape (m, S): with 1, 2, ... steps left; with more than m, the last row
+    # Int64 of shape (m, S): with 1, 2, ... steps left; with more than m, the last row.
     actions: th.Tensor
     horizon: th.Tensor  # steps of an episode, int64 of shape (); only looked at where m is above 1
 

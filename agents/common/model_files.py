@@ -46,13 +46,9 @@ from safe_files.files import (
 from safe_files.known_objects import check_values, load_tensors
 from safe_files.models import charged_tensors, hides
 
-# What a hand-written agent's zip holds beside its tables: plain JSON, never a pickle.
-#
 # `encode` turns the attributes of an agent into JSON, `decode` turns them back. An object of
-# another
-# kind is written as ``{"type": name, ...}`` and rebuilt from the fixed table here, so that reading
-# a
-# file can build nothing else.
+# another kind is written as ``{"type": name, ...}`` and rebuilt from the fixed table `CODECS`, so
+# that reading a file can build nothing else.
 
 TYPE = "type"
 
@@ -61,6 +57,9 @@ _MAX_VALUES = 10_000_000
 
 # Truth values and numbers of at most 64 bits, which JSON holds without loss.
 _ARRAY_DTYPE = re.compile(r"[<>|][biuf][1248]")
+
+# What building an object of the wrong values raises.
+_DAMAGE = (TypeError, LookupError, AttributeError, AssertionError, ArithmeticError, RecursionError)
 
 # What most of an agent's attributes are made of.
 _AS_THEY_ARE = frozenset({type(None), bool, int, float, str})
@@ -116,11 +115,8 @@ def decode(data: Any) -> Any:
     if data.keys() != {TYPE, *codec.fields}:
         raise ValueError(f"damaged {name} in an agent's file: its fields are {', '.join(data)}")
     try:
-        return codec.build(**{key: decode(item) for key, item in data.items() if key != TYPE})
-    except (
-        *(TypeError, LookupError, AttributeError, AssertionError, ArithmeticError),
-        RecursionError,
-    ) as error:
+        return codec.build(*(decode(data[key]) for key in codec.fields))
+    except _DAMAGE as error:
         raise ValueError(f"damaged {name} in an agent's file: {error}") from error
 
 
@@ -131,10 +127,11 @@ def _attributes(*names: str) -> dict[str, Callable[[Any], Any]]:
 def _space(cls: type, make: Callable[..., Any], **fields: Callable[[Any], Any]) -> Codec:
     """A space travels with its generator, so that it goes on sampling where it was."""
 
-    def build(rng: np.random.Generator | None, **values: Any) -> Any:
+    def build(*values: Any) -> Any:
+        *arguments, rng = values
         if not (rng is None or isinstance(rng, np.random.Generator)):
             raise TypeError(f"{rng!r} is no generator")
-        space = make(**values)
+        space = make(*arguments)
         space._np_random = rng
         return space
 
@@ -143,14 +140,6 @@ def _space(cls: type, make: Callable[..., Any], **fields: Callable[[Any], Any]) 
 
 def _pairs(mapping: Mapping[Any, Any]) -> list[list[Any]]:
     return [list(pair) for pair in mapping.items()]
-
-
-def _dict(pairs: list[list[Any]]) -> dict[Any, Any]:
-    return dict(pairs)
-
-
-def _tuple(items: list[Any]) -> tuple[Any, ...]:
-    return tuple(items)
 
 
 def _generator_state(generator: np.random.Generator) -> Mapping[str, Any]:
@@ -173,7 +162,7 @@ def _array_dtype(array: np.ndarray[Any, Any]) -> str:
     return dtype
 
 
-def _array(dtype: str, values: list[Any], shape: tuple[int, ...]) -> np.ndarray[Any, Any]:
+def _array(dtype: str, shape: tuple[int, ...], values: list[Any]) -> np.ndarray[Any, Any]:
     if not _ARRAY_DTYPE.fullmatch(dtype):
         raise ValueError(f"unknown array type {dtype!r} in an agent's file")
     return np.array(values, dtype=np.dtype(dtype)).reshape(shape)
@@ -194,43 +183,35 @@ def _box(low: np.ndarray[Any, Any], high: np.ndarray[Any, Any]) -> spaces.Box:
 
 
 def _dict_space(pairs: list[list[Any]]) -> spaces.Dict:
+    # Pairs, since a Dict space puts the keys of a plain mapping into an order of its own.
     return spaces.Dict([(key, space) for key, space in pairs])
 
 
+_RANGE = _attributes("start", "end", "end_fraction")
+_ARRAY: dict[str, Callable[[Any], Any]] = {
+    "dtype": _array_dtype,
+    "shape": attrgetter("shape"),
+    "values": lambda array: array.ravel().tolist(),
+}
 _CODEC_LIST = [
-    Codec(dict, {"pairs": _pairs}, _dict),
-    Codec(tuple, {"items": list}, _tuple),
-    Codec(
-        deque,
-        {"iterable": list, "maxlen": attrgetter("maxlen")},
-        deque,
-    ),
-    Codec(
-        np.ndarray,
-        {
-            "dtype": _array_dtype,
-            "shape": attrgetter("shape"),
-            "values": lambda array: array.ravel().tolist(),
-        },
-        _array,
-    ),
+    Codec(dict, {"pairs": _pairs}, dict),
+    Codec(tuple, {"items": list}, tuple),
+    Codec(deque, {"iterable": list, "maxlen": attrgetter("maxlen")}, deque),
+    Codec(np.ndarray, _ARRAY, _array),
     Codec(np.random.Generator, {"state": _generator_state}, _generator),
     Codec(ConstantSchedule, _attributes("val"), ConstantSchedule),
-    Codec(LinearSchedule, _attributes("start", "end", "end_fraction"), LinearSchedule),
-    Codec(ExponentialSchedule, _attributes("start", "end", "end_fraction"), ExponentialSchedule),
+    Codec(LinearSchedule, _RANGE, LinearSchedule),
+    Codec(ExponentialSchedule, _RANGE, ExponentialSchedule),
     Codec(FloatSchedule, _attributes("value_schedule"), FloatSchedule),
     _space(spaces.Discrete, _discrete, **_attributes("n", "start")),
     _space(spaces.MultiDiscrete, _multi_discrete, **_attributes("nvec", "start")),
     _space(spaces.MultiBinary, spaces.MultiBinary, **_attributes("n")),
     _space(spaces.Box, _box, **_attributes("low", "high")),
     _space(spaces.Tuple, spaces.Tuple, spaces=lambda space: list(space.spaces)),
-    # Pairs, since a Dict space puts the keys of a plain mapping into an order of its own.
     _space(spaces.Dict, _dict_space, pairs=lambda space: _pairs(space.spaces)),
 ]
 CODECS = {codec.cls.__name__: codec for codec in _CODEC_LIST}
 
-
-# Model files without pickles: attributes as JSON, tables as ``policy.pth``.
 
 FORMAT_VERSION = 1
 TENSORS = frozenset({"policy.pth"})
@@ -327,8 +308,15 @@ class JsonAlgorithm(BaseAlgorithm):
         policy = next(iter(cls.policy_aliases))
         model = cls(policy=policy, env=env, _init_setup_model=False)  # type: ignore[call-arg]
         _check_names(model, data)
-        _check_spaces(data)
-        _check_n_envs(data.get("n_envs"))
+        for name in ("observation_space", "action_space"):
+            if not isinstance(data.get(name), spaces.Space):
+                raise UnsafeFileError(f"does not say its {name}")
+        n_envs = data.get("n_envs")
+        # An agent makes room for the episodes of all its environments as soon as it is made.
+        if not isinstance(n_envs, int) or not 1 <= n_envs <= MOST_ENVS:
+            raise UnsafeFileError(
+                f"is of an agent on {shown(n_envs)} environments, not on 1 to {MOST_ENVS}"
+            )
         # Without a seed, setting up leaves alone what was saved with its state.
         model.__dict__.update({**data, "seed": None})
         with charged_tensors(budget):
@@ -384,27 +372,11 @@ def _content(path: str | pathlib.Path | io.BufferedIOBase) -> bytes:
 
 def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:
     """Make sure that a file sets only what a new agent has, and hides none of its methods."""
-    known = {*vars(model), *(name for cls in type(model).__mro__ for name in _declared(cls))}
+    declared = (vars(cls).get("__annotations__", {}) for cls in type(model).__mro__)
+    known = {*vars(model)}.union(*declared)
     for name in data:
         if name not in known or hides(type(model), name):
             raise UnsafeFileError(f"sets {shown(name)}, which is no attribute of such an agent")
-
-
-def _check_spaces(data: Mapping[str, Any]) -> None:
-    for name in ("observation_space", "action_space"):
-        if not isinstance(data.get(name), spaces.Space):
-            raise UnsafeFileError(f"does not say its {name}")
-
-
-def _check_n_envs(n: Any) -> None:
-    """An agent makes room for the episodes of all its environments as soon as it is made."""
-    if not isinstance(n, int) or not 1 <= n <= MOST_ENVS:
-        raise UnsafeFileError(f"is of an agent on {shown(n)} environments, not on 1 to {MOST_ENVS}")
-
-
-def _declared(cls: type) -> Iterable[str]:
-    found: Mapping[str, Any] = vars(cls).get("__annotations__", {})
-    return found
 
 
 def _check_tables(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
@@ -453,9 +425,6 @@ def _saved(tables: dict[str, Any]) -> bytes:
 @cache
 def _system_info() -> str:
     return get_system_info(print_info=False)[1]
-
-
-# What the policies of hand-written agents share: saved and loaded by themselves.
 
 
 class TablePolicy(BasePolicy):

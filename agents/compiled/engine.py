@@ -46,34 +46,10 @@ from agents.compiled.worlds import (
     draws_alike,
 )
 
-# Ctrl-C, and what else ends a process, at a moment that leaves nothing half done.
-
 Handler = Callable[[int, FrameType | None], object]
 
 # Windows has no SIGHUP.
 _SIGNALS = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHUP")]
-
-
-class _Hold:
-    """What the handler of the first signal raised, until it is time for it."""
-
-    def __init__(self) -> None:
-        self.n_signals = 0
-        self.waiting: BaseException | None = None
-
-    def around(self, handler: Handler) -> Handler:
-        """The handler, of which the first exception waits."""
-
-        def hold(number: int, frame: FrameType | None) -> None:
-            self.n_signals += 1
-            try:
-                handler(number, frame)
-            except BaseException as error:
-                if self.n_signals > 1:
-                    raise
-                self.waiting = error
-
-        return hold
 
 
 @contextmanager
@@ -82,9 +58,24 @@ def interrupts_held() -> Iterator[Callable[[], bool]]:
 
     That is KeyboardInterrupt on Ctrl-C, and whatever the handlers raise that a program has set for
     SIGINT, SIGTERM and SIGHUP; they are called at once. Outside the main thread, where Python
-    delivers no signals, nothing is held.
+    delivers no signals, nothing is held. Yields what tells whether an exception is waiting.
     """
-    hold = _Hold()
+    n_signals = 0
+    waiting: list[BaseException] = []
+
+    def held(handler: Handler) -> Handler:
+        def hold(number: int, frame: FrameType | None) -> None:
+            nonlocal n_signals
+            n_signals += 1
+            try:
+                handler(number, frame)
+            except BaseException as error:
+                if n_signals > 1:
+                    raise
+                waiting.append(error)
+
+        return hold
+
     try:
         with ExitStack() as restoring:
             if threading.current_thread() is threading.main_thread():
@@ -92,14 +83,12 @@ def interrupts_held() -> Iterator[Callable[[], bool]]:
                     handler = signal.getsignal(number)
                     if callable(handler):
                         restoring.callback(signal.signal, number, handler)
-                        signal.signal(number, hold.around(handler))
-            yield lambda: hold.waiting is not None
+                        signal.signal(number, held(handler))
+            yield lambda: bool(waiting)
     finally:
-        if hold.waiting is not None:
-            raise hold.waiting
+        if waiting:
+            raise waiting[0]
 
-
-# Drives the compiled loop, and keeps the rest of the training from noticing.
 
 # Some hundredths of a second: what a signal waits for.
 MAX_BLOCK_STEPS = 262_144
@@ -108,7 +97,7 @@ MAX_BLOCK_STEPS = 262_144
 class CompiledEngine:
     """One call of ``learn`` on the compiled loop."""
 
-    # whether statistics hear of a step on which a callback ends training
+    # Whether statistics hear of a step on which a callback ends training.
     counts_where_stopped = True
 
     def __init__(
@@ -350,8 +339,6 @@ class CompiledEngine:
         self.states.read()
         self.states.take_observations(agent._last_obs)
 
-
-# Whether a training runs compiled or interpreted.
 
 EngineChoice = Literal["auto", "compiled", "interpreted"]
 

@@ -66,7 +66,7 @@ class EnvStates:
     def __init__(self, vec_env: DummyVecEnv, world: World) -> None:
         self.vec_env = vec_env
         self.vector_state, self._record_type = VECTOR_STATES.get(type(world), ((), FINITE_ENV))
-        # of `FINITE_ENV`, or as `VECTOR_STATES` has them, shape (n_envs,)
+        # Of `FINITE_ENV`, or as `VECTOR_STATES` has them, shape (n_envs,).
         self.records = env_records(vec_env.num_envs, self.record_type())
         self.monitors = [monitor_of(env) for env in vec_env.envs]
         # Monitor holds the rewards of the episode that is under way: so must we.

@@ -28,9 +28,8 @@ from mdp.array_types import Floats
 #
 # A loop calls ``act(agent, ...)`` or ``step(world, ...)``. Of an environment, the function is the
 # attribute of that name of the world's class. Of an agent, it is that of the algorithm's class,
-# which
-# the record of its settings names. So each environment and each algorithm has a loop of its own, in
-# which nothing is looked up any more, and a new one is a class in a file of its own.
+# which the record of its settings names. So each environment and each algorithm has a loop of its
+# own, in which nothing is looked up any more, and a new one is a class in a file of its own.
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -141,9 +140,7 @@ def end_step(env: Any, time_limit: int, compensated: bool) -> None:
 # The compiled training loop: many steps of acting and learning in one call.
 #
 # It does what the interpreted loop of `OnlineAlgorithm` does, in the same order, with the same
-# functions and the same random numbers, so that both end in the same bits. What depends on the
-# agent,
-# the environment or the log is looked up by type (`agents.compiled.loop`).
+# functions and the same random numbers, so that both end in the same bits.
 
 
 @by_type
@@ -179,8 +176,7 @@ def note_progress(log: Any, progress: Any, step: int) -> None:
 class EpisodeLog(NamedTuple):
     """What Monitor and the logger are told of a block."""
 
-    # records of type `EPISODE`, filled with those that end, shape (capacity,)
-    episodes: NDArray[Any]
+    episodes: NDArray[Any]  # of type `EPISODE`, filled with those that end, shape (capacity,)
     # What Monitor sees of the episode under way, from its first step in the block on; of shape
     # (steps, n_envs).
     rewards: Floats

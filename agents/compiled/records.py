@@ -76,8 +76,6 @@ def _write_number(number: int, room: Bytes, place: int) -> int:
 # What Monitor and the logger learn of many episodes at once.
 
 DECIMALS = 6
-# Of Monitor, besides its own attributes: to look at a million numbers later would take long.
-_N_WHOLE = "n_whole_returns"
 MOST_BEGINNINGS = 10_000
 
 
@@ -129,24 +127,12 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
         times.append(round(elapsed, DECIMALS))
         chosen = slice(None) if len(monitors) == 1 else episodes.envs == i
         returns, lengths = episodes.returns[chosen], episodes.lengths[chosen]
-        _note_whole(monitor, returns)
         monitor.episode_returns += returns.tolist()
         monitor.episode_lengths += lengths.tolist()
         monitor.episode_times += [elapsed] * len(returns)
         if monitor.results_writer is not None and len(returns):
             _write_rows(monitor.results_writer.file_handler, returns, lengths, times[i])
     return times
-
-
-def n_whole_returns(monitor: Monitor) -> int:
-    """How many returns, from the first one on, Monitor is known to hold that are whole numbers."""
-    return int(vars(monitor).get(_N_WHOLE, 0))
-
-
-def _note_whole(monitor: Monitor, returns: Floats) -> None:
-    n_before = len(monitor.episode_returns)
-    if n_whole_returns(monitor) == n_before and (returns == np.rint(returns)).all():
-        vars(monitor)[_N_WHOLE] = n_before + len(returns)
 
 
 def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> None:

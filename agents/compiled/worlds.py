@@ -240,7 +240,7 @@ def swing(world: CartPole, env: Any) -> bool:
         theta = theta + world.tau * theta_dot
         theta_dot = theta_dot + world.tau * theta_acc
     env.x, env.x_dot, env.theta, env.theta_dot = x, x_dot, theta, theta_dot
-    return bool(abs(x) > world.x_threshold or abs(theta) > world.theta_threshold)
+    return bool(abs(x) > world.x_threshold or abs(theta) > world.theta_threshold_radians)
 
 
 @inlined
@@ -275,7 +275,7 @@ class CartPole(NamedTuple):
     tau: float
     semi_implicit: bool  # whether velocities move before positions
     x_threshold: float
-    theta_threshold: float  # in radians
+    theta_threshold_radians: float
     dims: Ints  # the dimensions of the observation that count, shape (d,)
     bins: Floats  # number of bins, lower end and upper end of each, shape (d, 3)
 
@@ -520,20 +520,17 @@ def _cart_pole(env: Env) -> CartPole:
         dims = np.array(wrapper.dims, dtype=np.int64)
         bins = np.stack((wrapper.bins, wrapper.low, wrapper.high), axis=1).astype(np.float64)
     return CartPole(
-        time_limit=time_limit(env) or 0,
-        gravity=float(base.gravity),
-        masspole=float(base.masspole),
-        total_mass=float(base.total_mass),
-        length=float(base.length),
-        polemass_length=float(base.polemass_length),
-        force_mag=float(base.force_mag),
-        tau=float(base.tau),
+        time_limit(env) or 0,
         semi_implicit=base.kinematics_integrator != "euler",
-        x_threshold=float(base.x_threshold),
-        theta_threshold=float(base.theta_threshold_radians),
         dims=dims,
         bins=bins,
+        **_constants(base, CartPole),
     )
+
+
+def _constants(base: Any, world: Any) -> dict[str, float]:
+    """An environment's constants that the world has under the same names."""
+    return {name: float(getattr(base, name)) for name in world._fields if hasattr(base, name)}
 
 
 def _mountain_car(env: Env) -> MountainCar:
@@ -541,5 +538,4 @@ def _mountain_car(env: Env) -> MountainCar:
     assert isinstance(base, MountainCarEnv)
     if type(base) is not MountainCarEnv or {type(layer) for layer in wrappers} - COMMON_WRAPPERS:
         raise NotCompilable("MountainCar compiles as it is, under Monitor alone")
-    constants = {name: float(getattr(base, name)) for name in MountainCar._fields[1:]}
-    return MountainCar(time_limit(env) or 0, **constants)
+    return MountainCar(time_limit(env) or 0, **_constants(base, MountainCar))

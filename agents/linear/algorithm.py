@@ -16,6 +16,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from agents.common.algorithm import Transitions
+from agents.common.exploration import first_best
 from agents.common.model_files import TablePolicy
 from agents.common.settings import (
     CommonArguments,
@@ -47,7 +48,6 @@ from agents.linear.tiles import (
 )
 from agents.networks.network_worlds import NetworkEnvStates, network_playground, network_world
 from agents.networks.observations import BEFORE, move_on
-from agents.networks.q_learner import best_of
 from machine_code.compiling import called
 from mdp.array_types import Floats, Ints
 
@@ -239,7 +239,7 @@ class TilePlayer(NamedTuple):
         """Take the best action."""
         look(self, env, BEFORE, self.room.tiles)
         add_up(self, self.room.tiles)
-        env.action = best_of(self.room.sums)
+        env.action = first_best(self.room.sums)
 
     @called
     def learn_from_step(self, envs: Any, progress: Any) -> None:

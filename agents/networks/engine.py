@@ -30,8 +30,8 @@ from agents.networks.observations import Numbers
 from agents.networks.torch_bridge import FlatTensors, Reference, SharedOptimizer, address_of
 
 if TYPE_CHECKING:
-    from agents.networks.policy_training import PolicyTraining
-    from agents.networks.q_training import QTraining
+    from agents.networks.policy_gradients import PolicyTraining
+    from agents.networks.q_learning import QTraining
 
 
 class RolloutEvents:

@@ -221,10 +221,9 @@ def _call_without_compiler(
 class EnginePlan:
     """Which engine a training runs on, and why."""
 
-    # whether networks act and learn in compiled code, and not in the library's loop
-    is_compiled: bool
+    is_compiled: bool  # whether networks act and learn in compiled code
     reason: str = ""  # why they do not although that would do; empty where nobody asked for it
-    # the compiled environments, and how networks see them; None where they run in Python
+    # The compiled environments, and how networks see them; None where they run in Python.
     world: tuple[Any, Any] | None = None
     in_python: str = ""  # why they do; empty where they do not, or nothing is compiled
 

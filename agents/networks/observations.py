@@ -15,8 +15,8 @@ from agents.compiled.loop import by_type
 from agents.networks.perceptron import Inputs, Singles
 from machine_code.compiling import inlined
 
-# Before a step; after it, also where it has ended the episode; and after the reset that followed.
-BEFORE, AFTER, NOW = range(3)
+# Before a step; and after it, before any reset.
+BEFORE, AFTER = range(2)
 
 
 @by_type
@@ -32,9 +32,7 @@ def move_on(seen: Any, env: Any) -> None:
 @inlined
 def number_at(env: Any, moment: int) -> int:
     """The number that stands for the observation."""
-    if moment == BEFORE:
-        return int(env.obs)
-    return int(env.next_obs if moment == AFTER else env.new_obs)
+    return int(env.obs if moment == BEFORE else env.next_obs)
 
 
 @inlined
@@ -99,12 +97,7 @@ class OwnVectors(NamedTuple):
     def observe(self, env: Any, moment: int, row: Any) -> None:
         """The vector of that moment, shape (n,)."""
         for j in range(self.n):
-            if moment == BEFORE:
-                row[j] = env.vector[j]
-            elif moment == AFTER:
-                row[j] = env.next_vector[j]
-            else:
-                row[j] = env.new_vector[j]
+            row[j] = env.vector[j] if moment == BEFORE else env.next_vector[j]
 
     @inlined
     def move_on(self, env: Any) -> None:

@@ -370,10 +370,8 @@ def _add_rows(rows: Singles, indices: Ints, totals: Singles) -> None:
 # Steps of gradient descent as PyTorch's optimizers take them, on flat vectors.
 #
 # Sources: Kingma and Ba (2015) for Adam, Loshchilov and Hutter (2019) for AdamW; Tieleman and
-# Hinton
-# (2012) for RMSprop, with TensorFlow's place of epsilon as Stable-Baselines3 has it; Pascanu,
-# Mikolov
-# and Bengio (2013) for clipping.
+# Hinton (2012) for RMSprop, with TensorFlow's place of epsilon as Stable-Baselines3 has it;
+# Pascanu, Mikolov and Bengio (2013) for clipping.
 
 ADAM, ADAMW, RMSPROP, RMSPROP_TENSORFLOW = range(4)
 
@@ -389,8 +387,7 @@ class Optimizer(NamedTuple):
     momentum: float  # Adam's beta_1
     smoothing: float  # Adam's beta_2, RMSprop's alpha
     epsilon: float  # keeps divisors from zero
-    # how much parameters are drawn to zero: by a part of the gradient, or with `ADAMW` beside it
-    weight_decay: float
+    weight_decay: float  # towards zero: as a part of the gradient, or with `ADAMW` beside it
     mean: Singles  # running mean of gradients, as long as the parameters
     mean_square: Singles  # of their squares
     n_steps: Singles  # steps taken so far, alone in an array, in single precision as PyTorch has it

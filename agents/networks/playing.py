@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch as th
 
+from agents.common.exploration import first_best
 from agents.networks.observations import BEFORE, look, move_on
 from agents.networks.perceptron import (
     Inputs,
@@ -23,7 +24,6 @@ from agents.networks.perceptron import (
     make_inputs,
     make_outputs,
 )
-from agents.networks.q_learner import best_of
 from agents.networks.torch_bridge import FlatTensors, Network, Reference, address_of, call
 from machine_code.compiling import inlined, kernel
 
@@ -49,7 +49,7 @@ def choose_surely(network: Any, _: float, __: float) -> int:
     """The best action for the observation in ``network.single``."""
     forward(network.layers, network.flat, network.single, 1, network.single_outputs)
     outputs = last_outputs(network.layers, network.single_outputs, 1)[0]
-    best, largest = best_of(outputs), 0.0
+    best, largest = first_best(outputs), 0.0
     for k in range(len(outputs)):
         largest = max(largest, abs(outputs[k]))
     for k in range(len(outputs)):
@@ -60,42 +60,33 @@ def choose_surely(network: Any, _: float, __: float) -> int:
     return best
 
 
-class Oracle:
-    """Asks Python which action is best, for compiled code."""
+class AskingNetwork(Reference):
+    """A reference to a `GreedyNetwork`, which asks ``predict`` where two actions are close."""
 
-    def __init__(self, predict: Callable[[Inputs], int]) -> None:
+    def __init__(self, layers: Layers, flat: Singles, predict: Callable[[Inputs], int]) -> None:
         self.predict = predict
-        self.inputs: Any = None  # what that code shows
-        # what `predict` has raised, which cannot pass through compiled code
+        # What `predict` has raised, which cannot pass through compiled code.
         self.errors: list[BaseException] = []
         # Compiled code does not keep it alive.
         self._called = _ASKED(self._answer)
-        # where compiled code calls it
-        self.address = np.uintp(ctypes.cast(self._called, ctypes.c_void_p).value or 0)
+        ask = np.uintp(ctypes.cast(self._called, ctypes.c_void_p).value or 0)
+        inputs, outputs = make_inputs(layers, 1), make_outputs(layers, 1)
+        super().__init__(GreedyNetwork(layers, flat, inputs, outputs, ask))
 
     def _answer(self, _: int | None, __: float, ___: float) -> int:
         if self.errors:
             return 0
         try:
-            return self.predict(self.inputs)
+            return self.predict(self.held.single)
         except BaseException as error:  # noqa: BLE001  # raised once compiled code has returned
             self.errors.append(error)
             return 0
 
 
-class PlayedNetwork(Reference):
-    """A reference to a `GreedyNetwork`."""
-
-    def __init__(self, held: GreedyNetwork, oracle: Oracle) -> None:
-        super().__init__(held)
-        self.oracle = oracle
-        oracle.inputs = held.single
-
-
 class NetworkPlayer(NamedTuple):
     """What the compiled loop asks."""
 
-    network: Any  # a `PlayedNetwork`
+    network: Any  # an `AskingNetwork`
     seen: Any  # how observations are read, of `agents.networks.observations`
     choose: np.uintp  # the address of `choose_surely`
 
@@ -113,18 +104,15 @@ class NetworkPlayer(NamedTuple):
 
     def check(self) -> None:
         """Raise what the library's `predict` has raised."""
-        if errors := self.network.oracle.errors:
+        if errors := self.network.errors:
             raise errors.pop()
 
 
 def network_player(network: Network, seen: Any, predict: Callable[[Inputs], int]) -> NetworkPlayer:
     """A network as it is now, whose parameters are copied."""
-    tensors, layers = FlatTensors([network]), network.layers
+    tensors = FlatTensors([network])
     with th.no_grad():
         for parameter, place in tensors.places:
             place.copy_(parameter)
-    oracle, inputs = Oracle(predict), make_inputs(layers, 1)
-    outputs = make_outputs(layers, 1)
-    held = GreedyNetwork(layers, tensors.vector, inputs, outputs, oracle.address)
-    played = PlayedNetwork(held, oracle)
-    return NetworkPlayer(played, seen, address_of(choose_surely, played))
+    asking = AskingNetwork(network.layers, tensors.vector, predict)
+    return NetworkPlayer(asking, seen, address_of(choose_surely, asking))

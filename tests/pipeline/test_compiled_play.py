@@ -12,7 +12,7 @@ from agents import load_algorithm
 from agents.compiled.greedy_play import play_episodes
 from agents.compiled.worlds import compile_envs
 from agents.networks.network_worlds import NetworkEnvStates, network_world
-from agents.networks.q_learner import choose_greedily
+from agents.networks.q_learning import choose_greedily
 from envs.wrappers import DiscretizeObservation
 from pipeline.evaluation.sampled import SampledEvaluator, compiled_copy, evaluate, evaluate_compiled
 

@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from torch import nn
 
 from agents import load_algorithm
-from agents.networks.policy_learner import estimate_advantages
+from agents.networks.policy_gradients import estimate_advantages
 
 N_ACTIONS = 3
 TOLERANCE = 1e-5

@@ -1,17 +1,30 @@
-"""Policy optimisation as the compiled loop runs it: rollouts, updates, order of events."""
+"""PPO and A2C on compiled code: rollouts, updates, and the agents that train so."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch as th
 from numpy.typing import NDArray
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.type_aliases import Schedule
+from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.vec_env import VecEnv
+from torch import nn
 
-from agents.common.schedules import schedule_value
-from agents.compiled.generators import next_uniform
-from agents.compiled.worlds import SCHEDULE
-from agents.networks.observations import AFTER, BEFORE, look, move_on, observe, show
+from agents.common.callbacks import NEVER, Horizon
+from agents.common.schedules import ScheduleRow, schedule_value
+from agents.compiled.generators import handles_of, next_uniform
+from agents.compiled.learning_algorithm import compiled_schedule
+from agents.compiled.worlds import SCHEDULE, NotCompilable
+from agents.networks.engine import NOWHERE, NetworkTraining, record_of
+from agents.networks.engine_setting import CompiledNetworks, Work, work_of
+from agents.networks.observations import AFTER, BEFORE, Numbers, look, move_on, observe, show
 from agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -21,10 +34,13 @@ from agents.networks.perceptron import (
     descend,
     forward,
     last_outputs,
+    make_inputs,
+    make_outputs,
+    n_parameters,
 )
-from agents.networks.torch_bridge import call
+from agents.networks.torch_bridge import Network, Reference, address_of, call, network_of
 from machine_code.compiling import called, inlined, kernel
-from mdp.array_types import Ints
+from mdp.array_types import Bools, Ints
 
 # The softmax distribution over actions that a network's outputs stand for.
 
@@ -50,12 +66,6 @@ def draw(logits: Singles, uniform: float) -> int:
         if uniform < cumulative:
             return k
     return len(logits) - 1
-
-
-@inlined
-def log_probability(logits: Singles, action: int) -> float:
-    """Of an action."""
-    return float(logits[action]) - log_normalizer(logits)
 
 
 @inlined
@@ -212,7 +222,10 @@ class RolloutMinibatch(NamedTuple):
 
 @kernel
 def learn_from_rollout_minibatch(learner: Any, n_rows: float, learning_rate: float) -> int:
-    """Take one step of gradient descent on the first ``n_rows`` rows of `learner.batch`."""
+    """Take one step of gradient descent on the first ``n_rows`` rows of `learner.batch`.
+
+    0 is returned where the policy has moved too far already, and nothing was done; otherwise 1.
+    """
     batch, rules, losses = learner.batch, learner.rules[0], learner.losses[0]
     n = int(n_rows)
     if rules.normalize_advantage and n > 1:
@@ -382,7 +395,7 @@ def choose_randomly(learner: Any, _: float, __: float) -> int:
     forward(learner.policy, learner.flat, learner.single, 1, learner.policy_outputs)
     logits = last_outputs(learner.policy, learner.policy_outputs, 1)[0]
     action = draw(logits, next_uniform(learner.rng[0]))
-    learner.place[0].log_probability = log_probability(logits, action)
+    learner.place[0].log_probability = float(logits[action]) - log_normalizer(logits)
     return action
 
 
@@ -413,7 +426,7 @@ def train(learner: Any, remaining: float, learning_rate: float) -> int:
 
 @inlined
 def learn_for_an_epoch(learner: Any, learning_rate: float) -> tuple[int, bool]:
-    """Learn from all of the rollout once."""
+    """Learn from all of the rollout once: how many minibatches; False once it has gone too far."""
     place, losses = learner.place[0], learner.losses[0]
     n_steps, size = len(learner.order), len(learner.batch.actions)
     place.kl, n_batches, goes_on = 0.0, 0, True
@@ -517,3 +530,369 @@ def evaluate_rows(learner: Any, shown: Any, values: Singles) -> None:
         show(learner.single, 0, shown[i], learner.policy.one_hot)
         evaluate(learner, 0.0, 0.0)
         values[i] = np.float32(learner.place[0].expected)
+
+
+# How far a number may move that nothing bounds.
+UNBOUNDED = 1e30
+
+# Rollouts that a block may hold where nothing is logged.
+_MOST_ROLLOUTS = 10_000
+
+
+class PolicyTraining(NetworkTraining):
+    """PPO or A2C in training; of its networks the first gives action probabilities."""
+
+    # The library's rollouts take what remains from the steps to do.
+    heeds_budgets = False
+
+    def __init__(self, agent: Any, seen: Any) -> None:
+        super().__init__(agent, seen)
+        actor, critic = (network.layers for network in self.networks)
+        n_steps = agent.n_steps * agent.n_envs
+        size = min(agent.minibatch_size or n_steps, n_steps)
+        rows = max(size, agent.n_envs)
+        flat = self.trained.vector
+        self.recorded, self.place = 0, record_of(PLACE)
+        batch = RolloutMinibatch(
+            make_inputs(actor, size),
+            np.zeros(size, np.int64),
+            *(np.zeros(size, np.float32) for _ in range(4)),
+        )
+        rollout, order = self._rollout(), np.arange(n_steps)
+        observations = agent.rollout_buffer.observations
+        observations = observations.reshape(*observations.shape[:2], -1)
+        self.memory = Reference(RolloutMemory(observations, rollout, order, batch, actor.one_hot))
+        learner = PolicyLearner(
+            self._rules(self._bound_now),
+            self.place,
+            record_of(LOSSES),
+            actor,
+            critic,
+            flat,
+            np.zeros_like(flat),
+            self.optimizer.compiled,
+            rollout,
+            address_of(pick_steps, self.memory),
+            np.uintp(self.memory.address),
+            np.zeros(agent.n_envs, np.float32),
+            np.zeros(agent.n_envs, np.float32),
+            NOWHERE,
+            order,
+            batch,
+            make_outputs(actor, rows),
+            make_outputs(actor, size),
+            make_outputs(critic, rows),
+            make_outputs(critic, size),
+            make_inputs(actor, 1),
+            handles_of([agent.rng]),
+        )
+        self.begin(learner, learn_from_rollout_minibatch)
+
+    def _rules(self, bound: Callable[[Schedule | None], ScheduleRow]) -> Any:
+        agent = self.agent
+        target_kl = getattr(agent, "target_kl", None)
+        return record_of(
+            RULES,
+            gamma=agent.gamma,
+            buffer_gamma=agent.rollout_buffer.gamma,
+            gae_lambda=agent.rollout_buffer.gae_lambda,
+            ent_coef=agent.ent_coef,
+            vf_coef=agent.vf_coef,
+            max_grad_norm=agent.max_grad_norm,
+            target_kl=np.inf if target_kl is None else target_kl,
+            normalize_advantage=agent.normalize_advantage,
+            n_epochs=getattr(agent, "n_epochs", 1),
+            waits=self.waits,
+            clip_range=tuple(bound(getattr(agent, "clip_range", None))),
+            clip_range_vf=tuple(bound(getattr(agent, "clip_range_vf", None))),
+        )
+
+    def _bound_now(self, schedule: Schedule | None) -> ScheduleRow:
+        """What any schedule of a bound says at the moment, as one that does not change."""
+        if schedule is None:
+            return _bound(None)
+        return _bound(FloatSchedule(schedule(self.agent._current_progress_remaining)))
+
+    def read_settings(self) -> None:
+        """Take over what a callback has changed."""
+        self.read_generator()
+        self.read_tensors()
+        self.held.rules[:] = self._rules(_bound)
+
+    def _rollout(self) -> Rollout:
+        buffer = self.agent.rollout_buffer
+        if buffer.generator_ready:
+            # The library has flattened it for its own minibatches.
+            buffer.reset()
+        return Rollout(
+            buffer.actions,
+            buffer.rewards,
+            buffer.episode_starts,
+            buffer.values,
+            buffer.log_probs,
+            buffer.advantages,
+            buffer.returns,
+        )
+
+    def in_loop(self) -> PolicyAgent:
+        """What the compiled loop asks."""
+        functions = (choose_randomly, evaluate, estimate_advantages, train)
+        addresses = (address_of(function, self.learner) for function in functions)
+        return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
+
+    def schedules(self) -> dict[str, Schedule]:
+        """What compiled code works out after each step, by the names in its record."""
+        return {"learning_rate": self.agent.lr_schedule}
+
+    def take_over_progress(self, remaining: float) -> None:
+        """Let the agent know how much of the training remained at the end of the last rollout."""
+        self.agent._current_progress_remaining = float(self.place["remaining"][0])
+
+    def give_up_rollout(self) -> None:
+        """Forget how much was collected since the last training."""
+        self.place["step"] = self.place["n_rollouts"] = 0
+
+    def read(self) -> None:
+        """Begin where the agent is."""
+        agent, place = self.agent, self.place
+        place["step"] = agent.collected
+        place["remaining"] = agent._current_progress_remaining
+        place["n_updates"] = agent._n_updates
+        self.held.starts[:] = agent._last_episode_starts
+
+    def write(self) -> None:
+        """Let the agent know where compiled code is."""
+        agent, place = self.agent, self.place[0]
+        agent._n_updates = int(place["n_updates"])
+        agent.collected = int(place["step"])
+        agent._last_episode_starts = self.held.starts.astype(bool)
+        buffer = agent.rollout_buffer
+        buffer.full = self.is_rollout_over or (bool(place["n_rollouts"]) and place["step"] == 0)
+        buffer.pos = len(buffer.rewards) if buffer.full else int(place["step"])
+
+    def until_end(self, total_timesteps: int) -> int:
+        """As everywhere, but to the end of the last rollout."""
+        begun, whole = int(self.place["step"][0]), int(self.agent.n_steps)
+        return -(-(begun + super().until_end(total_timesteps)) // whole) * whole - begun
+
+    def until_log(self, log_interval: int | None) -> Horizon:
+        """When something is logged next."""
+        in_rollout = self.agent.n_steps - int(self.place["step"][0])
+        if log_interval is None:
+            return Horizon(NEVER, NEVER)
+        iteration = int(self.place["n_rollouts"][0]) + 1
+        # By asking, as a training that was resumed has an interval that counts on.
+        for n_more in range(_MOST_ROLLOUTS):
+            if (iteration + n_more) % log_interval == 0:
+                break
+        # What is logged then is of the training before, which has to be told by itself.
+        return Horizon(in_rollout + max(n_more - 1, 0) * self.agent.n_steps, NEVER)
+
+    def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
+        """Nothing: it logs by rollouts."""
+
+    @property
+    def is_rollout_over(self) -> bool:
+        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
+        return bool(self.place["step"][0] == self.agent.n_steps)
+
+    def until_rollout_end(self) -> Horizon:
+        """When a rollout ends that is to wait."""
+        in_rollout = self.agent.n_steps - int(self.place["step"][0])
+        return Horizon(in_rollout if self.waits else NEVER, NEVER)
+
+    def learn_from_rollout(self, remaining: float) -> None:
+        """Learn from the rollout that waits, with that share of the training left."""
+        train(self.learner, remaining, float(self.agent.lr_schedule(remaining)))
+
+    def before_training(self, log_interval: int | None) -> None:
+        """Log as the library does, at the end of a rollout and before what is learnt from it."""
+        iteration = int(self.place["n_rollouts"][0]) + 1
+        ends = self.place["step"][0] >= self.agent.n_steps - 1
+        if ends and log_interval is not None and iteration % log_interval == 0:
+            self.agent.dump_logs(iteration)
+
+    def train(self) -> None:
+        """Learn from the rollout, where environments are Python's."""
+        agent = self.agent
+        self.read_tensors()
+        self.place["n_updates"] = agent._n_updates
+        self.held.rules[:] = self._rules(self._bound_now)
+        remaining = agent._current_progress_remaining
+        train(self.learner, remaining, float(agent.lr_schedule(remaining)))
+        self.write()
+        self.record()
+
+    def record(self) -> None:
+        """Hand what the last training has given to the agent's logger."""
+        agent, place = self.agent, self.place[0]
+        if place["n_rollouts"] == self.recorded:
+            return
+        self.recorded = place["n_rollouts"]
+        if np.isnan(self.held.losses["total"][0]):
+            raise ValueError("training has diverged: its losses are not numbers any more")
+        log, remaining = agent.logger, agent._current_progress_remaining
+        agent._update_learning_rate(agent.policy.optimizer)
+        log.record("train/explained_variance", place["explained"])
+        log.record("train/entropy_loss", place["entropy"])
+        log.record("train/value_loss", place["value"])
+        log.record("train/n_updates", agent._n_updates, exclude="tensorboard")
+        losses = self.held.losses[0]
+        if not hasattr(agent, "clip_range"):
+            log.record("train/policy_loss", losses["likelihood"])
+            return
+        log.record("train/policy_gradient_loss", place["policy_gradient"])
+        log.record("train/approx_kl", place["kl"])
+        log.record("train/clip_fraction", place["clipped"])
+        log.record("train/loss", losses["total"])
+        log.record("train/clip_range", agent.clip_range(remaining))
+        if agent.clip_range_vf is not None:
+            log.record("train/clip_range_vf", agent.clip_range_vf(remaining))
+
+    def collect_rollout(self, env: VecEnv, callback: BaseCallback) -> bool:
+        """Fill the rollout buffer, once callbacks have been told that it begins."""
+        agent, held, buffer = self.agent, self.held, self.agent.rollout_buffer
+        agent.collected = 0
+        self.read()
+        buffer.pos, buffer.full = 0, False
+        for step in range(agent.n_steps):
+            actions = self._act(step)
+            new_obs, rewards, dones, infos = env.step(actions.copy())
+            agent.num_timesteps += env.num_envs
+            told = {"new_obs": new_obs, "rewards": rewards, "dones": dones, "infos": infos}
+            callback.update_locals({**self._said(env, step), "actions": actions, **told})
+            if not callback.on_step():
+                return False
+            agent._update_info_buffer(infos, dones)
+            held.rollout.rewards[step] = rewards + self._cut_off(dones, infos)
+            agent._last_obs, agent._last_episode_starts, held.starts[:] = new_obs, dones, dones
+            buffer.pos = step + 1
+        buffer.full = True
+        self.show(agent._last_obs)
+        evaluate_rows(self.learner, self.shown, held.last_values)
+        estimate_advantages(self.learner, 0.0, 0.0)
+        callback.on_rollout_end()
+        return True
+
+    def _act(self, step: int) -> Any:
+        """Actions for the present observations, written down with what belongs to them."""
+        actions = np.zeros(self.agent.n_envs, np.int64)
+        self.place["step"] = step
+        self.read_generator()
+        self.trained.take_over()
+        self.show(self.agent._last_obs)
+        act_on_rows(self.learner, self.shown, actions)
+        self.memory.held.observations[step] = self.shown
+        return actions
+
+    def _said(self, env: VecEnv, step: int) -> dict[str, Any]:
+        """What callbacks read under the library's names of where the rollout is."""
+        rollout = self.held.rollout
+        return {
+            "self": self.agent,
+            "env": env,
+            "rollout_buffer": self.agent.rollout_buffer,
+            "n_rollout_steps": self.agent.n_steps,
+            "n_steps": step,
+            "values": th.tensor(rollout.values[step, :, np.newaxis]),
+            "log_probs": th.tensor(rollout.log_probs[step]),
+        }
+
+    def _cut_off(self, dones: Bools, infos: list[dict[str, Any]]) -> Singles:
+        """What would have come after episodes that ran out of time, shape (E,)."""
+        lost = np.zeros(len(dones), np.float32)
+        values = np.zeros(1, np.float32)
+        shown = self.shown[:1]
+        for i in np.flatnonzero(dones):
+            if infos[i].get("TimeLimit.truncated", False):
+                shown[:] = np.reshape(infos[i]["terminal_observation"], (1, -1))
+                self.check_numbers(shown)
+                evaluate_rows(self.learner, shown, values)
+                lost[i] = np.float32(self.agent.gamma) * values[0]
+        return lost
+
+
+def _bound(schedule: Schedule | None) -> ScheduleRow:
+    """The schedule of a bound as compiled code reads it."""
+    return compiled_schedule(FloatSchedule(UNBOUNDED) if schedule is None else schedule)
+
+
+class CompiledPolicyGradient(CompiledNetworks, OnPolicyAlgorithm):
+    """What PPO and A2C share; `CompiledNetworks` says what the argument ``engine`` does."""
+
+    training_kind = PolicyTraining
+    _own = (*CompiledNetworks._own, "collected")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.collected = 0  # steps of the rollout that the compiled loop has under way
+        super().__init__(*args, **kwargs)
+
+    @property
+    def minibatch_size(self) -> int | None:
+        """Steps that are learnt from at once; None for all of a rollout."""
+        return getattr(self, "batch_size", None)
+
+    @property
+    def is_within_rollout(self) -> bool:
+        return self.collected > 0
+
+    def _check_own(self) -> None:
+        if type(self.rollout_buffer) is not RolloutBuffer:
+            raise NotCompilable("its rollout buffer is of another kind")
+
+    def _parts(self) -> list[list[Any]]:
+        """The bodies and heads of the networks of action probabilities and of values."""
+        policy: Any = self.policy
+        extractor = policy.mlp_extractor
+        return [
+            [extractor.policy_net, policy.action_net],
+            [extractor.value_net, policy.value_net],
+        ]
+
+    def shared_networks(self, seen: Any) -> tuple[list[Network], list[Network]]:
+        one_hot = isinstance(seen, Numbers)
+        (body, head), (value_body, value_head) = self._parts()
+        actor = network_of([*body, head], 0, one_hot=one_hot)
+        start = n_parameters(actor.layers)
+        critic = network_of([*value_body, value_head], start, one_hot=one_hot)
+        return [actor, critic], []
+
+    def _work_of(self, n_steps: float) -> Work:
+        rollout = self.n_steps * self.n_envs
+        batch_size = self.minibatch_size or rollout
+        n_rollouts = math.ceil(n_steps / rollout)
+        n_updates = n_rollouts * getattr(self, "n_epochs", 1) * math.ceil(rollout / batch_size)
+        return work_of(
+            "policy",
+            [nn.ModuleList(parts) for parts in self._parts()],
+            self.observation_space,
+            n_rollouts * rollout,
+            self.n_envs,
+            n_updates,
+            batch_size,
+        )
+
+    def _schedules(self) -> list[Schedule]:
+        bounds = [getattr(self, name, None) for name in ("clip_range", "clip_range_vf")]
+        return [*super()._schedules(), *(bound for bound in bounds if bound is not None)]
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fill the rollout buffer; False once a callback asks to stop."""
+        if not self._sharing:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        rollout_buffer.pos, rollout_buffer.full = 0, False
+        callback.on_rollout_start()
+        return bool(self._shared_training().collect_rollout(env, callback))
+
+    def train(self) -> None:
+        """Learn from the rollout buffer."""
+        if self._sharing:
+            self._shared_training().train()
+        else:
+            super().train()
