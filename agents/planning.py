@@ -32,6 +32,9 @@ from envs.known_models import (
 from mdp import TransitionModel, finite_horizon_optimum, policy_iteration, value_iteration
 from mdp.array_types import Bools, Ints
 
+# Actions of shape (m, S), with 1, 2, ... steps left, and the horizon.
+Plan = tuple[NDArray[np.integer[Any]], int]
+
 
 class ActionTablePolicy(TablePolicy):
     """One action for each observation, or for each observation and number of steps left."""
@@ -158,10 +161,8 @@ class PlanningAgent(OnlineAlgorithm):
         self.policy.set_actions(actions, horizon)
 
     @abstractmethod
-    def _plan(
-        self, model: TransitionModel, limit: int | None, mask: Bools | None
-    ) -> tuple[NDArray[np.integer[Any]], int]:
-        """Actions of shape (m, S), with 1, 2, ... steps left, and the horizon."""
+    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
+        """The plan under a time limit, among the actions of ``mask``, bool of shape (S, A)."""
 
     def _choose_actions(self) -> Ints:
         actions = self.policy.actions_after(np.asarray(self._last_obs), self._steps)
@@ -205,9 +206,7 @@ class ValueIteration(PlanningAgent):
 
     default_gamma = 0.99
 
-    def _plan(
-        self, model: TransitionModel, limit: int | None, mask: Bools | None
-    ) -> tuple[NDArray[np.integer[Any]], int]:
+    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
         return value_iteration(model, self.gamma, mask=mask).policy[None], 1
 
 
@@ -219,9 +218,7 @@ class PolicyIteration(PlanningAgent):
 
     default_gamma = 0.99
 
-    def _plan(
-        self, model: TransitionModel, limit: int | None, mask: Bools | None
-    ) -> tuple[NDArray[np.integer[Any]], int]:
+    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
         return policy_iteration(model, self.gamma, mask=mask).policy[None], 1
 
 
@@ -230,9 +227,7 @@ class Optimal(PlanningAgent):
 
     default_gamma = 1.0
 
-    def _plan(
-        self, model: TransitionModel, limit: int | None, mask: Bools | None
-    ) -> tuple[NDArray[np.integer[Any]], int]:
+    def _plan(self, model: TransitionModel, limit: int | None, mask: Bools | None) -> Plan:
         if limit is None:
             raise ValueError("Optimal needs a time limit: give the environment max_episode_steps")
         plan = finite_horizon_optimum(model, limit, self.gamma, mask)

@@ -16,9 +16,6 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 
-# What is known of one agent: where its class lives, and what it can work with.
-
-
 @dataclass(frozen=True)
 class AlgorithmEntry:
     """One agent that can be trained.
@@ -118,23 +115,37 @@ NETWORK_ENGINES = ("auto", "compiled", "library")
 VECTOR_INPUTS = ("Box", "Discrete", "MultiDiscrete", "MultiBinary")
 
 
-def _tabular(entry_point: str, summary: str) -> AlgorithmEntry:
-    entry_point = f"agents.tabular.{entry_point}"
-    return AlgorithmEntry(entry_point, summary, DISCRETE, DISCRETE, engines=TABLE_ENGINES)
+def _tabular(place: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"agents.tabular.{place}", summary, DISCRETE, DISCRETE, engines=TABLE_ENGINES
+    )
 
 
-def _tiled(entry_point: str, summary: str) -> AlgorithmEntry:
-    entry_point = f"agents.linear.{entry_point}"
-    return AlgorithmEntry(entry_point, summary, LINEAR_INPUTS, DISCRETE, engines=TABLE_ENGINES)
+def _tiled(place: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"agents.linear.{place}", summary, LINEAR_INPUTS, DISCRETE, engines=TABLE_ENGINES
+    )
 
 
-def _deep(
-    entry_point: str,
+def _network(
+    name: str,
     summary: str,
     actions: tuple[str, ...] = DISCRETE,
-    engines: tuple[str, ...] = LIBRARY_ENGINES[:1],
+    engines: tuple[str, ...] = LIBRARY_ENGINES,
 ) -> AlgorithmEntry:
-    return AlgorithmEntry(entry_point, summary, NETWORK_INPUTS, actions, engines=engines)
+    return AlgorithmEntry(
+        f"agents.library:{name}", summary, NETWORK_INPUTS, actions, engines=engines
+    )
+
+
+def _continuous(name: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(
+        f"stable_baselines3:{name}",
+        f"{summary} (Stable-Baselines3)",
+        NETWORK_INPUTS,
+        CONTINUOUS,
+        engines=LIBRARY_ENGINES[:1],
+    )
 
 
 def _contrib(
@@ -157,14 +168,13 @@ def _contrib(
     )
 
 
-def _bandit(entry_point: str, summary: str) -> AlgorithmEntry:
-    entry_point = f"agents.bandits.{entry_point}"
-    return AlgorithmEntry(entry_point, summary, DISCRETE, DISCRETE, for_bandits=True)
+def _planning(name: str, summary: str) -> AlgorithmEntry:
+    return AlgorithmEntry(f"agents.planning:{name}", f"planning: {summary}", DISCRETE, DISCRETE)
 
 
-def _linear(name: str, summary: str) -> AlgorithmEntry:
+def _bandit(place: str, summary: str, observations: tuple[str, ...] = DISCRETE) -> AlgorithmEntry:
     return AlgorithmEntry(
-        f"agents.bandits.linear:{name}", summary, LINEAR_INPUTS, DISCRETE, for_bandits=True
+        f"agents.bandits.{place}", summary, observations, DISCRETE, for_bandits=True
     )
 
 
@@ -212,38 +222,18 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "reinforce": _tiled(
         "policy_gradients:Reinforce", "REINFORCE on tiles or a table, with or without a baseline"
     ),
-    "dqn": _deep(
-        "agents.library:DQN", "deep Q-network (Stable-Baselines3)", engines=LIBRARY_ENGINES
+    "dqn": _network("DQN", "deep Q-network (Stable-Baselines3)"),
+    "double_dqn": _network("DoubleDQN", "DQN with van Hasselt's target", DISCRETE, NETWORK_ENGINES),
+    "deep_qlearning": _network(
+        "DeepQLearning", "DQN of 2013: squared loss, no target network", DISCRETE, NETWORK_ENGINES
     ),
-    "double_dqn": _deep(
-        "agents.library:DoubleDQN", "DQN with van Hasselt's target", engines=NETWORK_ENGINES
+    "ppo": _network(
+        "PPO", "proximal policy optimisation (Stable-Baselines3)", POLICY_GRADIENT_OUTPUTS
     ),
-    "deep_qlearning": _deep(
-        "agents.library:DeepQLearning",
-        "DQN of 2013: squared loss, no target network",
-        engines=NETWORK_ENGINES,
-    ),
-    "ppo": _deep(
-        "agents.library:PPO",
-        "proximal policy optimisation (Stable-Baselines3)",
-        POLICY_GRADIENT_OUTPUTS,
-        LIBRARY_ENGINES,
-    ),
-    "a2c": _deep(
-        "agents.library:A2C",
-        "advantage actor-critic (Stable-Baselines3)",
-        POLICY_GRADIENT_OUTPUTS,
-        LIBRARY_ENGINES,
-    ),
-    "sac": _deep("stable_baselines3:SAC", "soft actor-critic (Stable-Baselines3)", CONTINUOUS),
-    "td3": _deep(
-        "stable_baselines3:TD3", "twin delayed policy gradient (Stable-Baselines3)", CONTINUOUS
-    ),
-    "ddpg": _deep(
-        "stable_baselines3:DDPG",
-        "deep deterministic policy gradient (Stable-Baselines3)",
-        CONTINUOUS,
-    ),
+    "a2c": _network("A2C", "advantage actor-critic (Stable-Baselines3)", POLICY_GRADIENT_OUTPUTS),
+    "sac": _continuous("SAC", "soft actor-critic"),
+    "td3": _continuous("TD3", "twin delayed policy gradient"),
+    "ddpg": _continuous("DDPG", "deep deterministic policy gradient"),
     "qrdqn": _contrib("sb3_contrib:QRDQN", "quantile-regression DQN", DISCRETE),
     "tqc": _contrib("sb3_contrib:TQC", "truncated quantile critics", CONTINUOUS),
     "crossq": _contrib(
@@ -271,24 +261,9 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
         ("Discrete", "MultiDiscrete", "MultiBinary"),
         needs_masks=True,
     ),
-    "value_iteration": AlgorithmEntry(
-        "agents.planning:ValueIteration",
-        "planning: greedy in the optimal values",
-        DISCRETE,
-        DISCRETE,
-    ),
-    "policy_iteration": AlgorithmEntry(
-        "agents.planning:PolicyIteration",
-        "planning: policies evaluated and improved in turn",
-        DISCRETE,
-        DISCRETE,
-    ),
-    "optimal": AlgorithmEntry(
-        "agents.planning:Optimal",
-        "planning: the optimum under the time limit",
-        DISCRETE,
-        DISCRETE,
-    ),
+    "value_iteration": _planning("ValueIteration", "greedy in the optimal values"),
+    "policy_iteration": _planning("PolicyIteration", "policies evaluated and improved in turn"),
+    "optimal": _planning("Optimal", "the optimum under the time limit"),
     "random": AlgorithmEntry(
         "agents.reference:RandomAgent",
         "uniformly random actions",
@@ -298,7 +273,7 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "angle": AlgorithmEntry(
         "agents.reference:AngleAgent",
         "CartPole: push to where the pole leans",
-        ("Box",),
+        CONTINUOUS,
         DISCRETE,
         observation_shape=(4,),
     ),
@@ -309,17 +284,20 @@ ALGORITHMS: dict[str, AlgorithmEntry] = {
     "gradient_bandit": _bandit("preferences:GradientBandit", "bandit: gradient on preferences"),
     "exp3": _bandit("preferences:Exp3", "bandit: exponential weights against an adversary"),
     "thompson": _bandit("thompson:Thompson", "bandit: Thompson sampling"),
-    "linucb": _linear("LinUCB", "contextual bandit: linear upper confidence bounds"),
-    "lin_thompson": _linear("LinThompson", "contextual bandit: linear Thompson sampling"),
-    "lin_epsilon_greedy": _linear("LinEpsilonGreedy", "contextual bandit: linear, epsilon-greedy"),
+    "linucb": _bandit(
+        "linear:LinUCB", "contextual bandit: linear upper confidence bounds", LINEAR_INPUTS
+    ),
+    "lin_thompson": _bandit(
+        "linear:LinThompson", "contextual bandit: linear Thompson sampling", LINEAR_INPUTS
+    ),
+    "lin_epsilon_greedy": _bandit(
+        "linear:LinEpsilonGreedy", "contextual bandit: linear, epsilon-greedy", LINEAR_INPUTS
+    ),
     "mabwiser_epsilon_greedy": _mabwiser("MABWiserEpsilonGreedy", "bandit: epsilon-greedy"),
     "mabwiser_ucb1": _mabwiser("MABWiserUCB1", "bandit: UCB1"),
     "mabwiser_thompson": _mabwiser("MABWiserThompson", "bandit: Thompson sampling"),
     "mabwiser_linucb": _mabwiser("MABWiserLinUCB", "contextual bandit: LinUCB", LINEAR_INPUTS),
 }
-
-
-# The table of agents, by their names.
 
 
 def register(name: str, entry_point: str, **fields: Any) -> None:

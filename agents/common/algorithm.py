@@ -240,7 +240,7 @@ class OnlineAlgorithm(JsonAlgorithm, metaclass=CheckedConstructor):
 
 
 def is_read(logger: Logger) -> bool:
-    """Whether anything comes of what a logger writes; one that was changed by hand may do anything.
+    """Whether a logger writes anything; True for one that was changed by hand, as it may do so.
 
     ``learn`` makes one without outputs where nothing else was asked for. One that is disabled keeps
     what is recorded.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import pathlib
 import re
 import sys
 import warnings
@@ -214,7 +213,7 @@ CODECS = {codec.cls.__name__: codec for codec in _CODEC_LIST}
 
 
 FORMAT_VERSION = 1
-TENSORS = frozenset({"policy.pth"})
+TABLES = "policy.pth"
 MOST_ENVS = 100_000
 
 
@@ -226,7 +225,7 @@ class JsonAlgorithm(BaseAlgorithm):
 
     def save(
         self,
-        path: str | pathlib.Path | io.BufferedIOBase,
+        path: str | Path | io.BufferedIOBase,
         exclude: Iterable[str] | None = None,
         include: Iterable[str] | None = None,
     ) -> None:
@@ -246,7 +245,7 @@ class JsonAlgorithm(BaseAlgorithm):
         content = _zipped(data, self.get_parameters())
         file = open_path(path, "w", verbose=0, suffix="zip")
         file.write(content)
-        if isinstance(path, str | pathlib.Path):
+        if isinstance(path, str | Path):
             file.close()
 
     def _encode_attribute(self, name: str, value: Any) -> Any:
@@ -267,7 +266,7 @@ class JsonAlgorithm(BaseAlgorithm):
     @classmethod
     def load(
         cls,
-        path: str | pathlib.Path | io.BufferedIOBase,
+        path: str | Path | io.BufferedIOBase,
         env: GymEnv | None = None,
         device: th.device | str = "cpu",
         custom_objects: dict[str, Any] | None = None,
@@ -324,12 +323,9 @@ class JsonAlgorithm(BaseAlgorithm):
         model.__dict__.update(data)
         if "seed" in kwargs:
             model.set_random_seed(kwargs["seed"])
-        parameters = {
-            name.removesuffix(".pth"): load_tensors(members[name], budget)
-            for name in sorted(TENSORS & set(members))
-        }
-        _check_tables(parameters, model.get_parameters())
-        model.set_parameters(parameters, exact_match=True, device="cpu")
+        tables: Any = load_tensors(members[TABLES], budget) if TABLES in members else None
+        _check_tables(tables, model.policy.state_dict())
+        model.set_parameters({"policy": tables}, exact_match=True, device="cpu")
         return model
 
     @classmethod
@@ -344,11 +340,12 @@ class JsonAlgorithm(BaseAlgorithm):
         if not (replaced is None or isinstance(replaced, dict)):
             raise ValueError("custom_objects must be a dictionary or None")
         known = replaced or {}
+        named = "it" if isinstance(path, io.BufferedIOBase) else str(path)
         raw = parse_settings(members, budget)
         if raw.pop("algorithm", None) != cls.__name__:
-            raise ValueError(f"{_named(path)} does not hold a {cls.__name__} agent")
+            raise ValueError(f"{named} does not hold a {cls.__name__} agent")
         if raw.pop("format", None) != FORMAT_VERSION:
-            raise ValueError(f"{_named(path)} is written in another version of the file format")
+            raise ValueError(f"{named} is written in another version of the file format")
         return {
             name: known[name] if name in known else decode(value)
             for name, value in raw.items()
@@ -357,14 +354,10 @@ class JsonAlgorithm(BaseAlgorithm):
         }
 
 
-def _named(path: str | pathlib.Path | io.BufferedIOBase) -> str:
-    return "it" if isinstance(path, io.BufferedIOBase) else str(path)
-
-
-def _content(path: str | pathlib.Path | io.BufferedIOBase) -> bytes:
+def _content(path: str | Path | io.BufferedIOBase) -> bytes:
     """All of a file, read once; ``.zip`` is appended where there is none of that name."""
     if not isinstance(path, io.BufferedIOBase):
-        path = pathlib.Path(path)
+        path = Path(path)
         if not path.exists():
             path = path.with_name(f"{path.name}.zip")
     return content_of(path, MAX_ARCHIVE_BYTES)
@@ -379,22 +372,22 @@ def _check_names(model: BaseAlgorithm, data: Iterable[str]) -> None:
             raise UnsafeFileError(f"sets {shown(name)}, which is no attribute of such an agent")
 
 
-def _check_tables(found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+def _check_tables(found: Any, expected: Mapping[str, th.Tensor]) -> None:
     """Make sure that tables are of numbers, and of the kind that a new agent's have.
 
     PyTorch would turn one kind into another; of shapes, the policies make sure themselves.
     """
-    for name, tables in expected.items():
-        if not isinstance(found.get(name), dict):
-            raise UnsafeFileError(f"holds no {name}.pth")
-        for key, table in found[name].items():
-            like = tables.get(key)
-            if not isinstance(table, th.Tensor) or (like is not None and table.dtype != like.dtype):
-                raise UnsafeFileError(f"{name}.pth: {shown(key)} is not of the kind of such agents")
-            # Scores of arms that were never pulled are infinite from the beginning.
-            is_like = like is not None and like.shape == table.shape
-            may_be_infinite = is_like and bool(th.isinf(like).any())
-            check_values({name: {key: table[~th.isinf(table)] if may_be_infinite else table}})
+    if not isinstance(found, dict):
+        raise UnsafeFileError(f"holds no {TABLES}")
+    for key, table in found.items():
+        like = expected.get(key)
+        if not isinstance(table, th.Tensor) or (like is not None and table.dtype != like.dtype):
+            raise UnsafeFileError(f"{TABLES}: {shown(key)} is not of the kind of such agents")
+        # Scores of arms that were never pulled are infinite from the beginning.
+        if like is not None and like.shape == table.shape and bool(th.isinf(like).any()):
+            check_values({"policy": {key: table[~th.isinf(table)]}})
+        else:
+            check_values({"policy": {key: table}})
 
 
 def _zipped(data: Mapping[str, Any], params: dict[str, Any]) -> bytes:
@@ -438,9 +431,6 @@ class TablePolicy(BasePolicy):
     def _remade(cls, arguments: Mapping[str, Any]) -> Self:
         """A new policy from its spaces and what `_sizes` said."""
         return cls(**arguments)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return {**super()._get_constructor_parameters(), **self._sizes()}
 
     def save(self, path: str) -> None:
         """Write tensors, and what else the policy is made of as JSON: no pickle that is run."""

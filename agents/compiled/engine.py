@@ -54,7 +54,7 @@ _SIGNALS = [getattr(signal, name, None) for name in ("SIGINT", "SIGTERM", "SIGHU
 
 @contextmanager
 def interrupts_held() -> Iterator[Callable[[], bool]]:
-    """Let what the first signal raises wait until the ``with`` statement is left; a second not.
+    """Hold what the first signal raises until the ``with`` statement is left; not a second one.
 
     That is KeyboardInterrupt on Ctrl-C, and whatever the handlers raise that a program has set for
     SIGINT, SIGTERM and SIGHUP; they are called at once. Outside the main thread, where Python
@@ -224,15 +224,12 @@ class CompiledEngine:
         return self.log_interval - int(self.agent._episode_num) % self.log_interval
 
     def _tell(self, episodes: Episodes, n_steps: int, began: int = 0) -> bool:
-        """Monitor, statistics and callbacks; False once a callback asks to stop."""
+        """Tell Monitor, statistics and callbacks; False once a callback asks to stop."""
         agent = self.agent
         records = self.log.records[: self.progress[0]["n_records"]]
         before = Statistics(agent) if len(records) else None
         self.states.keep_rewards(episodes, self.log.rewards[:n_steps])
-        times = record_in_monitors(self.states.monitors, episodes)
-        for monitor in self.states.monitors:
-            if monitor is not None:
-                monitor.total_steps += n_steps
+        times = record_in_monitors(self.states.monitors, episodes, n_steps)
         # The statistics hear of the last step after the callbacks, as in the interpreted loop.
         earlier = int(np.searchsorted(episodes.steps, n_steps - 1))
         self._update_statistics(episodes, 0, earlier, times)
@@ -414,17 +411,13 @@ def _world_for(
 def check_class(algorithm: type) -> None:
     """Make sure that compiled functions do all that the algorithm does at a step."""
     order = algorithm.__mro__
+    settings: Any = algorithm.settings_type.names  # type: ignore[attr-defined]
     for place, cls in enumerate(order[: order.index(LearningAlgorithm)]):
         if cls.__module__.startswith("agents."):
             continue
         above = [vars(base) for base in order[place + 1 :] if base is not object]
         for name, value in vars(cls).items():
             in_python = hasattr(value, "__get__") and not hasattr(value, "py_func")
-            replaces = any(name in names for names in above) or name in _settings(algorithm)
+            replaces = any(name in names for names in above) or name in settings
             if in_python and replaces and name not in SETTINGS:
                 raise NotCompilable(f"{algorithm.__name__} has a {name} of its own in Python")
-
-
-def _settings(algorithm: Any) -> tuple[str, ...]:
-    """Names of what compiled functions are told of an agent."""
-    return tuple(algorithm.settings_type.names)

@@ -4,10 +4,9 @@ Handing a `numpy.random.Generator` to a compiled function takes longer than a st
 an array cannot hold several. A handle is a record of the four addresses that drawing needs: of the
 generator's state and of three functions. A draw by a handle is the generator's own next number.
 
-Calling such a function takes longer than drawing. Of PCG64, which NumPy's `default_rng` and
-Gymnasium use, the handle also has the place of the 256 bits that it consists of, and its few
-instructions stand here. That place is believed after what lies there was seen to be the state that
-the generator tells.
+Calling such a function takes longer than drawing. So PCG64, which NumPy's `default_rng` and
+Gymnasium use, is written out here, and a handle has the address of its 256 bits. We use the address
+only if its bytes equal `bit_generator.state`.
 
 Source: O'Neill, PCG: A Family of Simple Fast Space-Efficient Statistically Good Algorithms for
 Random Number Generation (2014), XSL-RR 128/64.
@@ -56,7 +55,7 @@ def handles_of(generators: Sequence[Generator]) -> NDArray[np.void]:
 
 
 def _place_of_pcg64(bits: Any) -> int:
-    """Where PCG64 has its state and increment; 0 for other generators, or where it is not sure."""
+    """The address of PCG64's state and increment; 0 for other generators, or where it is unsure."""
     if type(bits) is not PCG64 or sys.byteorder != "little":
         return 0
     place = ctypes.cast(bits.ctypes.state_address, ctypes.POINTER(ctypes.c_void_p))[0] or 0
@@ -66,7 +65,7 @@ def _place_of_pcg64(bits: Any) -> int:
 
 
 def _stepped(builder: Any, place: Any) -> Any:
-    """The state of the PCG64 that lies there, after one step."""
+    """The state of the PCG64 at that address, after one step."""
     state_at = builder.inttoptr(place, _WIDE.as_pointer())
     increment_at = builder.gep(state_at, [ir.Constant(_WORD, 1)])
     state = builder.load(state_at, align=8)
@@ -78,7 +77,7 @@ def _stepped(builder: Any, place: Any) -> Any:
 
 @intrinsic
 def _step_of_pcg64(typing_context: Any, place: Any) -> Any:
-    """One step of the PCG64 that lies there, without a number."""
+    """Advance the PCG64 at that address by one step."""
 
     def build(context: Any, builder: Any, signature: Any, places: Any) -> Any:
         _stepped(builder, places[0])
@@ -89,7 +88,7 @@ def _step_of_pcg64(typing_context: Any, place: Any) -> Any:
 
 @intrinsic
 def _pcg64(typing_context: Any, place: Any) -> Any:
-    """The next double of the PCG64 that lies there."""
+    """The next double of the PCG64 at that address."""
 
     def build(context: Any, builder: Any, signature: Any, places: Any) -> Any:
         state = _stepped(builder, places[0])
@@ -148,7 +147,7 @@ def next_uniform(handle: Any) -> float:
 
 @inlined
 def skip_uniform(handle: Any) -> None:
-    """Leave out the next number, which decides nothing."""
+    """Skip the next number."""
     if handle.pcg64 != 0:
         _step_at(handle.pcg64)
     else:

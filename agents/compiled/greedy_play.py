@@ -63,22 +63,16 @@ VECTOR_STATES: dict[type, tuple[tuple[str, ...], np.dtype[np.void]]] = {
 class EnvStates:
     """Environments of a training, and a record for each of them."""
 
-    def __init__(self, vec_env: DummyVecEnv, world: World) -> None:
+    def __init__(
+        self, vec_env: DummyVecEnv, world: World, kind: np.dtype[np.void] | None = None
+    ) -> None:
         self.vec_env = vec_env
-        self.vector_state, self._record_type = VECTOR_STATES.get(type(world), ((), FINITE_ENV))
-        # Of `FINITE_ENV`, or as `VECTOR_STATES` has them, shape (n_envs,).
-        self.records = env_records(vec_env.num_envs, self.record_type())
+        # Of what state the records are: of vectors, or of numbers.
+        self.vector_state, own_kind = VECTOR_STATES.get(type(world), ((), FINITE_ENV))
+        self.records = env_records(vec_env.num_envs, own_kind if kind is None else kind)
         self.monitors = [monitor_of(env) for env in vec_env.envs]
         # Monitor holds the rewards of the episode that is under way: so must we.
         self._unfinished: list[list[Floats]] = [[] for _ in vec_env.envs]
-
-    def record_type(self) -> np.dtype[np.void]:
-        """What the records hold."""
-        return self._record_type
-
-    def observation(self, i: int) -> Any:
-        """What environment ``i`` shows."""
-        return self.records[i]["obs"]
 
     def observations(self, records: Any, prefix: str) -> Any:
         """What is shown now (no prefix), before (``next_``) or after a reset (``new_``)."""
@@ -118,7 +112,8 @@ class EnvStates:
                     chunks = self._unfinished[i]
                     layer.rewards = np.concatenate(chunks).tolist() if chunks else []
                     layer.needs_reset = False
-            next(iter(self.vec_env.buf_obs.values()))[i] = self.observation(i)
+            (shown,) = self.observations(self.records[i : i + 1], "")
+            next(iter(self.vec_env.buf_obs.values()))[i] = shown
 
     def _write_state(self, base: Any, record: Any) -> None:
         if self.vector_state:
@@ -176,7 +171,7 @@ Playground = tuple[Any, EnvStates, Any]
 
 
 class Plan(NamedTuple):
-    """Does at each number that is observed what is written down."""
+    """Takes a fixed action for each number that is observed."""
 
     actions: Ints  # one for each number, shape (S,)
 
@@ -193,7 +188,7 @@ class Plan(NamedTuple):
 
 
 class Explorer(NamedTuple):
-    """Acts as an agent does in training, at a moment of it."""
+    """Acts as an agent does at one moment of its training."""
 
     agent: Any  # as compiled functions see it, drawing from another generator
     progress: Any  # how far the training is, of type `PROGRESS`, alone in an array
@@ -241,17 +236,10 @@ def play_episodes(
         new = log.episodes[: progress["logged_episodes"][0]]
         states.keep_rewards(Episodes.of(new), log.rewards[:n_steps])
         ended = np.concatenate([ended, new])
-    _leave(states, Episodes.of(ended), int(progress["num_timesteps"][0]) // n_envs)
-    return Episodes.of(ended[_are_first(ended["env"], wanted)])
-
-
-def _leave(states: EnvStates, ended: Episodes, n_steps: int) -> None:
-    """Let environments and Monitors be where all these episodes have led them."""
-    record_in_monitors(states.monitors, ended)
-    for monitor in states.monitors:
-        if monitor is not None:
-            monitor.total_steps += n_steps
+    n_done = int(progress["num_timesteps"][0]) // n_envs
+    record_in_monitors(states.monitors, Episodes.of(ended), n_done)
     states.write()
+    return Episodes.of(ended[_are_first(ended["env"], wanted)])
 
 
 def _n_missing(envs: Ints, wanted: Ints) -> int:
@@ -289,7 +277,7 @@ class CompiledEvaluations:
 
     @contextmanager
     def taking_over(self) -> Iterator[None]:
-        """Within the ``with`` statement the callbacks evaluate so."""
+        """Let the callbacks evaluate in compiled code within the ``with`` statement."""
         for callback in self.callbacks:
             vars(callback)["_on_step"] = partial(self.on_step, callback)
         try:
@@ -299,7 +287,7 @@ class CompiledEvaluations:
                 del vars(callback)["_on_step"]
 
     def evaluate_policy(self, model: Any, env: VecEnv, **given: Any) -> Any:
-        """As the library's, with the arguments that `EvalCallback` has for it."""
+        """Stands in for the library's function, with the arguments that `EvalCallback` gives it."""
         playground = None if given["render"] else self._playground(model, env)
         player = self._player(given["deterministic"], playground)
         if playground is None or player is None:

@@ -113,7 +113,9 @@ class Episodes:
         ]
 
 
-def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> list[float]:
+def record_in_monitors(
+    monitors: list[Monitor | None], episodes: Episodes, n_steps: int
+) -> list[float]:
     """Do for a block of episodes what each Monitor does at the end of each.
 
     All of them get the time of the end of the block.
@@ -123,6 +125,7 @@ def record_in_monitors(monitors: list[Monitor | None], episodes: Episodes) -> li
         if monitor is None:
             times.append(0.0)
             continue
+        monitor.total_steps += n_steps
         elapsed = time.time() - monitor.t_start
         times.append(round(elapsed, DECIMALS))
         chosen = slice(None) if len(monitors) == 1 else episodes.envs == i
@@ -148,7 +151,7 @@ def _write_rows(file: Any, returns: Floats, lengths: Ints, seconds: float) -> No
 
 
 class _Beginnings(dict[complex, str]):
-    """How the row of an episode begins; equal episodes are common where rewards are whole.
+    """Caches how the row of an episode begins: printing takes long, and equal episodes are common.
 
     By the return of an episode, and its length as the imaginary part.
     """

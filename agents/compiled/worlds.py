@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -372,15 +371,11 @@ World = FiniteModel | CartPole | MountainCar
 # Wrappers whose work the engine does itself, or that have none to do.
 COMMON_WRAPPERS = {Monitor, TimeLimit, OrderEnforcing, PassiveEnvChecker}
 CART_POLE_WRAPPERS = {DiscretizeObservation, *COMMON_WRAPPERS}
-MASK_WRAPPERS = {ActionMasks, IdleActionMasks}
-CHANGE_WRAPPERS = {
-    ClipReward,
-    FlattenToDiscrete,
-    OneHotObservation,
-    ScaleReward,
-    TerminationReward,
+MODEL_WRAPPERS = {
+    *COMMON_WRAPPERS,
+    *(ActionMasks, IdleActionMasks),
+    *(ClipReward, FlattenToDiscrete, OneHotObservation, ScaleReward, TerminationReward),
 }
-MODEL_WRAPPERS = {*CHANGE_WRAPPERS, *MASK_WRAPPERS, *COMMON_WRAPPERS}
 
 
 class NotCompilable(ValueError):  # noqa: N818  # no error: the interpreted loop takes over
@@ -411,8 +406,11 @@ def compile_envs(vec_env: VecEnv) -> World:
         _check_monitor(env)
     first, *others = vec_env.envs
     world = _world_of(first)
+    kinds = [type(layer) for layer in layers(first)]
     for other in others:
-        _check_alike(world, first, other)
+        alike = kinds == [type(layer) for layer in layers(other)]
+        if not (alike and all(map(cast(Any, np.array_equal), world, _world_of(other)))):
+            raise NotCompilable("the environments are not alike")
     return world
 
 
@@ -429,17 +427,6 @@ def _world_of(env: Env) -> World:
         return _mountain_car(env)
     with one_look(env):
         return _finite_model(env)
-
-
-def _check_alike(world: World, first: Env, other: Env) -> None:
-    kinds = [[type(layer) for layer in layers(env)] for env in (first, other)]
-    if kinds[0] != kinds[1] or not _are_equal(world, _world_of(other)):
-        raise NotCompilable("the environments are not alike")
-
-
-def _are_equal(world: World, other: World) -> bool:
-    fields: Iterable[tuple[Any, Any]] = zip(world, other, strict=True)
-    return all(np.array_equal(ours, theirs) for ours, theirs in fields)
 
 
 def _check_monitor(env: Env) -> None:

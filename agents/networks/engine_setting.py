@@ -104,7 +104,7 @@ PACE_AT_HOME = 3.9e-3  # of `machine_pace`'s work, where the others were measure
 
 @dataclass(frozen=True)
 class Work:
-    """What a training does."""
+    """The work of a training."""
 
     kind: Literal["q", "policy"]  # ``"q"`` or ``"policy"``, which is a network of values too
     n_steps: float  # environment steps, over all environments
@@ -170,12 +170,12 @@ _LAST_COMPILED = {"q": "learn_from_minibatch", "policy": "learn_from_rollout_min
 
 
 def compiling_seconds(work: Work) -> float:
-    """What compiling is still to take on this machine: nothing where its result is on the disk."""
+    """How long compiling will take on this machine: 0 where its result is in the cache."""
     return 0.0 if is_compiled_before(_LAST_COMPILED[work.kind]) else COMPILING
 
 
 def machine_pace() -> float:
-    """How long this machine takes for what takes 1 where the constants were measured."""
+    """How long this machine takes, relative to the one where the constants were measured."""
     rows, weights = th.ones(64, 64), th.full((64, 64), 1 / 64)
     taken = []
     with th.no_grad():
@@ -307,7 +307,7 @@ class CompiledNetworks(BaseAlgorithm):
         return network_player(self.shared_networks(seen)[0][0], seen, predicted)
 
     def _schedules(self) -> list[Schedule]:
-        """What a training in the compiled loop works out by itself."""
+        """The schedules that compiled code evaluates."""
         return [self.lr_schedule]
 
     def learn(self, total_timesteps: int, *args: Any, **kwargs: Any) -> Self:
@@ -347,7 +347,7 @@ class CompiledNetworks(BaseAlgorithm):
             return EnginePlan(is_compiled=True, in_python=str(reason))
 
     def work(self, total_timesteps: int, callback: Any = None) -> Work:
-        """What a training with these arguments of `learn` does."""
+        """The work of a training with these arguments of `learn`."""
         steps = float(total_timesteps)
         for each in _each(callback):
             if isinstance(each, EpisodeBudget):
@@ -356,7 +356,7 @@ class CompiledNetworks(BaseAlgorithm):
 
     @abstractmethod
     def _work_of(self, n_steps: float) -> Work:
-        """What a training of so many steps does."""
+        """The work of a training of so many steps."""
 
     @contextmanager
     def _learning_compiled(self) -> Iterator[None]:

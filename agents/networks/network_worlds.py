@@ -76,15 +76,10 @@ class NetworkEnvStates(EnvStates):
 
     def __init__(self, vec_env: Any, world: Any, seen: Any) -> None:
         self.seen = seen
-        super().__init__(vec_env, getattr(world, "dynamics", world))
-
-    def record_type(self) -> np.dtype[np.void]:
-        """With room for what networks expect, and for vectors."""
-        return _record_in_full(self.vector_state) if self.vector_state else _FINITE_ENV
-
-    def observation(self, i: int) -> Any:
-        """What environment ``i`` shows, in the shape that it has in the environment's space."""
-        return self.observations(self.records[i : i + 1], "")[0]
+        world = getattr(world, "dynamics", world)
+        vectors = VECTOR_STATES.get(type(world))
+        kind = _FINITE_ENV if vectors is None else _record_in_full(vectors[0])
+        super().__init__(vec_env, world, kind)
 
     def observations(self, records: Any, prefix: str) -> Any:
         """What is shown now (no prefix), before (``next_``) or after a reset (``new_``)."""

@@ -193,7 +193,7 @@ def activate(rows: Singles, bias: Singles, kind: int) -> None:
 
 @vectorised
 def pull_back(errors: Singles, outputs: Singles, kind: int) -> None:
-    """Turn derivatives by the outputs into those by the inputs, in place; both of shape (n, d)."""
+    """Turn derivatives by the outputs into those by the inputs, in place, shape (n, d)."""
     for i in range(len(errors)):
         error, output = errors[i], outputs[i]
         if kind == RELU:
@@ -412,7 +412,7 @@ def descend(
 
 @vectorised
 def _clipping(gradient: Singles, max_grad_norm: float) -> Any:
-    """What gradients are multiplied by, as ``torch.nn.utils.clip_grad_norm_`` has it."""
+    """The factor by which ``torch.nn.utils.clip_grad_norm_`` scales the gradient."""
     total = _ZERO
     for i in range(len(gradient)):
         total += gradient[i] * gradient[i]

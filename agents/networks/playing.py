@@ -84,7 +84,7 @@ class AskingNetwork(Reference):
 
 
 class NetworkPlayer(NamedTuple):
-    """What the compiled loop asks."""
+    """The agent as the compiled loop calls it."""
 
     network: Any  # an `AskingNetwork`
     seen: Any  # how observations are read, of `agents.networks.observations`

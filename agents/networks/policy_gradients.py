@@ -59,7 +59,7 @@ def log_normalizer(logits: Singles) -> float:
 
 @inlined
 def draw(logits: Singles, uniform: float) -> int:
-    """The action that a number in [0, 1) picks."""
+    """Sample an action by a uniform number in [0, 1)."""
     normalizer, cumulative = log_normalizer(logits), 0.0
     for k in range(len(logits) - 1):
         cumulative += math.exp(float(logits[k]) - normalizer)
@@ -90,7 +90,7 @@ def turn_into_slopes(
     by_log: float,
     by_entropy: float,
 ) -> None:
-    """Derivatives by the logits of what depends on them in two ways, in place of probabilities."""
+    """Replace the probabilities by the derivatives of the loss by the logits."""
     for k in range(len(logits)):
         probability = float(probabilities[k])
         surplus = float(logits[k]) - normalizer + entropy
@@ -251,7 +251,7 @@ def learn_from_rollout_minibatch(learner: Any, n_rows: float, learning_rate: flo
 
 @called
 def standardize(numbers: Singles) -> None:
-    """Give them mean 0 and standard deviation 1, as far as they have one."""
+    """Scale the numbers to mean 0 and standard deviation 1."""
     n = len(numbers)
     mean = squares = 0.0
     for i in range(n):
@@ -447,7 +447,7 @@ def learn_for_an_epoch(learner: Any, learning_rate: float) -> tuple[int, bool]:
 
 
 class PolicyAgent(NamedTuple):
-    """What the compiled loop asks."""
+    """The agent as the compiled loop calls it."""
 
     learner: Any  # a reference to a `PolicyLearner`
     memory: Any  # one to the `RolloutMemory` that it learns from
@@ -608,7 +608,7 @@ class PolicyTraining(NetworkTraining):
         )
 
     def _bound_now(self, schedule: Schedule | None) -> ScheduleRow:
-        """What any schedule of a bound says at the moment, as one that does not change."""
+        """The present value of a bound's schedule, as a constant one."""
         if schedule is None:
             return _bound(None)
         return _bound(FloatSchedule(schedule(self.agent._current_progress_remaining)))
@@ -635,7 +635,7 @@ class PolicyTraining(NetworkTraining):
         )
 
     def in_loop(self) -> PolicyAgent:
-        """What the compiled loop asks."""
+        """The agent as the compiled loop calls it."""
         functions = (choose_randomly, evaluate, estimate_advantages, train)
         addresses = (address_of(function, self.learner) for function in functions)
         return PolicyAgent(self.learner, self.memory, self.seen, *addresses)
@@ -653,7 +653,7 @@ class PolicyTraining(NetworkTraining):
         self.place["step"] = self.place["n_rollouts"] = 0
 
     def read(self) -> None:
-        """Begin where the agent is."""
+        """Copy the agent's counters into the compiled record."""
         agent, place = self.agent, self.place
         place["step"] = agent.collected
         place["remaining"] = agent._current_progress_remaining
@@ -661,7 +661,7 @@ class PolicyTraining(NetworkTraining):
         self.held.starts[:] = agent._last_episode_starts
 
     def write(self) -> None:
-        """Let the agent know where compiled code is."""
+        """Copy the compiled record's counters to the agent."""
         agent, place = self.agent, self.place[0]
         agent._n_updates = int(place["n_updates"])
         agent.collected = int(place["step"])
@@ -693,7 +693,7 @@ class PolicyTraining(NetworkTraining):
 
     @property
     def is_rollout_over(self) -> bool:
-        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
+        """Whether a rollout waits to be learnt from, also where nothing is due yet."""
         return bool(self.place["step"][0] == self.agent.n_steps)
 
     def until_rollout_end(self) -> Horizon:
@@ -786,7 +786,7 @@ class PolicyTraining(NetworkTraining):
         return actions
 
     def _said(self, env: VecEnv, step: int) -> dict[str, Any]:
-        """What callbacks read under the library's names of where the rollout is."""
+        """The local variables of the library's rollout loop that callbacks read."""
         rollout = self.held.rollout
         return {
             "self": self.agent,
@@ -799,7 +799,7 @@ class PolicyTraining(NetworkTraining):
         }
 
     def _cut_off(self, dones: Bools, infos: list[dict[str, Any]]) -> Singles:
-        """What would have come after episodes that ran out of time, shape (E,)."""
+        """Discounted values of what would have followed episodes out of time, shape (E,)."""
         lost = np.zeros(len(dones), np.float32)
         values = np.zeros(1, np.float32)
         shown = self.shown[:1]

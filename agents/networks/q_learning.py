@@ -79,7 +79,7 @@ class Memory(NamedTuple):
 
 @inlined
 def clipped(number: float, bound: float) -> float:
-    """As it is within the bound; what is not a number stays that."""
+    """The number within plus and minus the bound; nan stays nan."""
     if number > bound:
         return bound
     return -bound if number < -bound else number
@@ -87,7 +87,7 @@ def clipped(number: float, bound: float) -> float:
 
 @inlined
 def show_normalised(memory: Memory, inputs: Inputs, i: int, row: Any) -> None:
-    """As `show`, the way VecNormalize shows it now."""
+    """As `show`, normalised by VecNormalize's present statistics."""
     rules = memory.rules[0]
     if not rules.normalises_observations:
         show(inputs, i, row, memory.one_hot)
@@ -99,7 +99,7 @@ def show_normalised(memory: Memory, inputs: Inputs, i: int, row: Any) -> None:
 
 @inlined
 def reward_of(memory: Memory, at: int, env: int) -> Any:
-    """A reward, the way VecNormalize gives it now."""
+    """A reward, normalised by VecNormalize's present statistics."""
     reward, rules = memory.replay.rewards[at, env], memory.rules[0]
     if not rules.normalises_rewards:
         return reward
@@ -290,7 +290,7 @@ def train(learner: Any, n_updates: float, learning_rate: float) -> int:
 
 
 class QAgent(NamedTuple):
-    """What the compiled loop asks."""
+    """The agent as the compiled loop calls it."""
 
     learner: Any  # a reference to a `QLearner`
     memory: Any  # one to the `Memory` that it learns from
@@ -481,7 +481,7 @@ class QTraining(NetworkTraining):
         )
 
     def in_loop(self) -> QAgent:
-        """What the compiled loop asks."""
+        """The agent as the compiled loop calls it."""
         learner = self.learner
         choose, learn = (address_of(function, learner) for function in (choose_greedily, train))
         return QAgent(learner, self.memory, self.seen, choose, learn)
@@ -513,7 +513,7 @@ class QTraining(NetworkTraining):
         self.place["collected"] = self.place["collected_episodes"] = 0
 
     def read(self) -> None:
-        """Begin where the agent is."""
+        """Copy the agent's counters into the compiled record."""
         agent, place = self.agent, self.place
         place["position"], place["full"] = agent.replay_buffer.pos, agent.replay_buffer.full
         place["n_calls"], place["n_updates"] = agent._n_calls, agent._n_updates
@@ -521,7 +521,7 @@ class QTraining(NetworkTraining):
         place["collected"], place["collected_episodes"] = agent.collected
 
     def write(self) -> None:
-        """Let the agent know where compiled code is."""
+        """Copy the compiled record's counters to the agent."""
         agent, place = self.agent, self.place[0]
         buffer = agent.replay_buffer
         buffer.pos, buffer.full = int(place["position"]), bool(place["full"])
@@ -578,7 +578,7 @@ class QTraining(NetworkTraining):
 
     @property
     def is_rollout_over(self) -> bool:
-        """Whether a rollout waits to be learnt from, be it that nothing is learnt yet."""
+        """Whether a rollout waits to be learnt from, also where nothing is due yet."""
         return bool(self.place["is_over"][0])
 
     def until_rollout_end(self) -> Horizon:

@@ -63,7 +63,7 @@ class Network:
 
 
 def network_of(modules: Iterable[nn.Module], start: int, *, one_hot: bool) -> Network:
-    """What linear layers with one activation function in between come to.
+    """The perceptron that linear layers with one activation function in between make.
 
     Its parameters begin at ``start`` of the flat vector. NotCompilable for anything else.
     """
@@ -126,14 +126,14 @@ class FlatTensors:
             begin = end
 
     def take_over(self) -> None:
-        """Let those look into the vector that lie elsewhere, as somebody has put them there."""
+        """Move parameters into the vector that lie elsewhere, as after a callback replaced them."""
         for parameter, place in self.places:
             if parameter.data_ptr() != place.data_ptr():
                 place.copy_(parameter.data)
                 parameter.data = place
 
     def give_back(self) -> None:
-        """Let them have memory of their own."""
+        """Give the parameters memory of their own again."""
         for parameter, _ in self.places:
             parameter.data = parameter.data.clone(memory_format=th.contiguous_format)
 
@@ -190,7 +190,7 @@ class SharedOptimizer:
         self.made_from = self._made_from()
 
     def _made_from(self) -> tuple[Any, ...]:
-        """What changes where somebody loads another state, or takes another optimizer."""
+        """What changes once another state is loaded, or another optimizer is used."""
         optimizer = self.policy.optimizer
         group = optimizer.param_groups[0]
         settings = [group.get(name) for name in _SETTINGS]
@@ -204,7 +204,7 @@ class SharedOptimizer:
         return id(optimizer), settings, memory, trained
 
     def give_back(self) -> None:
-        """Let what it remembers have memory of its own; nothing, where it has taken no step."""
+        """Give its state memory of its own again; no state, where it has taken no step."""
         known: Any = self.optimizer.state
         kind, _ = _kind(self.optimizer)
         remembered = [parameter for parameter in self.parameters if parameter in known]
