@@ -118,7 +118,7 @@ def record_in_monitors(
 ) -> list[float]:
     """Do for a block of episodes what each Monitor does at the end of each.
 
-    All of them get the time of the end of the block.
+    All get the time of the end of the block, which is returned, in seconds since each was made.
     """
     times = []
     for i, monitor in enumerate(monitors):
