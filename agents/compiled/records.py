@@ -175,8 +175,7 @@ def _rounded(episode_return: float) -> float:
 #
 # A log of every 100 episodes is due some ten thousand times a second. The compiled loop notes what
 # each record depends on, and all that the logger's outputs are told of a block is worked out at
-# once.
-# TensorBoard's file is appended to in one go: its own writer opens the file anew for each number.
+# once. TensorBoard's file is appended to in one go: its own writer opens it for each number.
 #
 # Format of the file: TensorFlow's `tfrecord`, each record an `Event` of TensorBoard with one value,
 # as `SummaryWriter.add_scalar` has it; checksums are CRC-32C (RFC 3720), masked.
@@ -206,13 +205,11 @@ def keeps_records(agent: Any, log_interval: int | None) -> bool:
         and type(logger).dump is Logger.dump
         and not any(hasattr(Logger, name) for name in vars(logger))
         and agent.logs_by_records
-        and all(_is_ours(type(agent), name) for name in ("_record_training", "dump_logs"))
+        and all(
+            getattr(type(agent), name).__module__.startswith("agents.")
+            for name in ("_record_training", "dump_logs")
+        )
     )
-
-
-def _is_ours(algorithm: type, name: str) -> bool:
-    module: str = getattr(algorithm, name).__module__
-    return module.partition(".")[0] == "agents"
 
 
 class Statistics:

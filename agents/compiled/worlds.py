@@ -298,7 +298,7 @@ class CartPole(NamedTuple):
         env.new_obs = bin_index(self, env)
 
     @inlined
-    def show(self, env: Any, vector: Any) -> None:
+    def show_state(self, env: Any, vector: Any) -> None:
         """What the agent sees where there are no bins, in single precision, shape (4,)."""
         vector[0] = np.float32(env.x)
         vector[1] = np.float32(env.x_dot)
@@ -357,7 +357,7 @@ class MountainCar(NamedTuple):
         env.new_obs = 0
 
     @inlined
-    def show(self, env: Any, vector: Any) -> None:
+    def show_state(self, env: Any, vector: Any) -> None:
         """What the agent sees, in single precision, shape (2,)."""
         vector[0] = np.float32(env.position)
         vector[1] = np.float32(env.velocity)

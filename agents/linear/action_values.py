@@ -27,7 +27,7 @@ from agents.compiled.loop import CompiledOnlyError, by_type
 from agents.compiled.worlds import UNDECIDED
 from agents.linear.algorithm import TileAlgorithm, TileArguments
 from agents.linear.tiles import LinearAgent, add_up, choose, look, move_sum, sum_of
-from agents.networks.observations import AFTER, BEFORE, move_on
+from agents.networks.network_worlds import AFTER, BEFORE, move_on
 from machine_code.compiling import called
 from mdp.array_types import Floats
 

@@ -46,8 +46,13 @@ from agents.linear.tiles import (
     tiles_of_all,
     vectors_of,
 )
-from agents.networks.network_worlds import NetworkEnvStates, network_playground, network_world
-from agents.networks.observations import BEFORE, move_on
+from agents.networks.network_worlds import (
+    BEFORE,
+    NetworkEnvStates,
+    move_on,
+    network_playground,
+    network_world,
+)
 from machine_code.compiling import called
 from mdp.array_types import Floats, Ints
 
@@ -181,7 +186,7 @@ class SeenWorld(NamedTuple):
 
     Attributes:
         world: what `agents.compiled.loop` steps.
-        seen: one of the kinds of `agents.networks.observations`.
+        seen: one of the kinds of `agents.networks.network_worlds`.
     """
 
     world: Any
@@ -374,7 +379,7 @@ class TileAlgorithm(LearningAlgorithm):
 
         Args:
             rng: its generator.
-            seen: how observations are read, one of the kinds of `agents.networks.observations`.
+            seen: how observations are read, one of the kinds of `agents.networks.network_worlds`.
         """
         tiles = self.policy.tiles
         here, ahead = np.empty((2, tiles.n_tilings), dtype=np.int64)

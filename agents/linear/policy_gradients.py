@@ -17,7 +17,7 @@ from agents.compiled.generators import next_uniform
 from agents.compiled.worlds import NotCompilable
 from agents.linear.algorithm import TileAlgorithm, TileArguments
 from agents.linear.tiles import LinearAgent, add_up, look, move_sum
-from agents.networks.observations import AFTER, BEFORE, move_on
+from agents.networks.network_worlds import AFTER, BEFORE, move_on
 from envs.known_models import time_limit
 from machine_code.compiling import called
 from mdp.array_types import Floats, Ints

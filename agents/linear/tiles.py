@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from agents.common.masks import numbers_in
 from agents.compiled.loop import CompiledOnlyError, act, by_type, learn_from_step
 from agents.compiled.worlds import UNDECIDED
-from agents.networks.observations import BEFORE, observe
+from agents.networks.network_worlds import BEFORE, observe
 from machine_code.compiling import called, kernel
 from mdp.array_types import Floats, Ints
 

@@ -25,8 +25,7 @@ from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.loop import learn_from_last_step, run_block
 from agents.compiled.records import Episodes
 from agents.compiled.worlds import NotCompilable
-from agents.networks.network_worlds import NetworkEnvStates, network_playground
-from agents.networks.observations import Numbers
+from agents.networks.network_worlds import NetworkEnvStates, Numbers, network_playground
 from agents.networks.torch_bridge import FlatTensors, Reference, SharedOptimizer, address_of
 
 if TYPE_CHECKING:

@@ -31,8 +31,7 @@ from agents.common.settings import check_option, full_signature
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.worlds import NotCompilable
 from agents.networks.engine import NetworkEngine, RolloutEvents
-from agents.networks.network_worlds import network_world
-from agents.networks.observations import Numbers, OwnVectors
+from agents.networks.network_worlds import Numbers, OwnVectors, network_world
 from agents.networks.perceptron import Inputs, one_thread
 from agents.networks.playing import NetworkPlayer, network_player
 from agents.networks.torch_bridge import Network, check_optimizer, in_rows

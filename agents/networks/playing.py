@@ -14,7 +14,7 @@ import numpy as np
 import torch as th
 
 from agents.common.exploration import first_best
-from agents.networks.observations import BEFORE, look, move_on
+from agents.networks.network_worlds import BEFORE, look, move_on
 from agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -87,7 +87,7 @@ class NetworkPlayer(NamedTuple):
     """The agent as the compiled loop calls it."""
 
     network: Any  # an `AskingNetwork`
-    seen: Any  # how observations are read, of `agents.networks.observations`
+    seen: Any  # how observations are read, of `agents.networks.network_worlds`
     choose: np.uintp  # the address of `choose_surely`
 
     @inlined

@@ -17,14 +17,14 @@ from stable_baselines3.common.utils import FloatSchedule
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from agents.common.callbacks import NEVER, Horizon
+from agents.common.callbacks import Horizon
 from agents.common.schedules import ScheduleRow, schedule_value
 from agents.compiled.generators import handles_of, next_uniform
 from agents.compiled.learning_algorithm import compiled_schedule
 from agents.compiled.worlds import SCHEDULE, NotCompilable
 from agents.networks.engine import NOWHERE, NetworkTraining, record_of
 from agents.networks.engine_setting import CompiledNetworks, Work, work_of
-from agents.networks.observations import AFTER, BEFORE, Numbers, look, move_on, observe, show
+from agents.networks.network_worlds import AFTER, BEFORE, Numbers, look, move_on, observe, show
 from agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -451,7 +451,7 @@ class PolicyAgent(NamedTuple):
 
     learner: Any  # a reference to a `PolicyLearner`
     memory: Any  # one to the `RolloutMemory` that it learns from
-    seen: Any  # how observations are read, of `agents.networks.observations`
+    seen: Any  # how observations are read, of `agents.networks.network_worlds`
     choose: np.uintp  # the address of `choose_randomly`
     evaluate: np.uintp  # that of `evaluate`
     estimate: np.uintp  # that of `estimate_advantages`
@@ -679,14 +679,14 @@ class PolicyTraining(NetworkTraining):
         """When something is logged next."""
         in_rollout = self.agent.n_steps - int(self.place["step"][0])
         if log_interval is None:
-            return Horizon(NEVER, NEVER)
+            return Horizon()
         iteration = int(self.place["n_rollouts"][0]) + 1
         # By asking, as a training that was resumed has an interval that counts on.
         for n_more in range(_MOST_ROLLOUTS):
             if (iteration + n_more) % log_interval == 0:
                 break
         # What is logged then is of the training before, which has to be told by itself.
-        return Horizon(in_rollout + max(n_more - 1, 0) * self.agent.n_steps, NEVER)
+        return Horizon(in_rollout + max(n_more - 1, 0) * self.agent.n_steps)
 
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
         """Nothing: it logs by rollouts."""
@@ -699,7 +699,7 @@ class PolicyTraining(NetworkTraining):
     def until_rollout_end(self) -> Horizon:
         """When a rollout ends that is to wait."""
         in_rollout = self.agent.n_steps - int(self.place["step"][0])
-        return Horizon(in_rollout if self.waits else NEVER, NEVER)
+        return Horizon(in_rollout) if self.waits else Horizon()
 
     def learn_from_rollout(self, remaining: float) -> None:
         """Learn from the rollout that waits, with that share of the training left."""

@@ -13,13 +13,13 @@ from stable_baselines3.common.type_aliases import Schedule, TrainFrequencyUnit
 from stable_baselines3.common.utils import update_learning_rate
 from stable_baselines3.common.vec_env import VecNormalize
 
-from agents.common.callbacks import NEVER, Horizon
+from agents.common.callbacks import Horizon
 from agents.common.exploration import first_best
 from agents.compiled.generators import handles_of, next_uniform
 from agents.compiled.worlds import NotCompilable
 from agents.networks.engine import NOWHERE, NetworkTraining, record_of
 from agents.networks.engine_setting import STEPS_OF_EPISODE, CompiledNetworks, Work, work_of
-from agents.networks.observations import AFTER, BEFORE, Numbers, look, move_on, observe, show
+from agents.networks.network_worlds import AFTER, BEFORE, Numbers, look, move_on, observe, show
 from agents.networks.perceptron import (
     Inputs,
     Layers,
@@ -294,7 +294,7 @@ class QAgent(NamedTuple):
 
     learner: Any  # a reference to a `QLearner`
     memory: Any  # one to the `Memory` that it learns from
-    seen: Any  # how observations are read, of `agents.networks.observations`
+    seen: Any  # how observations are read, of `agents.networks.network_worlds`
     choose: np.uintp  # the address of `choose_greedily`
     train: np.uintp  # that of `train`
 
@@ -540,8 +540,8 @@ class QTraining(NetworkTraining):
     def until_log(self, log_interval: int | None) -> Horizon:
         """When something is logged next."""
         if log_interval is None:
-            return Horizon(NEVER, NEVER)
-        return Horizon(NEVER, log_interval - self.agent._episode_num % log_interval)
+            return Horizon()
+        return Horizon(episodes=log_interval - self.agent._episode_num % log_interval)
 
     def count_episodes(self, n_episodes: int, log_interval: int | None) -> None:
         """Let the agent know of episodes that have ended, and log where it is time to."""
@@ -585,10 +585,10 @@ class QTraining(NetworkTraining):
         """When a rollout ends that is to wait."""
         place, rules = self.place[0], self.held.rules[0]
         if not self.waits:
-            return Horizon(NEVER, NEVER)
+            return Horizon()
         if rules["counts_episodes"]:
-            return Horizon(NEVER, int(rules["train_freq"] - place["collected_episodes"]))
-        return Horizon(int(rules["train_freq"] - place["collected"]), NEVER)
+            return Horizon(episodes=int(rules["train_freq"] - place["collected_episodes"]))
+        return Horizon(int(rules["train_freq"] - place["collected"]))
 
     def learn_from_rollout(self, remaining: float) -> None:
         """Learn from the rollout that waits, with that share of the training left."""
