@@ -244,19 +244,13 @@ MOST_FIGURES = 3  # agents whose figures stand in a line
 
 @dataclass(frozen=True)
 class Conclusion:
-    """What the runs on an environment say.
+    """What the runs on an environment say."""
 
-    Attributes:
-        lead: who is best, and how that stands to the optimum.
-        pairs: every verdict, with figures; several in a sentence.
-        failed: whose runs failed, to stand beside verdicts that are shown as signs; may be empty.
-        notes: failures, how soon agents arrive, training on variants, what is missing, what failed
-            agents do instead, and how often the runs have been looked at.
-    """
-
-    lead: str
-    pairs: tuple[str, ...]
-    failed: str
+    lead: str  # who is best, and how that stands to the optimum
+    pairs: tuple[str, ...]  # every verdict, with figures; several in a sentence
+    failed: str  # whose runs failed, to stand beside verdicts that are shown as signs; may be empty
+    # Failures, how soon agents arrive, training on variants, what is missing, what failed agents
+    # do instead, and how often the runs have been looked at.
     notes: tuple[str, ...]
 
     @property

@@ -25,29 +25,18 @@ from verdicts import Verdict
 
 @dataclass(frozen=True)
 class MarkupLanguage:
-    """How text becomes markup. All take plain text, but for ``table``, whose cells are markup.
+    """How text becomes markup. All take plain text, but for ``table``, whose cells are markup."""
 
-    Attributes:
-        preamble: what stands above all else, of the whole text below it.
-        title, heading: of the whole, and of a part.
-        command: a line for a terminal.
-        text: a paragraph in which nothing is markup.
-        items: a list of such texts.
-        name: a label.
-        figure: numbers and units.
-        bold: such a figure, made to stand out.
-        table: by headings, rows, and a caption; none has line breaks.
-    """
-
-    preamble: Callable[[str], str]
-    title: Callable[[str], str]
+    preamble: Callable[[str], str]  # what stands above all else, of the whole text below it
+    title: Callable[[str], str]  # of the whole, and of a part
     heading: Callable[[str], str]
-    command: Callable[[str], str]
-    text: Callable[[str], str]
-    items: Callable[[Sequence[str]], str]
-    name: Callable[[str], str]
-    figure: Callable[[str], str]
-    bold: Callable[[str], str]
+    command: Callable[[str], str]  # a line for a terminal
+    text: Callable[[str], str]  # a paragraph in which nothing is markup
+    items: Callable[[Sequence[str]], str]  # a list of such texts
+    name: Callable[[str], str]  # a label
+    figure: Callable[[str], str]  # numbers and units
+    bold: Callable[[str], str]  # such a figure, made to stand out
+    # By headings, rows, and a caption; none has line breaks.
     table: Callable[[Sequence[str], Sequence[Sequence[str]], str], str]
 
 

@@ -103,17 +103,11 @@ def colour_of(mark: Mark) -> str:
 
 @dataclass(frozen=True)
 class FigureFiles:
-    """The files that figures become.
+    """The files that figures become."""
 
-    Attributes:
-        folder: where.
-        formats: which: "png", "svg", "pdf".
-        written: those that there are by now.
-    """
-
-    folder: Path
-    formats: Sequence[str] = FORMATS[:2]
-    written: list[Path] = field(default_factory=list)
+    folder: Path  # where
+    formats: Sequence[str] = FORMATS[:2]  # which: "png", "svg", "pdf"
+    written: list[Path] = field(default_factory=list)  # those that there are by now
 
     @contextmanager
     def figure(

@@ -20,22 +20,14 @@ from verdicts import Estimate, ThresholdSummary
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell.
+    """One cell."""
 
-    Attributes:
-        text: the figure.
-        value: what it is sorted by; None puts it last.
-        note: what the page has below it in small print.
-        in_line: what the terminal has in place of the text, where it has something else.
-        aside: what the page says where the pointer rests on it.
-        bar: low end, point and high end, each between 0 and 1, of a bar to draw; or None.
-    """
-
-    text: str
-    value: float | None
-    note: str = ""
-    in_line: str = ""
-    aside: str = ""
+    text: str  # the figure
+    value: float | None  # what it is sorted by; None puts it last
+    note: str = ""  # what the page has below it in small print
+    in_line: str = ""  # what the terminal has in place of the text, where it has something else
+    aside: str = ""  # what the page says where the pointer rests on it
+    # Low end, point and high end, each between 0 and 1, of a bar to draw; or None.
     bar: tuple[float, float, float] | None = None
 
 
@@ -112,23 +104,16 @@ AnyRow = TypeVar("AnyRow", bound=Row)
 
 @dataclass(frozen=True, kw_only=True)
 class Column(Generic[AnyRow]):
-    """One column. A heading that is empty leaves it out there.
+    """One column. A heading that is empty leaves it out there."""
 
-    Attributes:
-        cell: what it says on an agent; None where it does not apply.
-        page: its heading on the page.
-        help: what stands below that heading; ``{threshold}`` is the environment's.
-        terminal: its heading in the terminal.
-        caption: what the terminal explains below the table, likewise; ``{variants}`` explains the
-            mark of agents that were trained on a variant of the environment.
-        best_first: the order that puts the best first; None for that of the study's metric.
-    """
-
-    cell: Callable[[AnyRow], Cell | None]
-    page: str = ""
-    help: str = ""
-    terminal: str = ""
+    cell: Callable[[AnyRow], Cell | None]  # what it says on an agent; None where it does not apply
+    page: str = ""  # its heading on the page
+    help: str = ""  # what stands below that heading; ``{threshold}`` is the environment's
+    terminal: str = ""  # its heading in the terminal
+    # What the terminal explains below the table, likewise; ``{variants}`` explains the mark of
+    # agents that were trained on a variant of the environment.
     caption: str = ""
+    # The order that puts the best first; None for that of the study's metric.
     best_first: Order | None = None
 
     def order(self, study: StudySpec) -> Order:

@@ -37,19 +37,13 @@ DASHES: tuple[Dash, ...] = ("solid", "dash", "dashdot", "dot")
 
 @dataclass(frozen=True)
 class Mark:
-    """How an agent is drawn.
+    """How an agent is drawn."""
 
-    Attributes:
-        label: the agent's.
-        colour: the place of its colour in `COLOURS`.
-        dash: its line style, as Plotly calls it.
-        shape: how often the colours have been gone through before: the page gives the dot beside a
-            name another shape each time.
-    """
-
-    label: str
-    colour: int
-    dash: Dash
+    label: str  # the agent's
+    colour: int  # the place of its colour in `COLOURS`
+    dash: Dash  # its line style, as Plotly calls it
+    # How often the colours have been gone through before: the page gives the dot beside a name
+    # another shape each time.
     shape: int = 0
 
 
@@ -84,18 +78,14 @@ class Curve:
 
 @dataclass(frozen=True)
 class LearningCurves:
-    """The mean curves on an environment.
+    """The mean curves on an environment."""
 
-    Attributes:
-        by_axis: by axis, and then by agent, the best first; an agent without a curve is left out.
-        linear_up_to: where a symmetric logarithmic axis of returns ceases to be linear; None for a
-            linear axis.
-        on_variant: agents whose returns are of a variant of the environment, so that they are not
-            to be held against the optimum.
-    """
-
+    # By axis, and then by agent, the best first; an agent without a curve is left out.
     by_axis: Mapping[str, Mapping[str, Curve]]
+    # Where a symmetric logarithmic axis of returns ceases to be linear; None for a linear axis.
     linear_up_to: float | None
+    # Agents whose returns are of a variant of the environment, so that they are not to be held
+    # against the optimum.
     on_variant: tuple[str, ...] = ()
 
 
@@ -224,20 +214,13 @@ def truth(statistics: PullStatistics, context: int, arm: int) -> float | None:
 
 @dataclass(frozen=True)
 class Belief:
-    """What an agent believed of the arms in its first run.
+    """What an agent believed of the arms in its first run."""
 
-    Attributes:
-        agent: its label.
-        moments: after how many pulls, shape (n_moments,).
-        points: mean rewards that the densities are given at, shape (n_points,).
-        densities: shape (n_moments, n_contexts, n_arms, n_points).
-        true_means: by context and arm; None for an agent that knows no contexts.
-    """
-
-    agent: str
-    moments: Ints
-    points: Floats
-    densities: Floats
+    agent: str  # its label
+    moments: Ints  # after how many pulls, shape (n_moments,)
+    points: Floats  # mean rewards that the densities are given at, shape (n_points,)
+    densities: Floats  # shape (n_moments, n_contexts, n_arms, n_points)
+    # By context and arm; None for an agent that knows no contexts.
     true_means: list[list[float | None]]
 
 
@@ -341,41 +324,27 @@ class RegretBounds:
 
 @dataclass(frozen=True)
 class ArmSeries:
-    """Arms in the order of contexts, each array of shape (n_contexts * n_arms,).
+    """Arms in the order of contexts, each array of shape (n_contexts * n_arms,)."""
 
-    Attributes:
-        n_contexts: how many.
-        names: what the arms are called.
-        means: their true mean rewards.
-        shares: by agent, the share of the pulls in the context that went to them.
-        estimates: by agent that has some, final estimates of the means, mean and standard deviation
-            over runs.
-    """
-
-    n_contexts: int
-    names: list[str]
-    means: Floats
+    n_contexts: int  # how many
+    names: list[str]  # what the arms are called
+    means: Floats  # their true mean rewards
+    # By agent, the share of the pulls in the context that went to them.
     shares: Mapping[str, Floats]
+    # By agent that has some, final estimates of the means, mean and standard deviation over runs.
     estimates: Mapping[str, tuple[Floats, Floats]]
 
 
 @dataclass(frozen=True)
 class PullSeries:
-    """What there is to draw of a bandit.
+    """What there is to draw of a bandit."""
 
-    Attributes:
-        pulls: figures by pull of each agent, the best first.
-        best: the highest expected reward of a pull, where it is known.
-        bounds: for a single row of Bernoulli arms that stay as they are; else None.
-        arms: None where arms differ between runs.
-        beliefs: of the agents that have some.
-    """
-
-    pulls: Pulls
-    best: float | None
+    pulls: Pulls  # figures by pull of each agent, the best first
+    best: float | None  # the highest expected reward of a pull, where it is known
+    # For a single row of Bernoulli arms that stay as they are; else None.
     bounds: RegretBounds | None
-    arms: ArmSeries | None
-    beliefs: tuple[Belief, ...]
+    arms: ArmSeries | None  # None where arms differ between runs
+    beliefs: tuple[Belief, ...]  # of the agents that have some
 
     @property
     def n_runs(self) -> int:
@@ -464,65 +433,41 @@ LEAST_VALUES = 3  # of a parameter, for a figure of it
 
 @dataclass(frozen=True)
 class AgentRuns:
-    """The runs of an agent that have a figure.
+    """The runs of an agent that have a figure."""
 
-    Attributes:
-        agent: its label.
-        mean: their mean with its interval.
-        seeds: which runs, shape (n_runs,).
-        values: what they have come to, likewise.
-    """
-
-    agent: str
-    mean: Estimate
-    seeds: Ints
-    values: Floats
+    agent: str  # its label
+    mean: Estimate  # their mean with its interval
+    seeds: Ints  # which runs, shape (n_runs,)
+    values: Floats  # what they have come to, likewise
 
 
 @dataclass(frozen=True)
 class RunSeries:
-    """The runs of all agents on an environment.
+    """The runs of all agents on an environment."""
 
-    Attributes:
-        agents: the best first.
-        linear_up_to: as in `LearningCurves`.
-    """
-
-    agents: tuple[AgentRuns, ...]
-    linear_up_to: float | None
+    agents: tuple[AgentRuns, ...]  # the best first
+    linear_up_to: float | None  # as in `LearningCurves`
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """Means by the one parameter that an agent was swept over.
+    """Means by the one parameter that an agent was swept over."""
 
-    Attributes:
-        parameter: what it is called on an axis.
-        means: by its value, with their intervals.
-        labels: of the agents in that order.
-    """
-
-    parameter: str
-    means: Curve
-    labels: tuple[str, ...]
+    parameter: str  # what it is called on an axis
+    means: Curve  # by its value, with their intervals
+    labels: tuple[str, ...]  # of the agents in that order
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Means by the two parameters that an agent was swept over.
+    """Means by the two parameters that an agent was swept over."""
 
-    Attributes:
-        parameters: what they are called on axes: the one that goes down and the one across.
-        down, across: their values.
-        means: shape (down, across), NaN where there is no run.
-        labels: of the agents there; empty where there is none.
-    """
-
+    # What they are called on axes: the one that goes down and the one across.
     parameters: tuple[str, str]
-    down: list[str]
+    down: list[str]  # their values
     across: list[str]
-    means: Floats
-    labels: list[list[str]]
+    means: Floats  # shape (down, across), NaN where there is no run
+    labels: list[list[str]]  # of the agents there; empty where there is none
 
     def shares(self, *, is_cost: bool) -> Floats:
         """How far each mean is on the way from the worst to the best: 0 to 1."""
@@ -609,38 +554,24 @@ def _groups(
 
 @dataclass(frozen=True)
 class EnvironmentSeries:
-    """What there is to draw of an environment.
+    """What there is to draw of an environment."""
 
-    Attributes:
-        environment: how the agents did on it.
-        curves: by kind; on bandits None, which have theirs by pull.
-        runs: each run, and the means.
-        pulls: on bandits; else None.
-        sweeps: by agent, where it was swept over one parameter.
-        grids: by agent, where it was swept over two.
-    """
-
-    environment: EnvironmentAnalysis
+    environment: EnvironmentAnalysis  # how the agents did on it
+    # By kind; on bandits None, which have theirs by pull.
     curves: Mapping[str, LearningCurves] | None
-    runs: RunSeries
-    pulls: PullSeries | None
-    sweeps: Mapping[str, Sweep]
-    grids: Mapping[str, Grid] = field(default_factory=dict)
+    runs: RunSeries  # each run, and the means
+    pulls: PullSeries | None  # on bandits; else None
+    sweeps: Mapping[str, Sweep]  # by agent, where it was swept over one parameter
+    grids: Mapping[str, Grid] = field(default_factory=dict)  # by agent, where it was swept over two
 
 
 @dataclass(frozen=True)
 class StudySeries:
-    """What there is to draw of a study.
+    """What there is to draw of a study."""
 
-    Attributes:
-        analysis: the study.
-        marks: how each agent is drawn.
-        environments: by environment.
-    """
-
-    analysis: StudyAnalysis
-    marks: Mapping[str, Mark]
-    environments: tuple[EnvironmentSeries, ...]
+    analysis: StudyAnalysis  # the study
+    marks: Mapping[str, Mark]  # how each agent is drawn
+    environments: tuple[EnvironmentSeries, ...]  # by environment
 
 
 def study_series(analysis: StudyAnalysis, tell: Tell = tell_nobody) -> StudySeries:

@@ -41,16 +41,12 @@ class Band:
 
 @dataclass(frozen=True)
 class ThresholdSummary:
-    """How soon runs reach a threshold, where some never do.
+    """How soon runs reach a threshold, where some never do."""
 
-    Attributes:
-        median: steps to the threshold, a run that never reaches it counting as later than all
-            others; infinite where half of the runs or more do not.
-        share_reached: the share of runs that reach it.
-    """
-
+    #: Steps to the threshold, a run that never reaches it counting as later than all others;
+    #: infinite where half of the runs or more do not.
     median: Estimate
-    share_reached: Estimate
+    share_reached: Estimate  #: the share of runs that reach it
 
 
 def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
@@ -317,21 +313,16 @@ def performance_profile(
 
 @dataclass(frozen=True)
 class SpeedComparison:
-    """How many times the steps of one agent another needs.
+    """How many times the steps of one agent another needs."""
 
-    Attributes:
-        first, second: their names, in the order of the mapping.
-        ratio: steps of the second divided by those of the first: the median over pairs of runs. The
-            intervals of all pairs hold together, wherever between two evaluations runs arrived.
-        adjusted_p_value: of "one of the two is sooner", after Holm's correction over all pairs.
-        sooner: the name of the one that is shown to be, or None.
-    """
-
-    first: str
+    first: str  #: their names, in the order of the mapping
     second: str
+    #: Steps of the second divided by those of the first: the median over pairs of runs. The
+    #: intervals of all pairs hold together, wherever between two evaluations runs arrived.
     ratio: Estimate
+    #: Of "one of the two is sooner", after Holm's correction over all pairs.
     adjusted_p_value: float
-    sooner: str | None
+    sooner: str | None  #: the name of the one that is shown to be, or None
 
 
 def compare_speed(

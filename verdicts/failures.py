@@ -15,17 +15,11 @@ from verdicts.rank_tests import holm
 
 @dataclass(frozen=True)
 class FailureCount:
-    """How many runs failed.
+    """How many runs failed."""
 
-    Attributes:
-        n_failed: runs that did.
-        n: runs that there are.
-        most: the largest share of all runs that is compatible with that.
-    """
-
-    n_failed: int
-    n: int
-    most: float
+    n_failed: int  #: runs that did
+    n: int  #: runs that there are
+    most: float  #: the largest share of all runs that is compatible with that
 
 
 def failure_threshold(baseline: float, typical: float) -> float:

@@ -18,25 +18,18 @@ STEP = 1.5
 
 @dataclass(frozen=True)
 class Growth:
-    """How far a study has grown on one environment.
+    """How far a study has grown on one environment."""
 
-    Attributes:
-        judged: by pair of agents, what is said of the first, at the look that decided it, or else
-            at the last.
-        looks: by pair, which look that was, counted from 1.
-        seeds: by agent, how many seeds it has at the next look; as many as at the last where every
-            pair that it is in is decided.
-        n_looks: how many looks there have been.
-        level: the error rate of each.
-        is_done: whether no agent lacks a seed that another look would take.
-    """
-
+    #: By pair of agents, what is said of the first, at the look that decided it, or else at the
+    #: last.
     judged: Mapping[tuple[str, str], Judgement]
-    looks: Mapping[tuple[str, str], int]
+    looks: Mapping[tuple[str, str], int]  #: by pair, which look that was, counted from 1
+    #: By agent, how many seeds it has at the next look; as many as at the last where every pair
+    #: that it is in is decided.
     seeds: Mapping[str, int]
-    n_looks: int
-    level: float
-    is_done: bool
+    n_looks: int  #: how many looks there have been
+    level: float  #: the error rate of each
+    is_done: bool  #: whether no agent lacks a seed that another look would take
 
 
 def look_sizes(first: int, most: int, n_agents: int, level: float) -> tuple[int, ...]:

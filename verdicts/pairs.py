@@ -78,20 +78,13 @@ FEWEST_SEEDS = 3
 
 @dataclass(frozen=True)
 class Judgement:
-    """A verdict and what it stands on.
+    """A verdict and what it stands on."""
 
-    Attributes:
-        verdict: on the first of the two.
-        p_value: of "one of the two is ahead".
-        adjusted_p_value: the same after Holm's correction over all pairs.
-        equivalence_p_value: of "neither is ahead by more than the margin", likewise corrected.
-        certain: whether neither agent depends on chance, so that nothing was to be tested.
-    """
-
-    verdict: Verdict
-    p_value: float
-    adjusted_p_value: float
-    equivalence_p_value: float
+    verdict: Verdict  #: on the first of the two
+    p_value: float  #: of "one of the two is ahead"
+    adjusted_p_value: float  #: the same after Holm's correction over all pairs
+    equivalence_p_value: float  #: of "neither is ahead by more than the margin", likewise corrected
+    #: Whether neither agent depends on chance, so that nothing was to be tested.
     certain: bool = False
 
 
@@ -293,34 +286,28 @@ _OPPOSITE: dict[Verdict, Verdict] = {
 
 @dataclass(frozen=True)
 class PairComparison:
-    """What the seeds say about two agents.
+    """What the seeds say about two agents."""
 
-    Attributes:
-        first, second: their names.
-        difference: the median difference between a run of the first and one of the second. The
-            intervals of all pairs hold together, and agree with the verdicts.
-        p_value: of "one of the two is ahead", by the rank-sum test.
-        adjusted_p_value: the same after Holm's correction over all pairs.
-        probability_of_improvement: that a run of the first scores higher than one of the second.
-        verdict: on the first: ``equivalent`` where neither is shown to be ahead by more than the
-            margin in half of the pairs of runs; else ``better`` or ``worse`` by the adjusted
-            p-value; else ``undecided``.
-        seeds_needed: where undecided, about the number of seeds that would decide at the next look
-            with 80 % power if all is as observed. None where that is more than 10,000, or there
-            are too few seeds to say.
-        certain: whether neither agent depends on chance, so that their scores say all there is.
-        n_seeds: how many seeds each of the two had then, those of runs that failed among them.
-    """
-
-    first: str
+    first: str  #: their names
     second: str
+    #: The median difference between a run of the first and one of the second. The intervals of all
+    #: pairs hold together, and agree with the verdicts.
     difference: Estimate
-    p_value: float
-    adjusted_p_value: float
+    p_value: float  #: of "one of the two is ahead", by the rank-sum test
+    adjusted_p_value: float  #: the same after Holm's correction over all pairs
+    #: That a run of the first scores higher than one of the second.
     probability_of_improvement: Estimate
+    #: On the first: ``equivalent`` where neither is shown to be ahead by more than the margin in
+    #: half of the pairs of runs; else ``better`` or ``worse`` by the adjusted p-value; else
+    #: ``undecided``.
     verdict: Verdict
+    #: Where undecided, about the number of seeds that would decide at the next look with 80 %
+    #: power if all is as observed. None where that is more than 10,000, or there are too few seeds
+    #: to say.
     seeds_needed: int | None
+    #: Whether neither agent depends on chance, so that their scores say all there is.
     certain: bool = False
+    #: How many seeds each of the two had then, those of runs that failed among them.
     n_seeds: int = 0
 
     def swapped(self) -> PairComparison:

@@ -126,20 +126,13 @@ _CUTS: dict[Statistic, Callable[[int], int]] = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """A figure and how sure it is.
+    """A figure and how sure it is."""
 
-    Attributes:
-        point: the figure; NaN where there is nothing to compute it from.
-        low, high: the ends of its interval; both NaN where there is none, as with a single seed.
-        n: the number of values that it is computed from.
-        n_missing: the number of values left out, from runs that failed.
-    """
-
-    point: float
-    low: float
+    point: float  #: the figure; NaN where there is nothing to compute it from
+    low: float  #: the ends of its interval; both NaN where there is none, as with a single seed
     high: float
-    n: int
-    n_missing: int = 0
+    n: int  #: the number of values that it is computed from
+    n_missing: int = 0  #: the number of values left out, from runs that failed
 
     @property
     def has_interval(self) -> bool:
@@ -149,17 +142,11 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Summary:
-    """Where the scores of an agent lie.
+    """Where the scores of an agent lie."""
 
-    Attributes:
-        mean: what the next run is expected to score.
-        median: what half of the runs exceed.
-        iqm: the interquartile mean: the mean of the middle half of the runs.
-    """
-
-    mean: Estimate
-    median: Estimate
-    iqm: Estimate
+    mean: Estimate  #: what the next run is expected to score
+    median: Estimate  #: what half of the runs exceed
+    iqm: Estimate  #: the interquartile mean: the mean of the middle half of the runs
 
 
 def summarise(
@@ -205,20 +192,14 @@ def estimate(
 
 @dataclass(frozen=True)
 class _Resampled:
-    """Pooled scores in order, and how much each resample weighs them.
+    """Pooled scores in order, and how much each resample weighs them."""
 
-    Attributes:
-        values: ascending, shape (n,).
-        weights: cumulated over ``values``, shape (1 + n_resamples, n), the scores as they are
-            first. A row ends at n.
-        tail: what an interval leaves out on each side.
-        n_missing: scores left out.
-    """
-
-    values: Floats
+    values: Floats  #: ascending, shape (n,)
+    #: Cumulated over ``values``, shape (1 + n_resamples, n), the scores as they are first. A row
+    #: ends at n.
     weights: Floats
-    tail: float
-    n_missing: int
+    tail: float  #: what an interval leaves out on each side
+    n_missing: int  #: scores left out
 
     def estimate(self, statistic: Statistic) -> Estimate:
         n = len(self.values)

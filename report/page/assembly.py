@@ -39,32 +39,21 @@ ABSENT = "-"
 
 @dataclass(frozen=True)
 class MissingRuns:
-    """Runs of an agent on an environment that are not there, all for one reason.
+    """Runs of an agent on an environment that are not there, all for one reason."""
 
-    Attributes:
-        agent, environment: whose.
-        seeds: which.
-        reason: the last line of what they left, or that they have not been done.
-        details: all that the last of them left.
-    """
-
-    agent: str
+    agent: str  # whose
     environment: str
-    seeds: list[int]
-    reason: str
-    details: str
+    seeds: list[int]  # which
+    reason: str  # the last line of what they left, or that they have not been done
+    details: str  # all that the last of them left
 
 
 @dataclass(frozen=True)
 class SettingsTable:
-    """The settings of an environment's runs.
+    """The settings of an environment's runs."""
 
-    Attributes:
-        agents: the columns.
-        rows: by name of the setting, its value for each agent, and whether they differ.
-    """
-
-    agents: list[str]
+    agents: list[str]  # the columns
+    # By name of the setting, its value for each agent, and whether they differ.
     rows: dict[str, tuple[list[str], bool]]
 
 

@@ -163,23 +163,14 @@ def setting(value: Any) -> str:
 
 @dataclass(frozen=True)
 class LearningPage:
-    """The page that plays the first training of an agent.
+    """The page that plays the first training of an agent."""
 
-    Attributes:
-        agent: its label.
-        environment: that of the environment.
-        seed: of the training.
-        place: the file, seen from the folder of the study; empty where there is none.
-        words: what it shows, or why there is none.
-        size: of the file, in bytes.
-    """
-
-    agent: str
-    environment: str
-    seed: int
-    place: str
-    words: str
-    size: int = 0
+    agent: str  # its label
+    environment: str  # that of the environment
+    seed: int  # of the training
+    place: str  # the file, seen from the folder of the study; empty where there is none
+    words: str  # what it shows, or why there is none
+    size: int = 0  # of the file, in bytes
 
     @property
     def link(self) -> str:
@@ -189,18 +180,12 @@ class LearningPage:
 
 @dataclass(frozen=True)
 class Report:
-    """What a page is made from.
+    """What a page is made from."""
 
-    Attributes:
-        series: the numbers that its figures show.
-        command: the command that reproduces the study.
-        tell: told how far the slow parts are.
-        learning: the pages that play trainings, where they were asked for.
-    """
-
-    series: StudySeries
-    command: str
-    tell: Tell = tell_nobody
+    series: StudySeries  # the numbers that its figures show
+    command: str  # the command that reproduces the study
+    tell: Tell = tell_nobody  # told how far the slow parts are
+    # The pages that play trainings, where they were asked for.
     learning: Sequence[LearningPage] = ()
 
     @property
@@ -211,24 +196,18 @@ class Report:
 
 @dataclass(frozen=True)
 class Section:
-    """One part of the page.
+    """One part of the page."""
 
-    Attributes:
-        name: that of its template and script, and its anchor.
-        title: its heading.
-        context: what its template is filled with.
-        data: what its script works with, to be written as JSON; None where there is no such thing.
-        places: likewise what it works with on each environment, in their order, read when that is
-            chosen; None for one that it has nothing on.
-        by_environment: whether it shows the environment that is chosen at the top of the page.
-            Its template marks what belongs to environment i by ``data-environment="i"``.
-    """
-
-    name: str
-    title: str
-    context: Mapping[str, Any] = field(default_factory=dict)
+    name: str  # that of its template and script, and its anchor
+    title: str  # its heading
+    context: Mapping[str, Any] = field(default_factory=dict)  # what its template is filled with
+    # What its script works with, to be written as JSON; None where there is no such thing.
     data: Any = None
+    # Likewise what it works with on each environment, in their order, read when that is chosen;
+    # None for one that it has nothing on.
     places: Sequence[Any] = ()
+    # Whether it shows the environment that is chosen at the top of the page. Its template marks
+    # what belongs to environment i by ``data-environment="i"``.
     by_environment: bool = False
 
 

@@ -37,18 +37,12 @@ WIDTH, HEIGHT = 200, 100  # in the drawing's own unit
 
 @dataclass(frozen=True)
 class SmallFigure:
-    """The curves of an environment.
+    """The curves of an environment."""
 
-    Attributes:
-        name: the environment's.
-        what: what goes upwards.
-        lines: by agent, corners of its line as SVG takes them.
-        optimum: how far from the top the optimum lies; None where it is not known or not shown.
-    """
-
-    name: str
-    what: str
-    lines: Mapping[str, str]
+    name: str  # the environment's
+    what: str  # what goes upwards
+    lines: Mapping[str, str]  # by agent, corners of its line as SVG takes them
+    # How far from the top the optimum lies; None where it is not known or not shown.
     optimum: float | None
 
 

@@ -29,14 +29,10 @@ COMPLETE, PRUNED, FAILED = "judged on all seeds", "ended early", "failed"
 
 @dataclass(frozen=True)
 class Trials:
-    """What a tuning has tried.
+    """What a tuning has tried."""
 
-    Attributes:
-        record: what the tuning wrote down, see `tuning.retesting`.
-        ended: the trials that have ended, in their order, as they stand there.
-    """
-
-    record: Mapping[str, Any]
+    record: Mapping[str, Any]  # what the tuning wrote down, see `tuning.retesting`
+    # The trials that have ended, in their order, as they stand there.
     ended: tuple[Mapping[str, Any], ...]
 
     @property
@@ -254,15 +250,10 @@ LEFT_OUT = "-"
 
 @dataclass(frozen=True)
 class Change:
-    """A setting that the winner has otherwise than what shipped.
+    """A setting that the winner has otherwise than what shipped."""
 
-    Attributes:
-        name: of the setting.
-        shipped, found: its values, as a file has them.
-    """
-
-    name: str
-    shipped: str
+    name: str  # of the setting
+    shipped: str  # its values, as a file has them
     found: str
 
 

@@ -43,35 +43,23 @@ MOST_ARMS = 40  # over all contexts, in a table or in a figure
 
 @dataclass(frozen=True)
 class ArmRow:
-    """An arm in a context.
+    """An arm in a context."""
 
-    Attributes:
-        name: what it is called.
-        mean: its true mean reward.
-        regret: how far that is from the best in the context.
-        shares: by agent, the share of the pulls in the context that went to it; nan where the agent
-            never saw the context.
-    """
-
-    name: str
-    mean: float
-    regret: float
+    name: str  # what it is called
+    mean: float  # its true mean reward
+    regret: float  # how far that is from the best in the context
+    # By agent, the share of the pulls in the context that went to it; nan where the agent never
+    # saw the context.
     shares: Mapping[str, float]
 
 
 @dataclass(frozen=True)
 class ContextTable:
-    """Where the pulls went in one context.
+    """Where the pulls went in one context."""
 
-    Attributes:
-        name: what it is called; empty where it is the only one.
-        rows: its arms.
-        regrets: by agent, mean regret of a pull there.
-    """
-
-    name: str
-    rows: list[ArmRow]
-    regrets: Mapping[str, float]
+    name: str  # what it is called; empty where it is the only one
+    rows: list[ArmRow]  # its arms
+    regrets: Mapping[str, float]  # by agent, mean regret of a pull there
 
 
 def bandits(report: Report) -> Section | None:
@@ -286,22 +274,14 @@ ALL_BYTES = 1_000_000  # of the films of a page, a third more as text
 
 @dataclass(frozen=True)
 class Film:
-    """A greedy episode of an agent.
+    """A greedy episode of an agent."""
 
-    Attributes:
-        agent: its label.
-        still: the first frame as a data URI.
-        place: that of its film among those of the page, which agents of one route share.
-        width, height: in pixels.
-        caption: how the episode went.
-    """
-
-    agent: str
-    still: str
-    place: int
-    width: int
+    agent: str  # its label
+    still: str  # the first frame as a data URI
+    place: int  # that of its film among those of the page, which agents of one route share
+    width: int  # in pixels
     height: int
-    caption: str
+    caption: str  # how the episode went
 
 
 def played_episodes(report: Report) -> Section | None:
