@@ -24,7 +24,7 @@ from experiments.plan import plan
 from experiments.results import read_results
 from experiments.study import read_study
 from report.conclusions import conclusion
-from report.documents import headline, markdown_table, markdown_text, name_of
+from report.documents import headline, markdown_text, name_of
 from report.words import spans
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -75,7 +75,8 @@ def what_fell(tuned: StudyAnalysis, held_out: StudyAnalysis) -> str:
     ]
     changes = [f"- {text}" for text in _changes(tuned, held_out)]
     told = changes or [f"No agent's median run changed by more than {MATTERS} of the score."]
-    return f"{markdown_table(headings, rows)}\n\n" + "\n".join(told) + "\n"
+    table = ["| " + " | ".join(row) + " |" for row in [headings, ["---"] * len(headings), *rows]]
+    return "\n".join([*table, "", *told, ""])
 
 
 def _failed(analysis: StudyAnalysis, agent: str) -> str:

@@ -20,6 +20,12 @@ from verdicts import Estimate, PairComparison
 # Sentences on pairs of agents: verdicts, and who fails more often.
 
 
+def pairs_both_ways(environment: EnvironmentAnalysis) -> dict[tuple[str, str], PairComparison]:
+    """By first and second agent every pair, as each of the two sees it."""
+    seen = [one for pair in environment.pairs for one in (pair, pair.swapped())]
+    return {(one.first, one.second): one for one in seen}
+
+
 def oriented_pairs(environment: EnvironmentAnalysis) -> list[PairComparison]:
     """The pairs, each seen from the agent that is better, where one is."""
     return [pair.swapped() if pair.verdict == "worse" else pair for pair in environment.pairs]

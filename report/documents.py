@@ -5,90 +5,49 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple, get_args
 
-from experiments.analysis import MARK, AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from experiments.analysis import AgentAnalysis, EnvironmentAnalysis, StudyAnalysis
 from experiments.plan import tuning_seeds
 from experiments.results import StudyResults
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from pipeline.errors import visible
 from pipeline.files import replacing, write_text
-from report.conclusions import conclusion, none_has_learnt, on_changes
+from report.conclusions import conclusion, none_has_learnt, on_changes, pairs_both_ways
 from report.words import enumeration, interval, number, seed_sentence, seeds
 from verdicts import Verdict
 
-# What a markup language has to be able to do so that a study can be written in it.
-
-
-@dataclass(frozen=True)
-class MarkupLanguage:
-    """How text becomes markup. All take plain text, but for ``table``, whose cells are markup."""
-
-    preamble: Callable[[str], str]  # what stands above all else, of the whole text below it
-    title: Callable[[str], str]  # of the whole, and of a part
-    heading: Callable[[str], str]
-    command: Callable[[str], str]  # a line for a terminal
-    text: Callable[[str], str]  # a paragraph in which nothing is markup
-    items: Callable[[Sequence[str]], str]  # a list of such texts
-    name: Callable[[str], str]  # a label
-    figure: Callable[[str], str]  # numbers and units
-    bold: Callable[[str], str]  # such a figure, made to stand out
-    # By headings, rows, and a caption; none has line breaks.
-    table: Callable[[Sequence[str], Sequence[Sequence[str]], str], str]
-
-
-# Text and tables as Markdown.
+# The languages by the suffix of their files, which their templates have too.
+Markup = Literal["md", "tex"]
+MARKUPS: tuple[Markup, ...] = get_args(Markup)
 
 PLAIN_NAME = re.compile(r"[\w.=+-]+")
-# What would be read as markup: not underscores inside words, nor brackets that are no link.
+
+
+# Text in which nothing is markup.
+
+# What Markdown would read: not underscores inside words, nor brackets that are no link.
 _MARKUP = re.compile(r"[\\`*<>|~&]|(?<!\w)_|_(?!\w)|\](?=[(\[:])|^[#+-]")
 
 
-def markdown_table(
-    headings: Sequence[str], rows: Sequence[Sequence[str]], caption: str = ""
-) -> str:
-    """Lines of a table, and the caption below; all Markdown already, with no line breaks."""
-    lines = [headings, ["---"] * len(headings), *rows]
-    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
-    return f"{table}\n\n{caption}" if caption else table
-
-
 def name_of(label: str) -> str:
-    """A label as code where it is a plain name, else as text."""
+    """A label in Markdown: as code where it is a plain name, else as text."""
     return f"`{label}`" if PLAIN_NAME.fullmatch(label) else markdown_text(label)
 
 
 def markdown_text(text: str) -> str:
-    """Text in which nothing is markup."""
+    """Text in which Markdown finds no markup."""
     return _MARKUP.sub(lambda found: "\\" + found[0], " ".join(visible(text).split()))
 
 
-MARKDOWN = MarkupLanguage(
-    preamble=lambda _: "",
-    title=lambda text: f"# {markdown_text(text)}",
-    heading=lambda text: f"## {markdown_text(text)}",
-    command=lambda text: f"`{visible(text).replace('`', ' ')}`",
-    text=markdown_text,
-    items=lambda texts: "\n".join(f"- {markdown_text(text)}" for text in texts),
-    name=name_of,
-    figure=str,
-    bold=lambda text: f"**{text}**",
-    table=markdown_table,
-)
-
-
-# Text and tables as LaTeX, to be taken into a paper by ``\input``.
-
 _PREAMBLE = r"% Taken in by \input; above it: \usepackage{booktabs,graphicx}"
 _FOREIGN = "% With XeLaTeX or LuaLaTeX, and a font that has these signs: "
-
-_WIDE = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
-
 _MINUS = "\N{MINUS SIGN}"
-
 _SIGNS = {
     "\\": r"\textbackslash{}",
     "~": r"\textasciitilde{}",
@@ -109,17 +68,20 @@ _SIGNS = {
     "…": r"\ldots{}",
     "†": r"$\dagger$",
 }
+_GREEK = (
+    "ALPHA BETA GAMMA DELTA EPSILON ZETA ETA THETA KAPPA LAMDA MU NU XI PI RHO SIGMA TAU PHI CHI "
+    "PSI OMEGA"
+)
 _NOT_IN_OT1 = "ÐÞðþ«»"  # of Latin-1, all of which pdfLaTeX has with other fonts alone
-
 _BEFORE_A_NUMBER = re.compile(r"(?<![\w.)\]}-])-(?=[\d.∞])")
 # Two hyphens or commas become one sign. At the start of a row or an item brackets and asterisks
-# would be read as a wish of its command.
+# would be read as an argument of its command.
 _LIGATURES = re.compile(r"(?<=-)(?=-)|(?<=,)(?=,)|(?<=')(?=')")
 _COMMAND_ARGUMENT = re.compile(r"^[\[*]")
 
 
 def latex_text(text: str) -> str:
-    """Text in which nothing is markup, as any TeX engine sets it that knows its letters."""
+    """Text in which LaTeX finds no command, as any engine sets it that knows its letters."""
     line = _BEFORE_A_NUMBER.sub(_MINUS, " ".join(visible(text).split()))
     line = _LIGATURES.sub("\0", _COMMAND_ARGUMENT.sub(lambda found: f"\0{found[0]}", line))
     return "".join("{}" if sign == "\0" else _SIGNS.get(sign) or _letter(sign) for sign in line)
@@ -128,63 +90,36 @@ def latex_text(text: str) -> str:
 def _letter(sign: str) -> str:
     """A small Greek letter by its command, and whatever else as it is."""
     greek, _, name = unicodedata.name(sign, "").partition(" SMALL LETTER ")
-    return f"${_greek(name)}$" if greek == "GREEK" and _greek(name) else sign
+    if greek != "GREEK" or name not in _GREEK.split():
+        return sign
+    return f"$\\{ {'LAMDA': 'lambda', 'EPSILON': 'varepsilon'}.get(name, name.lower()) }$"
 
 
-def _greek(name: str) -> str:
-    known = "ALPHA BETA GAMMA DELTA EPSILON ZETA ETA THETA KAPPA LAMDA MU NU XI PI RHO SIGMA TAU"
-    if name not in [*known.split(), "PHI", "CHI", "PSI", "OMEGA"]:
-        return ""
-    return "\\" + {"LAMDA": "lambda", "EPSILON": "varepsilon"}.get(name, name.lower())
+def _latex_name(label: str) -> str:
+    text = latex_text(label)
+    return f"\\texttt{{{text}}}" if PLAIN_NAME.fullmatch(label) else text
 
 
-def latex_table(headings: Sequence[str], rows: Sequence[Sequence[str]], caption: str) -> str:
-    """A table with the rules of booktabs, made narrower where it is wider than the text."""
-    body = [
-        r"\toprule",
-        f"{' & '.join(headings)} \\\\",
-        r"\midrule",
-        *(f"{' & '.join(row)} \\\\" for row in rows),
-        r"\bottomrule",
-    ]
-    return "\n".join(
-        [
-            r"\begin{table}[htbp]",
-            r"\centering",
-            f"\\caption{{{caption}}}",
-            _WIDE,
-            f"\\begin{{tabular}}{{l{'r' * (len(headings) - 1)}}}",
-            *body,
-            r"\end{tabular}}",
-            r"\end{table}",
-        ]
+_FILTERS: Mapping[Markup, Mapping[str, Callable[[str], str]]] = {
+    "md": {"text": markdown_text, "name": name_of},
+    "tex": {"text": latex_text, "name": _latex_name},
+}
+
+
+@cache
+def _templates(markup: Markup) -> Environment:
+    environment = Environment(  # noqa: S701  # no HTML; what is markup here the filters escape
+        loader=PackageLoader("report"),
+        variable_start_string="<<",
+        variable_end_string=">>",
+        block_start_string="<%",
+        block_end_string="%>",
+        trim_blocks=True,
+        undefined=StrictUndefined,
     )
-
-
-def _preamble(content: str) -> str:
-    foreign = sorted({sign for sign in content if ord(sign) > 0xFF or sign in _NOT_IN_OT1})
-    return "\n".join([_PREAMBLE, *([_FOREIGN + " ".join(foreign)] if foreign else [])])
-
-
-def _items(texts: Sequence[str]) -> str:
-    lines = [f"\\item {latex_text(text)}" for text in texts]
-    return "\n".join([r"\begin{itemize}", *lines, r"\end{itemize}"])
-
-
-LATEX = MarkupLanguage(
-    preamble=_preamble,
-    title=lambda text: f"\\section*{{{latex_text(text)}}}",
-    heading=lambda text: f"\\subsection*{{{latex_text(text)}}}",
-    command=lambda text: f"{{\\raggedright\\ttfamily {latex_text(text)}\\par}}",
-    text=latex_text,
-    items=_items,
-    name=lambda label: (
-        f"\\texttt{{{latex_text(label)}}}" if PLAIN_NAME.fullmatch(label) else latex_text(label)
-    ),
-    figure=latex_text,
-    bold=lambda text: f"\\textbf{{{latex_text(text)}}}",
-    table=latex_table,
-)
+    environment.filters.update(_FILTERS[markup])
+    environment.filters["table"] = lambda table: _table_as(table, markup)
+    return environment
 
 
 # A study as Markdown or LaTeX, to stand in a page or a paper: verdicts, failures and cost.
@@ -202,51 +137,87 @@ _SEEN_BY_THE_LEADER: dict[Verdict, Standing] = {
 }
 
 
-def verdicts_as(markup: MarkupLanguage, analysis: StudyAnalysis, command: str) -> str:
+class Cell(NamedTuple):
+    """A figure in a table, and notes behind it, in which nothing can be markup."""
+
+    figure: str
+    is_bold: bool = False
+    notes: str = ""
+
+
+class Row(NamedTuple):
+    """An agent's figures, and whether it was trained on a changed environment."""
+
+    label: str
+    is_changed: bool
+    cells: list[Cell]
+
+
+class Table(NamedTuple):
+    """What a table says, in plain text."""
+
+    headings: list[str]
+    rows: list[Row]
+    caption: str
+
+
+def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
     """The whole study: what seeds it has, the headline, and for each environment the verdicts."""
     study = analysis.study
-    parts = [
-        markup.title(study.title),
-        markup.command(command),
-        markup.text(seed_sentence(study.seeds, tuning_seeds(study))),
-        headline(analysis, markup),
-    ]
-    for environment in analysis.environments:
-        parts += [
-            markup.heading(environment.environment),
-            ranking(analysis.results, environment, markup),
-            markup.items(conclusion(study, environment).everything),
-        ]
-    content = "\n\n".join(parts) + "\n"
-    preamble = markup.preamble(content)
-    return f"{preamble}\n\n{content}" if preamble else content
+    template = _templates(markup).get_template(f"verdicts.{markup}")
+    content = template.render(
+        title=study.title,
+        command=visible(command),
+        seeds=seed_sentence(study.seeds, tuning_seeds(study)),
+        headline=_headline(analysis),
+        environments=[
+            {
+                "name": environment.environment,
+                "ranking": _ranking(analysis.results, environment),
+                "sentences": conclusion(study, environment).everything,
+            }
+            for environment in analysis.environments
+        ],
+    )
+    if markup == "md":
+        return content
+    foreign = sorted({sign for sign in content if ord(sign) > 0xFF or sign in _NOT_IN_OT1})
+    preamble = [_PREAMBLE, *([_FOREIGN + " ".join(foreign)] if foreign else [])]
+    return "\n".join([*preamble, "", content])
 
 
-def headline(analysis: StudyAnalysis, markup: MarkupLanguage = MARKDOWN) -> str:
+def headline(analysis: StudyAnalysis, markup: Markup = "md") -> str:
     """A table of agents by environments, and what its marks mean."""
-    study, environments = analysis.study, analysis.environments
-    found = [_cells(analysis, environment, markup) for environment in environments]
+    return _table_as(_headline(analysis), markup)
+
+
+def ranking(results: StudyResults, environment: EnvironmentAnalysis, markup: Markup = "md") -> str:
+    """The agents of an environment with their figures, the best first."""
+    return _table_as(_ranking(results, environment), markup)
+
+
+def _table_as(table: Table, markup: Markup) -> str:
+    return _templates(markup).get_template(f"table.{markup}").render(table=table)
+
+
+def _headline(analysis: StudyAnalysis) -> Table:
+    environments = analysis.environments
     changed = {a.agent for one in environments for a in one.agents if a.changes}
+    found = [_cells(analysis, environment) for environment in environments]
     rows = [
-        [
-            _name(markup, agent.label, agent.label in changed),
-            *(cells.get(agent.label, NOTHING) for cells in found),
-        ]
-        for agent in study.agents
+        Row(name, name in changed, [cells.get(name, Cell(NOTHING)) for cells in found])
+        for name in (agent.label for agent in analysis.study.agents)
     ]
-    headings = ["", *(markup.text(one.environment) for one in environments)]
-    return markup.table(headings, rows, markup.text(_legend(study, analysis)))
+    return Table(["", *(one.environment for one in environments)], rows, _legend(analysis))
 
 
-def _name(markup: MarkupLanguage, label: str, changed: bool) -> str:
-    return f"{markup.name(label)} {markup.text(MARK)}" if changed else markup.name(label)
-
-
-def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
-    agents = [agent for environment in analysis.environments for agent in environment.agents]
-    if all(_has_score(study, agent) for agent in agents):
+def _legend(analysis: StudyAnalysis) -> str:
+    study, environments = analysis.study, analysis.environments
+    if all(_median_score(study, agent) for one in environments for agent in one.agents):
         what = "Score of the median run: 1 is the optimum, 0 the best random or constant policy."
-        what += _on_brackets(analysis)
+        names = [one.environment for one in environments if one.optimum_at_least is not None]
+        if names:
+            what += f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
     else:
         what = f"{METRIC_WORDS[study.metric].capitalize()}: the median run."
     extreme = "lowest" if study.metric in COSTS else "highest"
@@ -256,54 +227,31 @@ def _legend(study: StudySpec, analysis: StudyAnalysis) -> str:
     )
     if processor_seconds(analysis.results):
         text += " In brackets: processor time of the median run."
-    return " ".join([text, *on_changes(analysis.environments)])
+    return " ".join([text, *on_changes(environments)])
 
 
-def _on_brackets(analysis: StudyAnalysis) -> str:
-    names = [e.environment for e in analysis.environments if e.optimum_at_least is not None]
-    if not names:
-        return ""
-    return f" On {enumeration(names)} the optimum is bracketed: 1 is the upper end."
-
-
-def _cells(
-    analysis: StudyAnalysis, environment: EnvironmentAnalysis, markup: MarkupLanguage
-) -> dict[str, str]:
+def _cells(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> dict[str, Cell]:
     """The cell of each agent that has a run."""
-    study, places = analysis.study, standings(analysis.study, environment)
+    places = standings(analysis.study, environment)
     costs = processor_seconds(analysis.results)
     cells = {}
     for agent in environment.agents:
-        value = _typical(study, agent)
-        is_best = places.get(agent.agent) == "best"
-        text = markup.bold(value) if is_best else markup.figure(value)
-        text += " ?" if places.get(agent.agent) == "open" else ""
+        figure = _median_score(analysis.study, agent) or number(agent.metric.median.point)
+        place = places.get(agent.agent)
         cost = costs.get((agent.agent, environment.environment))
-        text += "" if cost is None else f" ({duration(cost)})"
-        cells[agent.agent] = ", ".join([text, *_troubles(environment, agent)])
+        count = environment.failures.get(agent.agent)
+        notes = " ?" if place == "open" else ""
+        notes += "" if cost is None else f" ({duration(cost)})"
+        notes += f", {count.n_failed} of {count.n} failed" if count and count.n_failed else ""
+        notes += f", {agent.n_missing} missing" if agent.n_missing else ""
+        cells[agent.agent] = Cell(figure, place == "best", notes)
     return cells
 
 
-def _typical(study: StudySpec, agent: AgentAnalysis) -> str:
-    if _has_score(study, agent):
-        assert agent.score is not None
-        return f"{agent.score.median.point:.3f}"
-    return number(agent.metric.median.point)
-
-
-def _has_score(study: StudySpec, agent: AgentAnalysis) -> bool:
-    return (
-        study.metric == "final"
-        and agent.score is not None
-        and not math.isnan(agent.score.median.point)
-    )
-
-
-def _troubles(environment: EnvironmentAnalysis, agent: AgentAnalysis) -> list[str]:
-    """Runs that failed, and runs that are not there."""
-    count = environment.failures.get(agent.agent)
-    told = [f"{count.n_failed} of {count.n} failed"] if count is not None and count.n_failed else []
-    return told + ([f"{agent.n_missing} missing"] if agent.n_missing else [])
+def _median_score(study: StudySpec, agent: AgentAnalysis) -> str:
+    """The score of the median run, where scores are what the study is about; else empty."""
+    score = None if agent.score is None else agent.score.median.point
+    return "" if study.metric != "final" or score is None or math.isnan(score) else f"{score:.3f}"
 
 
 def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Standing]:
@@ -317,17 +265,13 @@ def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, S
         return {}
     leader = max(known, key=lambda agent: sign * agent.metric.median.point).agent
     found: dict[str, Standing] = {leader: "best"}
-    for pair in environment.pairs:
-        if leader in (pair.first, pair.second):
-            seen = pair if pair.first == leader else pair.swapped()
-            found[seen.second] = _SEEN_BY_THE_LEADER[seen.verdict]
+    for (first, second), pair in pairs_both_ways(environment).items():
+        if first == leader:
+            found[second] = _SEEN_BY_THE_LEADER[pair.verdict]
     return found
 
 
-def ranking(
-    results: StudyResults, environment: EnvironmentAnalysis, markup: MarkupLanguage = MARKDOWN
-) -> str:
-    """The agents of an environment with their figures, the best first."""
+def _ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
     costs = processor_seconds(results)
     rows = []
     for agent in environment.agents:
@@ -341,15 +285,16 @@ def ranking(
             NOTHING if stays is None else number(stays.median.point),
             NOTHING if cost is None else duration(cost),
         ]
-        name = _name(markup, agent.agent, bool(agent.changes))
-        rows.append([name, *map(markup.figure, figures)])
-    headings = ["", "median", "mean", "score", "failed", "stays from", "processor time"]
+        rows.append(Row(agent.agent, bool(agent.changes), list(map(Cell, figures))))
+    headings = ["median", "mean", "score", "failed", "stays from", "processor time"]
     # A column in which no agent has a figure is left out.
-    kept = [k for k, of in enumerate(zip(*rows, strict=True)) if not set(of) <= {NOTHING}]
-    rows, headings = [[row[k] for k in kept] for row in rows], [headings[k] for k in kept]
+    kept = [k for k in range(len(headings)) if any(row.cells[k].figure != NOTHING for row in rows)]
     metric = METRIC_WORDS[results.study.metric]
-    caption = f"{environment.environment}: {metric}, with 95 % intervals over seeds."
-    return markup.table(headings, rows, markup.text(caption))
+    return Table(
+        ["", *(headings[k] for k in kept)],
+        [row._replace(cells=[row.cells[k] for k in kept]) for row in rows],
+        f"{environment.environment}: {metric}, with 95 % intervals over seeds.",
+    )
 
 
 def processor_seconds(results: StudyResults) -> dict[tuple[str, str], float]:
@@ -373,31 +318,24 @@ def duration(time: float) -> str:
 
 # A study as files: comma-separated values, and verdicts for a page or a paper.
 
-# Of the last per cent of its size, the library's own choice is paid with half of the time.
-GZIP: Any = {"method": "gzip", "compresslevel": 6}
-
 
 def write_tables(results: StudyResults) -> list[Path]:
     """Write ``summary.csv``, a row for each run, and ``curves.csv.gz``, all learning curves."""
+    # For the last per cent of the size the default level of compression takes half of the time.
+    gzip: Any = {"method": "gzip", "compresslevel": 6}
+    rows: Any = {"mode": "wb", "index": False, "lineterminator": "\n"}
     summary, curves = results.root / "summary.csv", results.root / "curves.csv.gz"
     with replacing(summary) as file:
-        results.summary.to_csv(file, mode="wb", index=False, lineterminator="\n")
+        results.summary.to_csv(file, **rows)
     with replacing(curves) as file:
-        results.curves.to_csv(
-            file,
-            mode="wb",
-            index=False,
-            float_format="%.8g",
-            compression=GZIP,
-            lineterminator="\n",
-        )
+        results.curves.to_csv(file, float_format="%.8g", compression=gzip, **rows)
     return [summary, curves]
 
 
 def write_verdicts(analysis: StudyAnalysis, command: str) -> list[Path]:
     """Write ``verdicts.md`` and ``verdicts.tex``: what the study has shown, to be pasted."""
     written = []
-    for suffix, markup in ((".md", MARKDOWN), (".tex", LATEX)):
-        written.append((analysis.results.root / "verdicts").with_suffix(suffix))
+    for markup in MARKUPS:
+        written.append(analysis.results.root / f"verdicts.{markup}")
         write_text(written[-1], verdicts_as(markup, analysis, command))
     return written

@@ -13,7 +13,7 @@ from experiments.analysis import EnvironmentAnalysis, OverallAnalysis, StudyAnal
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from mdp.array_types import Floats
 from report.conclusions import conclusion, on_changes, places_without_a_run
-from report.documents import LATEX, MARKDOWN, verdicts_as
+from report.documents import MARKUPS, verdicts_as
 from report.page.frame import Report, Section, estimate_data
 from report.ranking import COLUMNS, Row, filled
 from report.series import (
@@ -137,10 +137,7 @@ def verdict(report: Report) -> Section | None:
         "phrases": PHRASES,
         "metric": METRIC_WORDS[study.metric],
     }
-    files = {
-        name: verdicts_as(markup, report.analysis, report.command)
-        for name, markup in (("md", MARKDOWN), ("tex", LATEX))
-    }
+    files = {name: verdicts_as(name, report.analysis, report.command) for name in MARKUPS}
     sweeps = [_sweeps(one) for one in report.series.environments]
     data = {"files": files, "metric": METRIC_WORDS[study.metric], "sweeps": sweeps}
     return Section("verdict", "Verdict", context, data)

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from report.documents import LATEX, MARKDOWN, latex_table, latex_text, verdicts_as
+from report.documents import MARKUPS, headline, latex_text, verdicts_as
 
 
 @pytest.mark.parametrize(
@@ -29,16 +29,17 @@ def test_nothing_of_a_text_is_a_command(text, latex):
     assert latex_text(text) == latex
 
 
-def test_a_table_has_the_rules_of_booktabs_and_no_others():
-    lines = latex_table(["", "lake"], [["a", "1"], ["b", "2"]], "what it is").splitlines()
-    assert lines[2] == r"\caption{what it is}"
+def test_a_table_has_the_rules_of_booktabs_and_no_others(made_up):
+    agents = [made_up.agent(name, 50) for name in "ab"]
+    lines = headline(made_up.analysis([made_up.environment(agents)], "ab"), "tex").splitlines()
+    assert lines[2].startswith(r"\caption{Score of the median run: ")
     assert lines[4:] == [
         r"\begin{tabular}{lr}",
         r"\toprule",
         r" & lake \\",
         r"\midrule",
-        r"a & 1 \\",
-        r"b & 2 \\",
+        r"\texttt{a} & \textbf{1.000} \\",
+        r"\texttt{b} & 1.000 \\",
         r"\bottomrule",
         r"\end{tabular}}",
         r"\end{table}",
@@ -55,7 +56,7 @@ def hostile(made_up):
 
 
 def test_whatever_labels_say_every_group_and_environment_is_closed(hostile):
-    text = verdicts_as(LATEX, hostile, "python compare.py 'a_b & 50%' --x")
+    text = verdicts_as("tex", hostile, "python compare.py 'a_b & 50%' --x")
     plain = re.sub(r"\\[{}$&#%_]", "", text)
     assert plain.count("{") == plain.count("}")
     assert plain.count("$") % 2 == 0
@@ -75,7 +76,7 @@ def test_whatever_labels_say_every_group_and_environment_is_closed(hostile):
 def test_it_says_which_signs_need_another_engine(made_up):
     agents = [made_up.agent(name, 90.0) for name in ("中", "é")]
     found = made_up.analysis([made_up.environment(agents)], ["中", "é"])
-    lines = verdicts_as(LATEX, found, "python compare.py").splitlines()
+    lines = verdicts_as("tex", found, "python compare.py").splitlines()
     assert lines[1] == "% With XeLaTeX or LuaLaTeX, and a font that has these signs: 中"
 
 
@@ -84,7 +85,7 @@ def test_both_languages_say_the_same(made_up):
     agents = [made_up.agent(name, mean) for name, mean in zip(names, (30, 90), strict=True)]
     place = made_up.environment(agents, pairs=(made_up.pair("low", "first", "worse"),))
     found = made_up.analysis([replace(place)], names)
-    both = [verdicts_as(markup, found, "python compare.py") for markup in (MARKDOWN, LATEX)]
+    both = [verdicts_as(markup, found, "python compare.py") for markup in MARKUPS]
     words = [re.findall(r"[\d.]+|[a-z]{3,}", one) for one in both]
     assert [word for word in words[0] if word not in words[1]] == []
     assert r"\texttt{first} & \textbf{1.800} \\" in both[1]

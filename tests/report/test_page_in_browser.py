@@ -13,7 +13,7 @@ from selenium.webdriver.support.ui import Select
 
 from experiments.analysis import analyse
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from report.documents import LATEX, MARKDOWN, verdicts_as
+from report.documents import MARKUPS, verdicts_as
 from report.page import write_report
 from report.page.assembly import SettingsTable
 from report.page.frame import STYLES, package_file, templates
@@ -537,7 +537,7 @@ def test_verdicts_to_take_along_are_those_beside_the_page(loaded, report_study):
         "small-b-bold-b-verdict.md",
         "small-b-bold-b-verdict.tex",
     ]
-    for (_, text), markup in zip(saved, (MARKDOWN, LATEX), strict=True):
+    for (_, text), markup in zip(saved, MARKUPS, strict=True):
         assert text == verdicts_as(markup, report_study.analysis, "python compare.py 'a & b.yml'")
 
 

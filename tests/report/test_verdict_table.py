@@ -8,10 +8,8 @@ import pytest
 
 from report.conclusions import conclusion
 from report.documents import (
-    LATEX,
     duration,
     headline,
-    markdown_table,
     markdown_text,
     name_of,
     processor_seconds,
@@ -89,7 +87,7 @@ def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_foo
         "| `too` †",
     ]
     assert text.endswith(told)
-    latex = headline(analysis, LATEX)
+    latex = headline(analysis, "tex")
     assert r"\texttt{changed} $\dagger$ &" in latex
     assert told.replace("†", r"$\dagger$") in latex
     assert "| `too` † |" in ranking(analysis.results, lake)
@@ -168,4 +166,3 @@ def test_nothing_of_a_text_is_markup():
     assert markdown_text("# one\n\ntwo _three_") == "\\# one two \\_three\\_"
     assert name_of("dqn") == "`dqn`"
     assert name_of("a`b|") == "a\\`b\\|"
-    assert markdown_table(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
