@@ -15,7 +15,7 @@ from experiments.analysis import (
 )
 from experiments.study import COSTS, METRIC_WORDS, OF_TRAINING, StudySpec
 from report.words import enumeration, interval, number, optimum_words, ordinal, seeds
-from verdicts import Estimate, PairComparison
+from verdicts import PairComparison
 
 # Sentences on pairs of agents: verdicts, and who fails more often.
 
@@ -38,12 +38,12 @@ def pair_sentences(study: StudySpec, environment: EnvironmentAnalysis) -> list[s
     oriented = oriented_pairs(environment)
     for name in (agent.agent for agent in environment.agents):
         pairs = [pair for pair in oriented if pair.first == name]
-        better = [pair for pair in pairs if pair.verdict == "better"]
-        open_ = [pair for pair in pairs if pair.verdict == "undecided"]
+        better = [_by_how_much(environment, pair) for pair in pairs if pair.verdict == "better"]
+        open_ = [_how_open(environment, pair) for pair in pairs if pair.verdict == "undecided"]
         if better:
-            texts.append(f"{name} is better than {_by_how_much(environment, better)}.")
+            texts.append(f"{name} is better than {enumeration(better)}.")
         if open_ and not too_few:
-            texts.append(f"{name} is undecided against {_how_open(environment, open_)}.")
+            texts.append(f"{name} is undecided against {enumeration(open_)}.")
     if too_few and texts and any(pair.verdict == "undecided" for pair in oriented):
         texts.append(f"All other pairs are undecided: {too_few_seeds(study, environment)}.")
     return texts
@@ -106,14 +106,21 @@ def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
     return groups
 
 
-def _by_how_much(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
-    return enumeration(
-        [
-            f"{pair.second} (by {interval(pair.difference)}{_shown_with(environment, [pair])}"
-            f"{_failed_more(environment, pair)})"
-            for pair in pairs
-        ]
-    )
+def _by_how_much(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
+    """The worse agent, the difference, and who failed, but of an agent most of whose runs did."""
+    counts = {name: environment.failures.get(name) for name in (pair.first, pair.second)}
+    few = [name for name, count in counts.items() if count and 2 * count.n_failed <= count.n]
+    failed = failed_runs(environment, few)
+    text = f"by {interval(pair.difference)}{_shown_with(environment, [pair])}"
+    return f"{pair.second} ({text}{f'; {failed}' if failed else ''})"
+
+
+def _how_open(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
+    """The other agent, the difference so far, and how many seeds it would take to decide."""
+    text = f"difference {interval(pair.difference)}{_shown_with(environment, [pair])}"
+    if pair.seeds_needed is not None:
+        text += f"; about {seeds(pair.seeds_needed)} are needed to decide"
+    return f"{pair.second} ({text})"
 
 
 def _shown_with(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
@@ -121,14 +128,6 @@ def _shown_with(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison
     if environment.look.design is None:
         return ""
     return f", with {seeds(*(pair.n_seeds for pair in pairs))}"
-
-
-def _failed_more(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
-    """The failures of two agents, but of an agent most of whose runs failed."""
-    counts = {name: environment.failures.get(name) for name in (pair.first, pair.second)}
-    few = [name for name, count in counts.items() if count and 2 * count.n_failed <= count.n]
-    told = failed_runs(environment, few)
-    return f"; {told}" if told else ""
 
 
 def failed_runs(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
@@ -155,43 +154,30 @@ def on_unreliable(environment: EnvironmentAnalysis) -> Iterable[str]:
             )
 
 
-def _how_open(environment: EnvironmentAnalysis, pairs: Sequence[PairComparison]) -> str:
-    """By how much the agents differ, and how many seeds it would take."""
-    return enumeration(
-        [f"{pair.second} ({_difference_so_far(environment, pair)})" for pair in pairs]
-    )
-
-
-def _difference_so_far(environment: EnvironmentAnalysis, pair: PairComparison) -> str:
-    text = f"difference {interval(pair.difference)}{_shown_with(environment, [pair])}"
-    if pair.seeds_needed is None:
-        return text
-    return f"{text}; about {seeds(pair.seeds_needed)} are needed to decide"
-
-
 # Sentences on how soon agents stay above the threshold.
 
 
 def speed_sentences(environment: EnvironmentAnalysis) -> Iterable[str]:
     """How many runs come to stay above the threshold, from when on, and who does so sooner."""
     told = [
-        agent
+        (agent.agent, agent.steps_to_stay.share_reached, agent.steps_to_stay.median.point)
         for agent in environment.agents
         if agent.steps_to_stay is not None and agent.steps_to_stay.share_reached.n
     ]
-    arrived = [agent for agent in told if _n_stayed(agent)]
+    arrived = sorted((one for one in told if one[1].point > 0), key=lambda one: one[2])
     if len(told) < 2 or not arrived:
         return
-    arrived.sort(key=_median_steps)
-    goal = f"{_goal(environment)} and keeps it to the end"
-    first, *others = [_on_arrival(agent) for agent in arrived]
-    never = [agent.agent for agent in told if not _n_stayed(agent)]
-    parts = [f"{arrived[0].agent} reaches {goal} in {first}"]
-    parts += [f"{agent.agent} in {text}" for agent, text in zip(arrived[1:], others, strict=True)]
+    parts = []
+    for name, share, steps in arrived:
+        goal = "" if parts else f"reaches {_goal(environment)} and keeps it to the end "
+        parts.append(f"{name} {goal}in {round(share.point * share.n)} of {share.n} runs")
+        if not math.isinf(steps):
+            parts[-1] += f", the median one from step {steps:,.0f} on"
+    never = [name for name, share, _ in told if share.point == 0]
     if never:
         parts.append(f"{enumeration(never)} in none")
     yield f"{'; '.join(parts)}."
-    yield from _on_ratios(environment, arrived[0].agent)
+    yield from _on_ratios(environment, arrived[0][0])
 
 
 def _on_ratios(environment: EnvironmentAnalysis, fastest: str) -> Iterable[str]:
@@ -202,34 +188,13 @@ def _on_ratios(environment: EnvironmentAnalysis, fastest: str) -> Iterable[str]:
             continue
         forward = pair.first == fastest
         low, high = pair.ratio.low, pair.ratio.high
-        low, high = (low, high) if forward else (_inverse(high), _inverse(low))
+        if not forward:
+            low, high = (math.inf if ratio == 0 else 1 / ratio for ratio in (high, low))
         name = pair.second if forward else pair.first
         most = f"at least {number(low)}" if math.isinf(high) else f"{number(low)} to {number(high)}"
         slower.append(f"{name} needs {most} times as many")
     if slower:
         yield f"{fastest} arrives in fewer steps: {enumeration(slower)}."
-
-
-def _inverse(ratio: float) -> float:
-    return math.inf if ratio == 0 else 1 / ratio
-
-
-def _n_stayed(agent: AgentAnalysis) -> int:
-    assert agent.steps_to_stay is not None
-    share = agent.steps_to_stay.share_reached
-    return round(share.point * share.n)
-
-
-def _median_steps(agent: AgentAnalysis) -> float:
-    assert agent.steps_to_stay is not None
-    return agent.steps_to_stay.median.point
-
-
-def _on_arrival(agent: AgentAnalysis) -> str:
-    assert agent.steps_to_stay is not None
-    n, steps = agent.steps_to_stay.share_reached.n, _median_steps(agent)
-    text = f"{_n_stayed(agent)} of {n} runs"
-    return text if math.isinf(steps) else f"{text}, the median one from step {steps:,.0f} on"
 
 
 def _goal(environment: EnvironmentAnalysis) -> str:
@@ -267,10 +232,13 @@ class Conclusion:
 
 def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion:
     """What a study has shown on one environment."""
+    failed = failed_runs(environment, [agent.agent for agent in environment.agents])
+    has_equal = any(pair.verdict == "equivalent" for pair in environment.pairs)
+    equal = ": what is equivalent is so in the typical run" if has_equal else ""
     return Conclusion(
         lead=" ".join(_lead(study, environment)),
         pairs=tuple(pair_sentences(study, environment)),
-        failed=_on_failed(environment),
+        failed=f"{failed}{equal}." if failed else "",
         notes=(
             *_on_other_tasks(environment),
             *on_unreliable(environment),
@@ -283,13 +251,6 @@ def conclusion(study: StudySpec, environment: EnvironmentAnalysis) -> Conclusion
             *_on_looks(environment),
         ),
     )
-
-
-def _on_failed(environment: EnvironmentAnalysis) -> str:
-    failed = failed_runs(environment, [agent.agent for agent in environment.agents])
-    if failed and any(pair.verdict == "equivalent" for pair in environment.pairs):
-        return f"{failed}: what is equivalent is so in the typical run."
-    return f"{failed}." if failed else ""
 
 
 def places_without_a_run(analysis: StudyAnalysis) -> list[str]:
@@ -338,8 +299,12 @@ def _standing(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[st
         figure = _figure(study, environment, first[0])
         yield f"{enumeration(ahead)} are best, and equivalent{where}: {figure}{but}."
     else:
-        figures = f"{_alternatives(first)}: that is undecided{_optimum(study, environment)}"
-        yield f"Best is {figures}{but}."
+        if len(ahead) > MOST_FIGURES:
+            whoever = f"one of {enumeration(ahead)}"
+        else:
+            *others, last = [f"{agent.agent} ({interval(agent.metric.mean)})" for agent in first]
+            whoever = f"{', '.join(others)} or {last}"
+        yield f"Best is {whoever}: that is undecided{_optimum(study, environment)}{but}."
 
 
 def _nothing_decided(study: StudySpec, environment: EnvironmentAnalysis) -> str:
@@ -356,13 +321,6 @@ def _nothing_decided(study: StudySpec, environment: EnvironmentAnalysis) -> str:
 def _but_failed(environment: EnvironmentAnalysis, names: Sequence[str]) -> str:
     failed = failed_runs(environment, names)
     return f"; {failed}" if failed else ""
-
-
-def _alternatives(agents: list[AgentAnalysis]) -> str:
-    if len(agents) > MOST_FIGURES:
-        return f"one of {enumeration([agent.agent for agent in agents])}"
-    *others, last = [f"{agent.agent} ({interval(agent.metric.mean)})" for agent in agents]
-    return f"{', '.join(others)} or {last}"
 
 
 def _figure(study: StudySpec, environment: EnvironmentAnalysis, agent: AgentAnalysis) -> str:
@@ -439,18 +397,15 @@ def _on_the_impossible(study: StudySpec, environment: EnvironmentAnalysis) -> It
     most = environment.optimum
     if environment.optimum_at_least is None or most is None:
         return
-    names = [a.agent for a in environment.agents if _surely(a.final) > most + abs(most) * 1e-6]
+    # Surely: by six standard errors, three times what the interval of the mean says.
+    least = {a.agent: a.final.point - 3 * (a.final.point - a.final.low) for a in environment.agents}
+    names = [name for name, value in least.items() if value > most + abs(most) * 1e-6]
     if names:
         verb = "has" if len(names) == 1 else "have"
         yield (
             f"{enumeration(names)} {verb} MORE THAN ANY POLICY CAN REACH, {number(most)}: the "
             "environment is not the one that the bracket is of, or the bracket is wrong."
         )
-
-
-def _surely(value: Estimate) -> float:
-    """What a mean is above by six standard errors: by three times what its interval says."""
-    return value.point - 3 * (value.point - value.low)
 
 
 def _on_variants(study: StudySpec, environment: EnvironmentAnalysis) -> Iterable[str]:

@@ -60,8 +60,7 @@ if TYPE_CHECKING:
 # The look of a study's figures, and how one becomes files.
 #
 # A figure is as wide as the text of a page, so that it is printed as it is drawn. Words that would
-# be
-# wider than what they belong to go over several lines.
+# be wider than what they belong to go over several lines.
 
 # What Matplotlib calls Plotly's line styles.
 _LINE_STYLES: Mapping[Dash, str] = {"solid": "-", "dash": "--", "dashdot": "-.", "dot": ":"}
@@ -96,9 +95,10 @@ def line_style(mark: Mark) -> dict[str, Any]:
     return {"color": COLOURS[mark.colour], "linestyle": _LINE_STYLES[mark.dash]}
 
 
-def colour_of(mark: Mark) -> str:
-    """The colour alone."""
-    return COLOURS[mark.colour]
+def fill_band(axes: Axes, band: Curve, mark: Mark, alpha: float = 0.2) -> None:
+    """Shade what lies between the ends of a curve's interval."""
+    style = {"color": COLOURS[mark.colour], "alpha": alpha, "linewidth": 0}
+    axes.fill_between(band.x, band.low, band.high, **style)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -205,18 +205,10 @@ def shared_legend(*places: Axes, band: str = "") -> None:
     figure.legend(handles, names, loc="outside lower center", **style)
 
 
-def make_room(axes: Axes, names: Sequence[str]) -> None:
-    """Make a figure of one panel as high as the names beside its axes need."""
-    lines = max(name.count("\n") + 1 for name in names)
-    _figure_of(axes).set_figheight(1.1 + len(names) * max(0.32, _LINE * lines + 0.04))
-
-
 def label_ends(axes: Axes, ends: Sequence[tuple[str, float, float, str]]) -> None:
-    """Names beside the ends of lines; an arrow stands after one whose line has left the axes.
+    """Names beside the ends of lines, of which all have been drawn; ``ends``: name, x, y, colour.
 
-    Args:
-        axes: where all lines have been drawn.
-        ends: name, x, y and colour of each.
+    An arrow stands after the name of a line that has left the axes.
     """
     low, high = axes.get_ylim()
     names = [wrapped(f"{name} ↑" if y > high else name, _END) for name, _, y, _ in ends]
@@ -254,7 +246,7 @@ def _apart(wanted: Sequence[float], sizes: Sequence[float]) -> list[float]:
     """Middles between 0 and 1 near those wanted, so that no two of these sizes overlap."""
 
     def span(group: list[int]) -> tuple[float, float]:
-        """Where the sizes of a group lie one on the other, near what all of them want."""
+        # Where the sizes of a group lie one on the other, near what all of them want.
         total = sum(sizes[k] for k in group)
         middle = float(np.mean([wanted[k] for k in group]))
         bottom = min(max(middle - total / 2, 0.0), 1 - total)
@@ -314,13 +306,9 @@ def draw_regret(axes: Axes, series: PullSeries, place: str, marks: Marks) -> Non
     # The interval of the mean, then the spread of runs, as far as the bands are few.
     kinds = ((mean_regret, 0.3), (regret_of_runs, 0.08))[: MOST_BANDS // len(series.pulls)]
     for agent, pulls in series.pulls.items():
-        style = line_style(marks[agent])
-        lines.append((agent, pulls.pulls, mean_regret(pulls).y, style))
+        lines.append((agent, pulls.pulls, mean_regret(pulls).y, line_style(marks[agent])))
         for curve_of, alpha in kinds:
-            band = curve_of(pulls)
-            axes.fill_between(
-                band.x, band.low, band.high, color=style["color"], alpha=alpha, linewidth=0
-            )
+            fill_band(axes, curve_of(pulls), marks[agent], alpha)
     words = ("", " with its 95 % interval", f", its 95 % interval, and {SPREAD} of the runs")
     title = f"{place}: mean of {series.n_runs:,} runs{words[len(kinds)]}"
     highest = max(axes.dataLim.y1, *(np.nanmax(y) for _, _, y, _ in lines))
@@ -353,7 +341,7 @@ def draw_arms(upper: Axes, lower: Axes, arms: ArmSeries, marks: Marks) -> None:
     places = np.arange(len(arms.names))
     width = 0.8 / len(arms.shares)
     for index, (agent, shares) in enumerate(arms.shares.items()):
-        colour = colour_of(marks[agent])
+        colour = COLOURS[marks[agent].colour]
         offset = places + (index - (len(arms.shares) - 1) / 2) * width
         upper.bar(offset, shares, width, color=colour, label=agent)
         if agent in arms.estimates:
@@ -425,10 +413,17 @@ def draw_learning_curves(
         _draw_curves(place, found.by_axis[by], marks)
         for agent, curve in found.by_axis[by].items():
             if agent in found.on_variant:
-                _mark_variant(place, curve, marks[agent])
+                # Circles along the curve, which tell it from the others without colour.
+                style = {"color": COLOURS[marks[agent].colour], "markerfacecolor": "white"}
+                (circles,) = place.plot(curve.x, curve.y, "o", markersize=5, **style)
+                circles.set_markevery(CIRCLES_APART)
         if not found.on_variant:
             _draw_references(place, environment)
-        title += "evaluations" if kind == "evaluation" else _training_title(found.on_variant)
+        title += "evaluations" if kind == "evaluation" else "training episodes"
+        if found.on_variant:
+            n = len(found.on_variant)
+            names = found.on_variant[0] if n == 1 else f"{n} agents"
+            title += f" ({names}: on a variant of the environment)"
         lettering(place, title=title, x=_AXES[by], y=f"return{_beyond(found.linear_up_to)}")
         place.xaxis.set_major_formatter(EngFormatter(sep=""))
         title = ""
@@ -441,27 +436,11 @@ def draw_learning_curves(
 def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
     """Curves, the first ones with their intervals."""
     for place, (agent, curve) in enumerate(curves.items()):
-        style = line_style(marks[agent])
         marker = "o" if len(curve.x) == 1 else ""  # which has no length
+        style = line_style(marks[agent])
         axes.plot(curve.x, curve.y, label=agent, linewidth=1.5, marker=marker, **style)
         if place < MOST_BANDS:
-            axes.fill_between(
-                curve.x, curve.low, curve.high, color=style["color"], alpha=0.2, linewidth=0
-            )
-
-
-def _mark_variant(axes: Axes, curve: Curve, mark: Mark) -> None:
-    """Circles along a curve, which tell it from the others without colour."""
-    colour = colour_of(mark)
-    hollow = axes.plot(curve.x, curve.y, "o", color=colour, markerfacecolor="white", markersize=5)
-    hollow[0].set_markevery(CIRCLES_APART)
-
-
-def _training_title(on_variant: Sequence[str]) -> str:
-    if not on_variant:
-        return "training episodes"
-    names = on_variant[0] if len(on_variant) == 1 else f"{len(on_variant)} agents"
-    return f"training episodes ({names}: on a variant of the environment)"
+            fill_band(axes, curve, marks[agent])
 
 
 def _beyond(linear_up_to: float | None) -> str:
@@ -475,12 +454,9 @@ def _set_scale(axes: Axes, linear_up_to: float | None) -> None:
         axes.set_yscale("symlog", linthresh=linear_up_to)
         axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
         axes.yaxis.set_minor_locator(NullLocator())
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _signed(value)))
-
-
-def _signed(value: float) -> str:
-    """A number as Matplotlib's own axes have it."""
-    return number(value).replace("-", "\N{MINUS SIGN}")
+        # With the minus sign that Matplotlib's own axes have.
+        signed = FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
+        axes.yaxis.set_major_formatter(signed)
 
 
 def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
@@ -491,9 +467,7 @@ def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
         ("best random or constant policy", environment.baseline, ":"),
     ):
         if height is not None:
-            axes.axhline(
-                height, color=REFERENCE, linestyle=style, linewidth=1, label=label, zorder=1
-            )
+            axes.axhline(height, color=REFERENCE, ls=style, lw=1, label=label, zorder=1)
 
 
 def draw_runs(
@@ -502,7 +476,7 @@ def draw_runs(
     """Each run as a dot, the mean with its interval; the best agent on top."""
     upwards = runs.agents[::-1]
     for row, agent in enumerate(upwards):
-        colour = colour_of(marks[agent.agent])
+        colour = COLOURS[marks[agent.agent].colour]
         n = len(agent.values)
         spread = np.linspace(-0.18, 0.18, n) if n > 1 else np.zeros(n)
         axes.plot(agent.values, row + spread, ".", color=colour, alpha=0.5, markersize=5)
@@ -511,7 +485,8 @@ def draw_runs(
         axes.plot([mean.point], [row], "|", color=colour, markersize=16, markeredgewidth=1.5)
     names = [wrapped(agent.agent, NAMES) for agent in upwards]
     axes.set_yticks(range(len(upwards)), names)
-    make_room(axes, names)
+    lines = max(name.count("\n") + 1 for name in names)
+    _figure_of(axes).set_figheight(1.1 + len(names) * max(0.32, _LINE * lines + 0.04))
     axes.set_ylim(-0.6, len(upwards) - 0.4)
     title = environment.environment
     if metric in ("final", "best") and environment.optimum is not None:
@@ -534,14 +509,12 @@ def draw_sweeps(
     values = np.unique(np.concatenate([sweep.means.x for sweep in sweeps.values()]))
     words = _set_scale_of_values(axes, values)
     for place, (group, sweep) in enumerate(sweeps.items()):
-        style = line_style(Mark(group, place % len(COLOURS), DASHES[place % len(DASHES)]))
-        curve = sweep.means
+        mark = Mark(group, place % len(COLOURS), DASHES[place % len(DASHES)])
+        x, y = sweep.means.x, sweep.means.y
         label = group if len(names) == 1 else f"{group}, {sweep.parameter}"
-        axes.plot(curve.x, curve.y, marker="o", label=label, markersize=4, **style)
+        axes.plot(x, y, marker="o", label=label, markersize=4, **line_style(mark))
         if place < MOST_BANDS:
-            axes.fill_between(
-                curve.x, curve.low, curve.high, color=style["color"], alpha=0.2, linewidth=0
-            )
+            fill_band(axes, sweep.means, mark)
     best = best_of(environment, [label for sweep in sweeps.values() for label in sweep.labels])
     rings = [
         (x, y)
@@ -580,7 +553,8 @@ def draw_grid(
     """The means over two swept parameters as a heat map, the best in frames."""
     shares = grid.shares(is_cost=metric in COSTS)  # the darker the better
     colours = mpl.colormaps["Blues"](0.05 + 0.75 * shares)
-    axes.pcolormesh(*map(_edges, grid.means.shape[::-1]), colours, edgecolor="white", linewidth=1)
+    across, down = (np.arange(-0.5, n) for n in grid.means.shape[::-1])  # edges of the cells
+    axes.pcolormesh(across, down, colours, edgecolor="white", linewidth=1)
     best = best_of(environment, [label for row in grid.labels for label in row])
     for (row, column), mean in np.ndenumerate(grid.means):
         if not np.isnan(mean):
@@ -592,10 +566,9 @@ def draw_grid(
             axes.add_patch(frame)
     axes.invert_yaxis()
     axes.grid(visible=False)
-    down, across = ([_brief(text) for text in texts] for texts in (grid.down, grid.across))
-    turned = 90 if len(across) > UPRIGHT else 0
-    axes.set_xticks(range(len(across)), across, rotation=turned)
-    axes.set_yticks(range(len(down)), down)
+    turned = 90 if len(grid.across) > UPRIGHT else 0
+    axes.set_xticks(range(len(grid.across)), list(map(_brief, grid.across)), rotation=turned)
+    axes.set_yticks(range(len(grid.down)), list(map(_brief, grid.down)))
     axes.tick_params(length=0)
     y, x = grid.parameters
     frames = "a frame" if len(best) == 1 else "frames"
@@ -608,26 +581,14 @@ def _brief(text: str) -> str:
     return wrapped(text if len(text) <= LONGEST else f"{text[: LONGEST - 1]}…", 1.0)
 
 
-def _edges(n: int) -> Floats:
-    """Of cells whose middles are 0, 1, 2 and so on."""
-    return np.arange(-0.5, n)
-
-
 def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark) -> None:
     """Average, minimum and maximum of each block of an agent's episodes."""
     scale = linear_up_to([rows[column].to_numpy(float) for column in BLOCKS], None)
     _set_scale(axes, scale)
+    colour = COLOURS[mark.colour]
     for column, style in BLOCKS.items():
-        colour = colour_of(mark)
         axes.plot(rows["episode"], rows[column], style, marker="o", markersize=3, color=colour)
     lettering(axes, title=mark.label, x="episode", y=f"return{_beyond(scale)}")
-
-
-def name_blocks(axes: Axes) -> None:
-    """Tell below the figure what the lines of all blocks are."""
-    for label, style in BLOCKS.items():
-        axes.plot([], [], style, marker="o", markersize=3, color=REFERENCE, label=label)
-    shared_legend(axes)
 
 
 def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:
@@ -652,15 +613,9 @@ MOST_IN_PAIRS = 8  # panels that have a page in two columns; more stand in three
 def write_figures(
     series: StudySeries, episodes_table: pd.DataFrame | None, tell: Tell = tell_nobody
 ) -> list[Path]:
-    """Draw all figures that the study has the runs for, into its folder ``figures``.
+    """Draw all figures that the study has the runs for, into its folder ``figures``; its files.
 
-    Args:
-        series: what they show.
-        episodes_table: from `report.series`, or None for no such figure.
-        tell: told how far the drawing is.
-
-    Returns:
-        The files.
+    ``episodes_table`` is that of `report.series`, or None for no such figure.
     """
     files = FigureFiles(series.analysis.results.root / "figures", series.analysis.study.figures)
     files.folder.mkdir(exist_ok=True)
@@ -714,7 +669,9 @@ def _block_figure(files: FigureFiles, name: str, rows: pd.DataFrame, marks: Mark
                 draw_blocks(axes, rows[rows["agent"] == agent], marks[agent])
             for axes in places[len(agents) :]:
                 axes.set_visible(False)
-            name_blocks(places[0])
+            for label, style in BLOCKS.items():
+                places[0].plot([], [], style, marker="o", ms=3, color=REFERENCE, label=label)
+            shared_legend(places[0])
 
 
 def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Marks) -> None:

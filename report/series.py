@@ -94,17 +94,13 @@ def learning_curves(
 ) -> dict[str, LearningCurves]:
     """The curves on an environment, by kind."""
     found = {}
+    variants = tuple(agent.agent for agent in environment.agents if agent.on_variant)
     runs = curves_by_agent(results, environment.environment)
     for kind in KINDS:
         of_agents = {agent.agent: runs.get((agent.agent, kind), []) for agent in environment.agents}
         by_axis = {by: _curves(of_agents, by) for by in AXES}
-        by_step = [curve.y for curve in by_axis["step"].values()]
-        variants = [agent.agent for agent in environment.agents if agent.on_variant]
-        found[kind] = LearningCurves(
-            by_axis,
-            linear_up_to(by_step, environment.optimum),
-            tuple(variants) if kind == "training" else (),
-        )
+        scale = linear_up_to([curve.y for curve in by_axis["step"].values()], environment.optimum)
+        found[kind] = LearningCurves(by_axis, scale, variants if kind == "training" else ())
     return found
 
 
@@ -122,15 +118,10 @@ def _curves(of_agents: Mapping[str, Sequence[pd.DataFrame]], by: str) -> dict[st
 
 
 def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | None:
-    """Where a symmetric logarithmic axis ceases to be linear.
+    """Where a symmetric logarithmic axis ceases to be linear; None where a linear axis shows all.
 
-    Args:
-        curves: returns in the order of time, each of shape (n_points,).
-        optimum: the highest expected return, where it is known.
-
-    Returns:
-        The optimum's magnitude or, where it is not known, the largest of the returns that the
-        curves end with; None where no return dwarfs it, so that a linear axis shows all.
+    It is the optimum's magnitude or, where that is not known, the largest of the returns that the
+    curves end with. The curves are in the order of time, each of shape (n_points,).
     """
     known = [finite for curve in curves if len(finite := curve[np.isfinite(curve)])]
     if not known:
@@ -145,29 +136,20 @@ def linear_up_to(curves: Iterable[Floats], optimum: float | None) -> float | Non
 
 
 def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
-    """Training returns by blocks of episodes, over all seeds of an agent.
+    """Training returns of all seeds by agent, environment and block of ``width`` episodes.
 
-    Args:
-        results: the runs.
-        width: episodes in a block.
-
-    Returns:
-        Columns agent, environment, episode (the last of the block), average, minimum, maximum.
+    Columns agent, environment, episode (the last of the block), average, minimum, maximum.
     """
     rows = []
     for planned in results.finished:
         returns = read_episodes(planned.run).returns
-        block = pd.Series(range(len(returns))) // width
-        rows.append(
-            pd.DataFrame(
-                {
-                    "agent": planned.agent,
-                    "environment": planned.environment,
-                    "episode": (block + 1) * width,
-                    "return": returns,
-                }
-            )
-        )
+        columns = {
+            "agent": planned.agent,
+            "environment": planned.environment,
+            "episode": (np.arange(len(returns)) // width + 1) * width,
+            "return": returns,
+        }
+        rows.append(pd.DataFrame(columns))
     if not rows:
         return pd.DataFrame(columns=["agent", "environment", "episode"])
     grouped = pd.concat(rows).groupby(["environment", "agent", "episode"], sort=False)["return"]
@@ -177,39 +159,6 @@ def episodes_table(results: StudyResults, width: int) -> pd.DataFrame:
 # What Thompson sampling believes of its arms, as densities to draw.
 
 N_POINTS = 241
-
-
-def is_normal(results: StudyResults, agent: str) -> bool:
-    """Whether the agent takes rewards to have normal noise, so that its beliefs are normal too."""
-    spec = next(planned.spec for planned in results.planned if planned.agent == agent)
-    return spec.hyperparams.algorithm.get("likelihood") == "gaussian"
-
-
-def grid(true_means: Floats, *, is_normal: bool) -> Floats:
-    """Mean rewards to give densities at, shape (n_points,)."""
-    if is_normal:
-        return np.linspace(true_means.min() - 2, true_means.max() + 2, N_POINTS)
-    return np.linspace(0.0, min(2 * float(true_means.max()), 1.0), N_POINTS)
-
-
-def density(parameters: Floats, points: Floats, *, is_normal: bool) -> Floats:
-    """The density of a belief.
-
-    Args:
-        parameters: mean and standard deviation of a normal distribution, or the two parameters of a
-            Beta distribution.
-        points: where.
-        is_normal: which of them.
-    """
-    family = stats.norm if is_normal else stats.beta
-    return np.asarray(family.pdf(points, *parameters))
-
-
-def truth(statistics: PullStatistics, context: int, arm: int) -> float | None:
-    """The mean of the arm that a belief is about; None for an agent that knows no contexts."""
-    if statistics.posteriors.shape[1] != len(statistics.true_means):
-        return None
-    return float(statistics.true_means[context, arm])
 
 
 @dataclass(frozen=True)
@@ -226,17 +175,22 @@ class Belief:
 
 def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Belief:
     """The densities of an agent's beliefs, at all moments that were kept."""
-    normal = is_normal(results, agent)
-    points = grid(statistics.true_means, is_normal=normal)
+    spec = next(planned.spec for planned in results.planned if planned.agent == agent)
+    means = statistics.true_means
+    # Parameters: of a normal distribution mean and standard deviation, of a Beta distribution both.
+    if spec.hyperparams.algorithm.get("likelihood") == "gaussian":
+        family, low, high = stats.norm, means.min() - 2, means.max() + 2
+    else:
+        family, low, high = stats.beta, 0.0, min(2 * float(means.max()), 1.0)
+    points = np.linspace(low, high, N_POINTS)
     parameters = statistics.posteriors
     _, n_contexts, n_arms, _ = parameters.shape
-    densities = [density(row, points, is_normal=normal) for row in parameters.reshape(-1, 2)]
     return Belief(
         agent,
         statistics.moments,
         points,
-        np.reshape(densities, (*parameters.shape[:3], len(points))),
-        [[truth(statistics, c, arm) for arm in range(n_arms)] for c in range(n_contexts)],
+        family.pdf(points, parameters[..., :1], parameters[..., 1:]),
+        means.tolist() if n_contexts == len(means) else [[None] * n_arms] * n_contexts,
     )
 
 
@@ -244,14 +198,7 @@ def belief(results: StudyResults, agent: str, statistics: PullStatistics) -> Bel
 
 
 def auer_bound(means: ArrayLike, pulls: ArrayLike) -> Floats:
-    """An upper bound on the expected regret of UCB1 for rewards between 0 and 1.
-
-    Args:
-        means: of the arms, shape (n_arms,).
-        pulls: numbers of pulls, of any shape.
-
-    Returns:
-        The bound for each number of pulls.
+    """An upper bound on the expected regret of UCB1, by pulls, for rewards between 0 and 1.
 
     Source: Auer, Cesa-Bianchi and Fischer (2002), theorem 1.
     """
@@ -326,7 +273,6 @@ class RegretBounds:
 class ArmSeries:
     """Arms in the order of contexts, each array of shape (n_contexts * n_arms,)."""
 
-    n_contexts: int  # how many
     names: list[str]  # what the arms are called
     means: Floats  # their true mean rewards
     # By agent, the share of the pulls in the context that went to them.
@@ -407,7 +353,6 @@ def arm_series(known: Pulls) -> ArmSeries | None:
     means = next(iter(known.values())).true_means
     contexts, arms = means.shape
     return ArmSeries(
-        n_contexts=contexts,
         names=[
             f"arm {arm}" if contexts == 1 else f"context {context}, arm {arm}"
             for context in range(contexts)
@@ -576,23 +521,18 @@ class StudySeries:
 
 def study_series(analysis: StudyAnalysis, tell: Tell = tell_nobody) -> StudySeries:
     """Compute all that is drawn; most of the time goes into the intervals of the curves."""
+    results, agents = analysis.results, analysis.study.agents
     environments = []
     for one in analysis.environments:
         tell(one.environment)
-        environments.append(_environment_series(analysis, one))
+        pulls = pull_series(results, one)
+        found = EnvironmentSeries(
+            environment=one,
+            curves=learning_curves(results, one) if pulls is None else None,
+            runs=run_series(results, one),
+            pulls=pulls,
+            sweeps=sweeps(agents, one),
+            grids=grids(agents, one),
+        )
+        environments.append(found)
     return StudySeries(analysis, agent_marks(analysis.study), tuple(environments))
-
-
-def _environment_series(
-    analysis: StudyAnalysis, environment: EnvironmentAnalysis
-) -> EnvironmentSeries:
-    results = analysis.results
-    pulls = pull_series(results, environment)
-    return EnvironmentSeries(
-        environment=environment,
-        curves=learning_curves(results, environment) if pulls is None else None,
-        runs=run_series(results, environment),
-        pulls=pulls,
-        sweeps=sweeps(analysis.study.agents, environment),
-        grids=grids(analysis.study.agents, environment),
-    )

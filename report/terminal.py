@@ -13,13 +13,10 @@ from rich.table import Table
 
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
 from experiments.off_policy.estimators import difference_in_value, mean_reward
-from experiments.off_policy.logged_policies import (
-    Comparison,
-    Judged,
-)
+from experiments.off_policy.logged_policies import Comparison, Judged
 from experiments.plan import tuning_seeds
 from experiments.study import METRIC_WORDS, StudySpec
-from report.conclusions import conclusion, seeds_of
+from report.conclusions import conclusion, pairs_both_ways, seeds_of
 from report.ranking import BANDIT_COLUMNS, COLUMNS, BanditRow, Cell, Column, Row, filled
 from report.words import enumeration, number, optimum_words, seed_sentence
 from verdicts import Estimate, Verdict
@@ -38,10 +35,7 @@ LEGEND = "> better than the agent of the column, < worse, = equivalent, ? undeci
 
 def verdict_matrix(environment: EnvironmentAnalysis) -> list[list[Verdict | None]]:
     """By row and column, the verdict on the row's agent against the column's; None on itself."""
-    verdicts: dict[tuple[str, str], Verdict] = {}
-    for pair in environment.pairs:
-        for seen in (pair, pair.swapped()):
-            verdicts[seen.first, seen.second] = seen.verdict
+    verdicts = {names: pair.verdict for names, pair in pairs_both_ways(environment).items()}
     names = [agent.agent for agent in environment.agents]
     return [[verdicts.get((row, column)) for column in names] for row in names]
 
@@ -56,15 +50,13 @@ def says_more(environment: EnvironmentAnalysis) -> bool:
 
 MOST_AGENT_WIDTH = 20
 UNBOUNDED = 10_000  # columns
-
-AnyRow = TypeVar("AnyRow", bound=Row)
-
-
 # Where a table is wider than the terminal it goes without these, in this order; the page has all.
 FIRST_LEFT_OUT = (
     *("training", "IQM", "solved", "stays from"),
     *("simple regret", "reward", "CPU time", "score", "best arm"),
 )
+
+AnyRow = TypeVar("AnyRow", bound=Row)
 
 
 def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
@@ -81,21 +73,13 @@ def print_analysis(console: Console, analysis: StudyAnalysis) -> None:
 def _print_conclusion(console: Console, study: StudySpec, environment: EnvironmentAnalysis) -> None:
     """The verdict in a line, the pairs as a matrix where they are many, and what else there is."""
     said = conclusion(study, environment)
-
-    def say(text: str) -> None:
-        console.print(text, highlight=False)
-
-    say(said.lead)
+    told: list[str | Table] = [said.lead]
     if says_more(environment):
-        console.print(_matrix(environment))
-        say(LEGEND)
-        if said.failed:
-            say(said.failed)
+        told += [_matrix(environment), LEGEND, *([said.failed] if said.failed else [])]
     elif len(environment.agents) == 2:
-        for sentence in said.pairs:
-            say(sentence)
-    for sentence in said.notes:
-        say(sentence)
+        told += said.pairs
+    for each in (*told, *said.notes):
+        console.print(each, highlight=False)
 
 
 def _matrix(environment: EnvironmentAnalysis) -> Table:
@@ -141,14 +125,11 @@ def _print_fitting(
     """Print a table with as many columns as there is room for; the headings of the others."""
     shown = filled(columns, rows)
     left_out: list[str] = []
-    table = _table(title, shown, rows)
-    for heading in FIRST_LEFT_OUT:
-        if _width(console, table) <= console.width:
-            break
-        if heading in [column.terminal for column, _ in shown]:
-            shown = [(column, cells) for column, cells in shown if column.terminal != heading]
-            left_out.append(heading)
-            table = _table(title, shown, rows)
+    there = [column.terminal for column, _ in shown]
+    to_leave_out = [heading for heading in FIRST_LEFT_OUT if heading in there]
+    while _width(console, table := _table(title, shown, rows)) > console.width and to_leave_out:
+        left_out.append(to_leave_out.pop(0))
+        shown = [(column, cells) for column, cells in shown if column.terminal != left_out[-1]]
     console.print(table)
     return left_out
 

@@ -57,7 +57,6 @@ def statistics(start, n_runs=4):
 
 BOUNDS = RegretBounds(PULLS, np.array([10.0, 30.0, 90.0]), np.array([0.0, 5.0, 10.0]))
 ARMS = ArmSeries(
-    2,
     [f"context {context}, arm {arm}" for context in (0, 1) for arm in (0, 1)],
     np.array([0.1, 0.2, 0.3, 0.4]),
     {"first": np.array([0.25, 0.75, 0.5, 0.5]), "second": np.array([1, 0, 0, 1.0])},
@@ -302,5 +301,5 @@ def test_agents_without_a_simple_regret_leave_no_empty_panel(study, canvases):
 def test_too_many_agents_on_a_bandit_make_no_lines(study):
     names = [f"agent {n}" for n in range(15)]
     crowd = {name: statistics(10) for name in names}
-    arms = ArmSeries(1, ["arm 0"], np.ones(1), dict.fromkeys(names, np.ones(1)), {})
+    arms = ArmSeries(["arm 0"], np.ones(1), dict.fromkeys(names, np.ones(1)), {})
     assert write_figures(study(series(pulls=crowd, arms=arms), tuple(names)), None) == []

@@ -15,7 +15,7 @@ from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.figures import write_figures
 from report.page import world_sections, write_report
 from report.page.frame import Report
-from report.series import density, grid, is_normal, study_series, truth
+from report.series import belief, study_series
 
 PLACES = (
     EnvironmentSpec("coins", "BernoulliBandit-v0", {"n_timesteps": 400}),
@@ -108,17 +108,16 @@ def test_the_table_by_context(analysis):
 
 def test_beliefs(analysis):
     results = analysis.results
-    assert [is_normal(results, agent.label) for agent in AGENTS] == [False, False, True, False]
-    normal, beta = (results.pulls[a.label, "coins"] for a in (AGENTS[2], AGENTS[0]))
-    for statistics, is_bell in ((normal, True), (beta, False)):
-        points = grid(statistics.true_means, is_normal=is_bell)
-        for parameters in statistics.posteriors[0, 0]:
-            y = density(parameters, points, is_normal=is_bell)
-            assert integrate.trapezoid(y, points) == pytest.approx(1, abs=0.02)
-        assert truth(statistics, 0, 2) == 0.75
+    for agent, lowest in ((AGENTS[2], 0.2 - 2), (AGENTS[0], 0)):
+        found = belief(results, agent.label, results.pulls[agent.label, "coins"])
+        assert found.points[0] == pytest.approx(lowest)
+        for y in found.densities[0, 0]:
+            assert integrate.trapezoid(y, found.points) == pytest.approx(1, abs=0.02)
+        assert found.true_means[0][2] == 0.75
     # What an agent believes of an arm over all contexts has no one true mean here.
-    assert truth(results.pulls["blind", "segments"], 0, 1) is None
-    assert truth(results.pulls[AGENTS[0].label, "segments"], 0, 1) == 0.25
+    for label, mean in (("blind", None), (AGENTS[0].label, 0.25)):
+        found = belief(results, label, results.pulls[label, "segments"])
+        assert found.true_means[0][1] == mean
 
 
 def test_posteriors_on_the_page(page):

@@ -91,7 +91,7 @@ def all_figures(made_up, root, names):
     )
     few = np.full(4, 0.25)
     arms = ArmSeries(
-        2, [f"context {c}, arm {a}" for c in (0, 1) for a in (0, 1)], few,
+        [f"context {c}, arm {a}" for c in (0, 1) for a in (0, 1)], few,
         dict.fromkeys(names, few), dict.fromkeys(names, (few, few)),
     )  # fmt: skip
     belief = Belief(

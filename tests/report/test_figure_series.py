@@ -188,7 +188,7 @@ def test_arms_of_agents_that_estimate_them_and_of_others():
     knows = pulls_of(true_means=means, estimates=np.array([[[0.1, 0.4]], [[0.3, 0.6]]]))
     arms = arm_series({"knows": knows, "does not": pulls_of(true_means=means)})
     assert arms is not None
-    assert (arms.n_contexts, arms.names) == (1, ["arm 0", "arm 1"])
+    assert arms.names == ["arm 0", "arm 1"]
     assert arms.means.tolist() == [0.2, 0.5]
     assert {agent: shares.tolist() for agent, shares in arms.shares.items()} == {
         "knows": [3 / 8, 5 / 8],
