@@ -9,7 +9,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from importlib.resources import files
 from typing import Any
 from urllib.parse import quote
@@ -26,7 +26,6 @@ from pipeline.signs_of_life import Tell, tell_nobody
 from report.ranking import bar
 from report.series import StudySeries
 from report.words import interval_alone, number, optimum_words
-from verdicts import Estimate
 
 # From data to text that a browser can be handed: templates, JSON, inline scripts.
 
@@ -73,11 +72,13 @@ def package_file(name: str) -> str:
 
 def plain(value: Any) -> Any:
     """The value as JSON knows it: rounded, and None in place of what is not finite."""
+    if is_dataclass(value):
+        value = vars(value)
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, float):
         return float(f"{value:.{SIGNIFICANT}g}") if math.isfinite(value) else None
-    if isinstance(value, dict):
+    if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain(item) for item in value]
@@ -229,11 +230,6 @@ def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
         ]
         for environment in analysis.environments
     ]
-
-
-def estimate_data(estimate: Estimate) -> dict[str, float]:
-    """A figure and its interval, for scripts."""
-    return {"point": estimate.point, "low": estimate.low, "high": estimate.high}
 
 
 def layout_data(layout: GridLayout) -> dict[str, Any]:

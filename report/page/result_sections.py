@@ -1,98 +1,83 @@
-"""Sections on results: overview, verdicts, rankings, curves, differences, scores."""
+"""Sections on results: overview, verdicts, rankings, curves, differences, scores, settings."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.analysis import EnvironmentAnalysis, OverallAnalysis, StudyAnalysis
+from experiments.analysis import EnvironmentAnalysis
+from experiments.looks import read_looks
+from experiments.plan import PlannedRun, tuning_seeds
+from experiments.results import StudyResults
+from experiments.run_files import mixed_versions
 from experiments.study import COSTS, METRIC_WORDS, StudySpec
 from mdp.array_types import Floats
-from report.conclusions import conclusion, on_changes, places_without_a_run
+from report.conclusions import conclusion, on_changes, pairs_both_ways, places_without_a_run
 from report.documents import MARKUPS, verdicts_as
-from report.page.frame import Report, Section, estimate_data
+from report.page.frame import Report, Section, setting
 from report.ranking import COLUMNS, Row, filled
-from report.series import (
-    AgentRuns,
-    Curve,
-    EnvironmentSeries,
-    Grid,
-    LearningCurves,
-    PullSeries,
-    best_of,
-    mean_regret,
-)
-from report.terminal import PHRASES, SIGNS, says_more, verdict_matrix
-from report.words import number
-from verdicts import Estimate
+from report.series import AgentRuns, Curve, EnvironmentSeries, Grid, best_of, mean_regret
+from report.terminal import PHRASES, SIGNS, says_more
+from report.words import look_sentences, number, seed_sentence
 
-# All environments side by side, each as a small figure.
-
-WIDTH, HEIGHT = 200, 100  # in the drawing's own unit
+WIDTH, HEIGHT = 200, 100  # of a small figure, in the drawing's own unit
 
 
-@dataclass(frozen=True)
-class SmallFigure:
+class SmallFigure(NamedTuple):
     """The curves of an environment."""
 
     name: str  # the environment's
     what: str  # what goes upwards
     lines: Mapping[str, str]  # by agent, corners of its line as SVG takes them
-    # How far from the top the optimum lies; None where it is not known or not shown.
-    optimum: float | None
+    optimum: float | None  # how far from the top it lies; None where it is not known or not shown
 
 
 def overview(report: Report) -> Section | None:
-    """A figure for each environment; None for a single one."""
+    """All environments side by side, each as a small figure; None for a single one."""
     environments = report.series.environments
     if len(environments) < 2:
         return None
-    figures = [_figure(one) for one in environments]
+    figures = [_small_figure(one) for one in environments]
     agents = [label for label in report.series.marks if any(label in f.lines for f in figures)]
     context = {"figures": figures, "agents": agents, "width": WIDTH, "height": HEIGHT}
     return Section("overview", "Environments", context, data={})
 
 
-def _figure(one: EnvironmentSeries) -> SmallFigure:
-    name = one.environment.environment
+def _small_figure(one: EnvironmentSeries) -> SmallFigure:
+    curves: Mapping[str, Curve] = {}
+    linear, optimum = None, None
     if one.pulls is not None:
-        return SmallFigure(name, "cumulative regret by pull", _regret(one.pulls), None)
-    evaluations = None if one.curves is None else one.curves["evaluation"]
-    curves = {} if evaluations is None else evaluations.by_axis["step"]
-    linear = None if evaluations is None else evaluations.linear_up_to
-    return _drawn(name, "return of evaluations by step", curves, one.environment.optimum, linear)
-
-
-def _regret(pulls: PullSeries) -> dict[str, str]:
-    curves = {agent: mean_regret(found) for agent, found in pulls.pulls.items()}
-    return dict(_drawn("", "", curves, None, None).lines)
-
-
-def _drawn(
-    name: str,
-    what: str,
-    curves: Mapping[str, Curve],
-    optimum: float | None,
-    linear: float | None,
-) -> SmallFigure:
-    upright = {agent: _compressed(curve.y, linear) for agent, curve in curves.items()}
-    best = None if optimum is None else float(_compressed(np.array([optimum]), linear)[0])
-    known = [*upright.values(), *([] if best is None else [np.array([best])])]
-    low, high = _range(known)
+        what = "cumulative regret by pull"
+        curves = {agent: mean_regret(found) for agent, found in one.pulls.pulls.items()}
+    else:
+        what, optimum = "return of evaluations by step", one.environment.optimum
+        if one.curves is not None:
+            curves = one.curves["evaluation"].by_axis["step"]
+            linear = one.curves["evaluation"].linear_up_to
+    heights = {agent: _compressed(curve.y, linear) for agent, curve in curves.items()}
+    best = _compressed(np.array([] if optimum is None else [optimum]), linear)
+    known = np.concatenate([best, *heights.values()])
+    known = known[np.isfinite(known)]
+    low, high = (known.min(), known.max()) if known.size else (0.0, 1.0)
     last = max((float(curve.x[-1]) for curve in curves.values()), default=1.0) or 1.0
+
+    def down(height: float) -> float:
+        # How far below the top, with room for the width of a line.
+        return 4 + (HEIGHT - 8) * (high - height) / ((high - low) or 1.0)
+
     lines = {
         agent: " ".join(
-            f"{WIDTH * x / last:.1f},{_down(y, low, high):.1f}"
+            f"{WIDTH * x / last:.1f},{down(y):.1f}"
             for x, y in zip(curves[agent].x, values, strict=True)
             if math.isfinite(y)
         )
-        for agent, values in upright.items()
+        for agent, values in heights.items()
     }
-    return SmallFigure(name, what, lines, None if best is None else _down(best, low, high))
+    name = one.environment.environment
+    return SmallFigure(name, what, lines, down(float(best[0])) if best.size else None)
 
 
 def _compressed(values: Floats, linear: float | None) -> Floats:
@@ -103,43 +88,29 @@ def _compressed(values: Floats, linear: float | None) -> Floats:
     return np.asarray(np.sign(values) * np.where(size <= 1, size, 1 + np.log10(size)))
 
 
-def _range(values: Iterable[Floats]) -> tuple[float, float]:
-    known = np.concatenate([[], *values])
-    known = known[np.isfinite(known)]
-    return (float(known.min()), float(known.max())) if known.size else (0.0, 1.0)
-
-
-def _down(value: float, low: float, high: float) -> float:
-    """How far below the top, with room for the width of a line."""
-    return 4 + (HEIGHT - 8) * (high - value) / ((high - low) or 1.0)
-
-
-# What the study has shown: verdicts, rankings, curves, differences, scores.
-
-
 def verdict(report: Report) -> Section | None:
     """For each environment a line, the pairs as a matrix, and folded the rest."""
-    study = report.analysis.study
+    study, environments = report.analysis.study, report.series.environments
+    metric = METRIC_WORDS[study.metric]
     cards = [
         {
             "environment": one.environment,
             "conclusion": conclusion(study, one.environment),
-            "matrix": verdict_matrix(one.environment) if says_more(one.environment) else None,
+            "pairs": pairs_both_ways(one.environment) if says_more(one.environment) else None,
             "has_sweeps": bool(one.sweeps),
             "grids": {name: _grid(one, grid, study.metric) for name, grid in one.grids.items()},
         }
-        for one in report.series.environments
+        for one in environments
     ]
     context = {
         "general": places_without_a_run(report.analysis),
         "cards": cards,
         "signs": SIGNS,
         "phrases": PHRASES,
-        "metric": METRIC_WORDS[study.metric],
+        "metric": metric,
     }
     files = {name: verdicts_as(name, report.analysis, report.command) for name in MARKUPS}
-    sweeps = [_sweeps(one) for one in report.series.environments]
-    data = {"files": files, "metric": METRIC_WORDS[study.metric], "sweeps": sweeps}
+    data = {"files": files, "metric": metric, "sweeps": [_sweeps(one) for one in environments]}
     return Section("verdict", "Verdict", context, data)
 
 
@@ -163,9 +134,9 @@ def _grid(one: EnvironmentSeries, grid: Grid, metric: str) -> dict[str, Any]:
     rows = [
         [
             {"mean": mean, "strength": f"{90 * share:.0f}%", "is_best": label in best}
-            for label, mean, share in zip(labels, means, of_row, strict=True)
+            for label, mean, share in zip(*of_row, strict=True)
         ]
-        for labels, means, of_row in zip(grid.labels, grid.means, shares, strict=True)
+        for of_row in zip(grid.labels, grid.means, shares, strict=True)
     ]
     return {"grid": grid, "n_best": len(best), "rows": list(zip(grid.down, rows, strict=True))}
 
@@ -173,10 +144,8 @@ def _grid(one: EnvironmentSeries, grid: Grid, metric: str) -> dict[str, Any]:
 def ranking(report: Report) -> Section | None:
     """A table for each environment."""
     study = report.analysis.study
-    context = {
-        "tables": [_ranking(study, environment) for environment in report.analysis.environments],
-        "metric": METRIC_WORDS[study.metric],
-    }
+    tables = [_ranking(study, environment) for environment in report.analysis.environments]
+    context = {"tables": tables, "metric": METRIC_WORDS[study.metric]}
     return Section("ranking", "Ranking", context, by_environment=True)
 
 
@@ -212,33 +181,17 @@ def curves(report: Report) -> Section | None:
     curves = [one.curves for one in report.series.environments]
     if report.analysis.results.curves.empty or not any(curves):
         return None
+    by_step = [{} if item is None else item["evaluation"].by_axis["step"] for item in curves]
     context = {
         "has_curves": [item is not None for item in curves],
         "stages": STAGES,
-        "tables": [[] if item is None else _stages(item["evaluation"]) for item in curves],
+        # For those who cannot see the figure.
+        "tables": [
+            [(agent, [_at(curve, share) for share in STAGES]) for agent, curve in of_agents.items()]
+            for of_agents in by_step
+        ],
     }
-    data = [None if item is None else _environment_data(item) for item in curves]
-    return Section("curves", "Learning curves", context, places=data, by_environment=True)
-
-
-def _environment_data(curves: Mapping[str, LearningCurves]) -> dict[str, Any]:
-    return {
-        kind: {
-            "linearUpTo": of_kind.linear_up_to,
-            "onVariant": of_kind.on_variant,
-            **{
-                by: {agent: vars(curve) for agent, curve in of_agents.items()}
-                for by, of_agents in of_kind.by_axis.items()
-            },
-        }
-        for kind, of_kind in curves.items()
-    }
-
-
-def _stages(evaluations: LearningCurves) -> list[tuple[str, list[dict[str, float]]]]:
-    """What an agent's curve comes to by each stage: for those who cannot see the figure."""
-    curves = evaluations.by_axis["step"]
-    return [(agent, [_at(curve, share) for share in STAGES]) for agent, curve in curves.items()]
+    return Section("curves", "Learning curves", context, places=curves, by_environment=True)
 
 
 def _at(curve: Curve, share: float) -> dict[str, float]:
@@ -260,40 +213,24 @@ def comparison(report: Report) -> Section | None:
         "phrases": PHRASES,
         "most_dots": MOST_DOTS,
         "lower_is_better": analysis.study.metric in COSTS,
-        "matrices": [improvement_matrix(one) for one in analysis.environments],
+        "probabilities": [
+            {k: pair.probability_of_improvement for k, pair in pairs_both_ways(one).items()}
+            for one in analysis.environments
+        ],
     }
-    places = [_intervals(one) for one in report.series.environments]
-    return Section(
-        "comparison", "Differences", context, {"metric": metric}, places, by_environment=True
-    )
-
-
-def _intervals(one: EnvironmentSeries) -> dict[str, Any]:
-    return {
-        "intervals": [_runs(agent) for agent in one.runs.agents],
-        "linearUpTo": one.runs.linear_up_to,
-    }
+    places = [
+        {"intervals": [_runs(agent) for agent in one.runs.agents], "linear": one.runs.linear_up_to}
+        for one in report.series.environments
+    ]
+    data = {"metric": metric}
+    return Section("comparison", "Differences", context, data, places, by_environment=True)
 
 
 def _runs(agent: AgentRuns) -> dict[str, Any]:
     """The mean, and each run where they are not too many to be told apart."""
-    many = len(agent.values) > MOST_DOTS
-    return {
-        "agent": agent.agent,
-        **estimate_data(agent.mean),
-        "seeds": agent.seeds[:0] if many else agent.seeds,
-        "runs": agent.values[:0] if many else agent.values,
-    }
-
-
-def improvement_matrix(environment: EnvironmentAnalysis) -> list[list[float | None]]:
-    """The probability that a run of the row's agent beats one of the column's, None on itself."""
-    chances: dict[tuple[str, str], float] = {}
-    for pair in environment.pairs:
-        for seen in (pair, pair.swapped()):
-            chances[seen.first, seen.second] = seen.probability_of_improvement.point
-    agents = [agent.agent for agent in environment.agents]
-    return [[chances.get((row, column)) for column in agents] for row in agents]
+    shown = slice(0 if len(agent.values) > MOST_DOTS else None)
+    runs = {"seeds": agent.seeds[shown], "runs": agent.values[shown]}
+    return {"agent": agent.agent, **vars(agent.mean), **runs}
 
 
 def overall(report: Report) -> Section | None:
@@ -302,48 +239,106 @@ def overall(report: Report) -> Section | None:
     if overall is None:
         return None
     agents = list(overall.scores)
-    context = {
+    scores = [
+        {agent.agent: agent.score.mean for agent in one.agents if agent.score is not None}
+        for one in report.analysis.environments
+    ]
+    context = {"agents": agents, "scores": scores, "probabilities": overall.improvement}
+    data = {
         "agents": agents,
-        "scores": _scores(report.analysis, agents),
-        "improvement": [
-            [overall.improvement[one, two].point if one != two else None for two in agents]
-            for one in agents
-        ],
-    }
-    return Section("overall", "Overall", context, _profiles(overall))
-
-
-def _profiles(overall: OverallAnalysis) -> dict[str, Any]:
-    agents = list(overall.scores)
-    return {
-        "agents": agents,
-        "iqm": [{"agent": agent, **estimate_data(overall.scores[agent].iqm)} for agent in agents],
+        "iqm": [{"agent": agent, **vars(overall.scores[agent].iqm)} for agent in agents],
         "thresholds": overall.thresholds,
         "profiles": {
             agent: {"y": band.point, "low": band.low, "high": band.high}
             for agent, band in overall.profiles.items()
         },
     }
-
-
-def _scores(analysis: StudyAnalysis, agents: list[str]) -> list[dict[str, Estimate]]:
-    """The mean score by agent, for each environment."""
-    return [
-        {
-            agent.agent: agent.score.mean
-            for agent in environment.agents
-            if agent.score is not None and agent.agent in agents
-        }
-        for environment in analysis.environments
-    ]
+    return Section("overall", "Overall", context, data)
 
 
 def watching(report: Report) -> Section | None:
-    """The links, by environment; None where no pages were asked for."""
+    """The links to pages that play trainings; None where none were asked for."""
     if not report.learning:
         return None
-    groups = [
-        [page for page in report.learning if page.environment == environment.environment]
-        for environment in report.analysis.environments
-    ]
-    return Section("watching", "See it learn", {"groups": groups}, by_environment=True)
+    return Section("watching", "See it learn", {"pages": report.learning}, by_environment=True)
+
+
+# What a reader needs to do the study again: settings as run, seeds, looks, versions, failures.
+
+ABSENT = "-"
+
+
+def settings(report: Report) -> Section | None:
+    """Settings by environment, and what holds for the whole study."""
+    results, environments = report.analysis.results, report.analysis.environments
+    done = [(run, run.run.read_info()) for run in results.finished]
+    infos = [info for _, info in done]
+    looks = read_looks(results.root)
+    context = {
+        "command": report.command,
+        "seeds": seed_sentence(results.study.seeds, tuning_seeds(results.study)),
+        "absent": ABSENT,
+        "tables": [
+            _settings_table([(r, info) for r, info in done if r.environment == e.environment])
+            for e in environments
+        ],
+        "versions": recorded("versions", infos),
+        "machine": recorded("machine", infos),
+        "looks": [look_sentences(looks.on(one.environment)) for one in environments],
+        "mixed": mixed_versions(infos),
+        "missing": _missing_runs(results),
+    }
+    return Section("settings", "Settings", context, by_environment=True)
+
+
+def _settings_table(runs: list[tuple[PlannedRun, Mapping[str, Any]]]) -> dict[str, Any]:
+    """The agents, and by setting its value for each of them and whether these differ."""
+    columns: dict[str, dict[str, str]] = {}
+    for agent in dict.fromkeys(run.agent for run, _ in runs):
+        columns[agent] = _column([info for run, info in runs if run.agent == agent])
+    rows = {}
+    for name in dict.fromkeys(name for column in columns.values() for name in column):
+        values = [column.get(name, ABSENT) for column in columns.values()]
+        rows[name] = (values, len({*values} - {ABSENT}) > 1)
+    return {"agents": list(columns), "rows": rows}
+
+
+def _column(infos: list[Mapping[str, Any]]) -> dict[str, str]:
+    """The settings of an agent, which its seeds share, and how long its runs were."""
+    spec = infos[0]["spec"]
+    steps = sorted(info["n_timesteps"] for info in infos)
+    lengths = f"{steps[0]:,}" if steps[0] == steps[-1] else f"{steps[0]:,} to {steps[-1]:,}"
+    column = {"agent": spec["algo"], "steps run": lengths}
+    engines = sorted({str(info["engine"]) for info in infos if info.get("engine")})
+    if engines:
+        column["engine"] = "; ".join(engines)
+    return column | {name: setting(value) for name, value in spec["hyperparams"].items()}
+
+
+def recorded(what: str, infos: Iterable[Mapping[str, Any]]) -> dict[str, str]:
+    """What the runs were done with, by its name; several where runs differ, none of old runs."""
+    found: dict[str, set[str]] = {}
+    for info in infos:
+        for name, value in info.get(what, {}).items():
+            found.setdefault(name, set()).add(value)
+    return {name: ", ".join(sorted(values)) for name, values in found.items()}
+
+
+def _missing_runs(results: StudyResults) -> list[dict[str, Any]]:
+    """Runs that are not there, those of an agent with one reason together.
+
+    The reason is the last line of what they left, the details all that the last of them left.
+    """
+    groups: dict[tuple[str, str, str], dict[str, Any]] = {}
+    damaged = {one.planned.path: one.reason for one in results.left_out}
+    there = {run.path for run in results.finished}
+    for run in results.planned:
+        if run.path in there:
+            continue
+        details = results.failures.get(run.path, "").strip()
+        reason = damaged.get(run.path) or (details.splitlines()[-1] if details else "not done yet")
+        new = {"agent": run.agent, "environment": run.environment, "reason": reason, "seeds": []}
+        group = groups.setdefault((run.agent, run.environment, reason), new)
+        group["seeds"].append(run.seed)
+        group["details"] = details
+    return list(groups.values())

@@ -15,14 +15,20 @@ import numpy as np
 from jinja2 import ChoiceLoader, PackageLoader
 
 from pipeline.files import write_text
-from report.page.frame import SHARED, as_json, frame, packed, setting, template_file, templates
+from report.page.frame import (
+    SHARED,
+    Section,
+    as_json,
+    frame,
+    package_file,
+    packed,
+    setting,
+    templates,
+)
 from report.words import number
 
 if TYPE_CHECKING:
     from optuna.distributions import BaseDistribution
-
-
-# The trials of a tuning, as its record holds them.
 
 COMPLETE, PRUNED, FAILED = "judged on all seeds", "ended early", "failed"
 
@@ -52,23 +58,6 @@ class Trials:
         sign = 1 if self.is_cost else -1
         return sorted(whole, key=lambda trial: (sign * trial["value"], trial["number"]))
 
-    @property
-    def n_runs(self) -> int:
-        """How many runs the search has judged."""
-        return sum(len(trial["figures"]) for trial in self.ended)
-
-    @property
-    def seconds(self) -> float:
-        """What these took, one after the other."""
-        return float(sum(trial["seconds"] for trial in self.ended))
-
-    @property
-    def wall_seconds(self) -> float | None:
-        """From the first trial's beginning to the last one's end; None without any."""
-        began = [datetime.fromisoformat(t["began"]) for t in self.ended if t["began"]]
-        ended = [datetime.fromisoformat(t["ended"]) for t in self.ended if t["ended"]]
-        return (max(ended) - min(began)).total_seconds() if began and ended else None
-
     def distributions(self) -> dict[str, BaseDistribution]:
         """What each parameter was drawn from."""
         from optuna.distributions import json_to_distribution
@@ -96,12 +85,10 @@ def importances(trials: Trials) -> dict[str, float]:
     Trials that were ended early count too, by the seeds that they had: those that were not are few,
     and good all of them.
 
-    Returns:
-        Shares by parameter, which sum to 1, the largest first; empty where trials are too few or
-        all alike.
+    The shares sum to 1, the largest first; there are none where trials are too few or all alike.
 
     Source: PED-ANOVA, Watanabe et al. (2023), "PED-ANOVA: Efficiently quantifying hyperparameter
-        importance in arbitrary subspaces", IJCAI, as Optuna computes it.
+    importance in arbitrary subspaces", IJCAI, as Optuna computes it.
     """
     import optuna
 
@@ -114,12 +101,9 @@ def importances(trials: Trials) -> dict[str, float]:
     study = optuna.create_study(direction=direction, sampler=optuna.samplers.RandomSampler(0))
     for trial in judged:
         params = {name: value for name, value in trial["params"].items() if name in ranges}
+        drawn_from = {name: ranges[name] for name in params}
         study.add_trial(
-            optuna.create_trial(
-                value=trial["value"],
-                params=params,
-                distributions={name: ranges[name] for name in params},
-            )
+            optuna.create_trial(value=trial["value"], params=params, distributions=drawn_from)
         )
     evaluator = optuna.importance.PedAnovaImportanceEvaluator()
     with warnings.catch_warnings():
@@ -129,12 +113,13 @@ def importances(trials: Trials) -> dict[str, float]:
     return {name: share for name, share in found.items() if share > 0}
 
 
-# The numbers behind the figures of a tuning's page.
+# The numbers behind the figures.
 
 # Trials so far from the best that the others could not be told apart are drawn at the edge.
 _SHOWN = 0.8
 # Lines of as many strengths as ranks are told apart by.
 _GROUPS = 5
+_ABSENT = object()
 
 
 def history(trials: Trials) -> dict[str, Any]:
@@ -207,9 +192,6 @@ def parallel(trials: Trials, shares: Mapping[str, float]) -> dict[str, Any]:
     }
 
 
-_ABSENT = object()
-
-
 def _place(ends: BaseDistribution, value: Any) -> float | None:
     """Where a value lies between the ends, from 0 to 1; None for a parameter that is not there."""
     from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
@@ -226,67 +208,63 @@ def _place(ends: BaseDistribution, value: Any) -> float | None:
 
 
 def _ticks(ends: BaseDistribution) -> list[tuple[float | None, str]]:
-    from optuna.distributions import CategoricalDistribution, FloatDistribution, IntDistribution
-
-    if isinstance(ends, CategoricalDistribution):
-        return [(_place(ends, word), _said(word)) for word in ends.choices]
-    assert isinstance(ends, FloatDistribution | IntDistribution)
-    return [(_place(ends, end), number(end)) for end in (ends.low, ends.high)]
+    words = getattr(ends, "choices", None) or (ends.low, ends.high)  # type: ignore[attr-defined]
+    return [(_place(ends, word), _said(word)) for word in words]
 
 
 def _said(value: Any) -> str:
     if value is _ABSENT:
         return "not there"
-    if value is None:
-        return "null"
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number(value) if is_number else str(value).lower() if value in (True, False) else value
+    return number(value) if is_number else setting(value)
 
 
-# The tables of a tuning's page: the re-test, what changed, the cost, all trials.
+# The tables: what changed, the cost, all trials.
 
 LEFT_OUT = "-"
 
 
-@dataclass(frozen=True)
-class Change:
-    """A setting that the winner has otherwise than what shipped."""
+class Change(NamedTuple):
+    """A setting that the winner has otherwise than what shipped, as a file has them."""
 
-    name: str  # of the setting
-    shipped: str  # its values, as a file has them
+    name: str
+    shipped: str
     found: str
 
 
 def changes(trials: Trials, winner: int) -> list[Change]:
     """What a trial has otherwise than the settings that the search began with."""
     settings = {trial["number"]: trial["settings"] or {} for trial in trials.ended}
-    before, after = settings.get(0, {}), settings.get(winner, {})
+    before, after = (
+        {name: setting(value) for name, value in settings.get(number, {}).items()}
+        for number in (0, winner)
+    )
     return [
-        Change(name, _setting_said(before, name), _setting_said(after, name))
+        Change(name, before.get(name, LEFT_OUT), after.get(name, LEFT_OUT))
         for name in dict.fromkeys([*before, *after])
-        if _setting_said(before, name) != _setting_said(after, name)
+        if before.get(name) != after.get(name)
     ]
-
-
-def _setting_said(settings: Mapping[str, Any], name: str) -> str:
-    return setting(settings[name]) if name in settings else LEFT_OUT
 
 
 def cost(trials: Trials) -> list[tuple[str, str]]:
     """What the search took."""
     record = trials.record
-    n_seeds = len(record["seeds"])
     kinds = Counter(kind(trial) for trial in trials.ended)
-    whole = len(trials.ended) * n_seeds
-    saved = f"{1 - trials.n_runs / whole:.0%}" if whole else LEFT_OUT
+    n_runs = sum(len(trial["figures"]) for trial in trials.ended)
+    whole = len(trials.ended) * len(record["seeds"])
+    saved = f"{1 - n_runs / whole:.0%}" if whole else LEFT_OUT
+    seconds = sum(trial["seconds"] for trial in trials.ended)
+    began = [datetime.fromisoformat(t["began"]) for t in trials.ended if t["began"]]
+    ended = [datetime.fromisoformat(t["ended"]) for t in trials.ended if t["ended"]]
+    wall = (max(ended) - min(began)).total_seconds() if began and ended else None
     retest = (record["retest"] or {}).get("settings", [])
     return [
         ("Trials", f"{len(trials.ended):,} of {record['n_trials']:,}"),
         *((name[0].upper() + name[1:], f"{count:,}") for name, count in sorted(kinds.items())),
-        ("Runs", f"{trials.n_runs:,} of at most {whole:,}"),
+        ("Runs", f"{n_runs:,} of at most {whole:,}"),
         ("Runs saved by ending trials early", saved),
-        ("Processor time of all runs", _duration(trials.seconds)),
-        ("From the first trial to the end of the last", _duration(trials.wall_seconds)),
+        ("Processor time of all runs", _duration(seconds)),
+        ("From the first trial to the end of the last", _duration(wall)),
         ("Runs of the re-test", f"{sum(each['n_runs'] for each in retest):,}"),
     ]
 
@@ -302,8 +280,7 @@ def _duration(seconds: float | None) -> str:
 
 def rows(trials: Trials) -> list[dict[str, Any]]:
     """All trials, the best first, then those that have not all their seeds."""
-    ranked = [*trials.best_first]
-    rest = [trial for trial in trials.ended if trial not in ranked]
+    ranked = trials.best_first
     return [
         {
             "number": trial["number"],
@@ -313,29 +290,13 @@ def rows(trials: Trials) -> list[dict[str, Any]]:
             "n_seeds": len(trial["figures"]),
             "seconds": trial["seconds"],
             "failure": trial["failure"] or "",
-            "params": ", ".join(
-                f"{name} {_param(value)}" for name, value in trial["params"].items()
-            ),
+            "params": ", ".join(f"{name} {_said(at)}" for name, at in trial["params"].items()),
         }
-        for trial in [*ranked, *rest]
+        for trial in [*ranked, *(trial for trial in trials.ended if trial not in ranked)]
     ]
 
 
-def _param(value: Any) -> str:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return number(value) if is_number else setting(value)
-
-
-# The page of a tuning as one file, in the frame of a study's page.
-
-_SCRIPT = Path(__file__).resolve().parent / "templates" / "tuning" / "tuning.js"
-
-
-class Part(NamedTuple):
-    """A section of the page: its anchor and its heading."""
-
-    name: str
-    title: str
+# The page as one file, in the frame of a study's page.
 
 
 def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = "") -> None:
@@ -348,40 +309,35 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     """
     trials = trials_of(record)
     shares = importances(trials)
-    parts = [Part("verdict", "What was found"), Part("history", "History")]
-    if trials.judged and record["asked"]:
-        parts.append(Part("parallel", "Settings tried"))
+    asked, retest = record["asked"] or {}, record["retest"]
+    sections = [
+        Section("verdict", "What was found"),
+        Section("history", "History", data=history(trials)),
+        Section("cost", "Cost"),
+        Section("trials", "All trials"),
+    ]
+    winner = None
+    if retest:
+        retested = {each["label"]: each for each in retest["settings"]}
+        winner = retested.get(retest["winner"])
     if shares:
-        parts.append(Part("importances", "What matters"))
-    parts += [Part("cost", "Cost"), Part("trials", "All trials")]
-    write_text(path, _render(trials, parts, shares, retest_page))
-
-
-def _render(
-    trials: Trials, parts: list[Part], shares: Mapping[str, float], retest_page: str
-) -> str:
-    record = trials.record
-    asked = record["asked"] or {}
+        data = {"names": [*shares], "shares": [*shares.values()]}
+        sections.insert(2, Section("importances", "What matters", data=data))
+    if trials.judged and asked:
+        data = {**parallel(trials, shares), "winner": winner and winner["number"]}
+        sections.insert(2, Section("parallel", "Settings tried", data=data))
+    data = {"page": {"agents": [], "environments": []}}
+    data |= {section.name: section.data for section in sections if section.data}
     environment = templates()
     environment.loader = ChoiceLoader(
         [PackageLoader("report.page", "templates/tuning"), PackageLoader("report.page")]
     )
-    retest = record["retest"]
-    again = retest["settings"] if retest else []
-    winner = next((each for each in again if each["label"] == retest["winner"]), None)
-    data: dict[str, Any] = {
-        "page": {"agents": [], "environments": []},
-        "history": history(trials),
-        "parallel": {**parallel(trials, shares), "winner": winner and winner["number"]},
-        "importances": {"names": [*shares], "shares": [*shares.values()]},
-    }
-    shared = [template_file(name) or "" for name in SHARED]
-    own = [_SCRIPT.read_text(encoding="utf-8"), template_file("paper.js") or ""]
-    return environment.get_template("tuning.html").render(
+    scripts = [*SHARED, "tuning/tuning.js", "paper.js"]
+    text = environment.get_template("tuning.html").render(
         title=f"{asked.get('algo', 'an agent')} on {asked.get('env', 'an environment')}",
         record=record,
         asked=asked,
-        sections=parts,
+        sections=sections,
         retest=retest,
         retest_page=retest_page,
         winner=winner,
@@ -391,5 +347,6 @@ def _render(
         rows=rows(trials),
         shares=shares,
         data={name: packed(as_json(item)) for name, item in data.items()},
-        **frame("\n".join([*shared, *own])),
+        **frame("\n".join(package_file(f"templates/{name}") for name in scripts)),
     )
+    write_text(path, text)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,50 +15,19 @@ from PIL import Image
 from envs.known_models import transition_model
 from envs.layout import GridLayout, grid_layout
 from experiments.analysis import EnvironmentAnalysis, StudyAnalysis
-from experiments.bandits import PullStatistics
 from experiments.child_processes import do_aside
 from experiments.plan import PlannedRun
 from experiments.run_files import read_value_maps
 from pipeline.environments import make_single_env
 from report.films import MAX_BYTES, films_of, has_film
 from report.page.frame import Report, Section, data_uri, first_runs, layout_data
-from report.series import (
-    SPREAD,
-    ArmSeries,
-    Belief,
-    Curve,
-    Pulls,
-    PullSeries,
-    mean_regret,
-    regret_of_runs,
-)
+from report.series import SPREAD, Pulls, PullSeries, mean_regret, regret_of_runs
 from report.words import number
 from safe_files.files import NO_LIMIT, read_file
 
 # What agents make of bandits: rewards and regrets by pull, where pulls went, what is believed.
 
 MOST_ARMS = 40  # over all contexts, in a table or in a figure
-
-
-@dataclass(frozen=True)
-class ArmRow:
-    """An arm in a context."""
-
-    name: str  # what it is called
-    mean: float  # its true mean reward
-    regret: float  # how far that is from the best in the context
-    # By agent, the share of the pulls in the context that went to it; nan where the agent never
-    # saw the context.
-    shares: Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class ContextTable:
-    """Where the pulls went in one context."""
-
-    name: str  # what it is called; empty where it is the only one
-    rows: list[ArmRow]  # its arms
-    regrets: Mapping[str, float]  # by agent, mean regret of a pull there
 
 
 def bandits(report: Report) -> Section | None:
@@ -79,7 +47,7 @@ def bandits(report: Report) -> Section | None:
     return Section("bandits", "Pulls and regret", context, places=data, by_environment=True)
 
 
-def context_tables(pulls: Pulls) -> list[ContextTable]:
+def context_tables(pulls: Pulls) -> list[dict[str, Any]]:
     """Where the pulls went by context; none where true means differ between runs."""
     known = {agent: p for agent, p in pulls.items() if p.true_means.size}
     if not known:
@@ -88,72 +56,42 @@ def context_tables(pulls: Pulls) -> list[ContextTable]:
     if means.size > MOST_ARMS:
         return []
     gaps = means.max(axis=1, keepdims=True) - means
-    tables = []
-    for context in range(len(means)):
-        rows = [
-            ArmRow(
-                name=f"arm {arm}",
-                mean=float(means[context, arm]),
-                regret=float(gaps[context, arm]),
-                shares={agent: float(p.shares[context, arm]) for agent, p in known.items()},
-            )
-            for arm in range(means.shape[1])
-        ]
-        regrets = {agent: float(p.shares[context] @ gaps[context]) for agent, p in known.items()}
-        tables.append(ContextTable(f"context {context}" if len(means) > 1 else "", rows, regrets))
-    return tables
+    n_contexts, n_arms = means.shape
+    return [
+        {
+            "name": f"context {context}" if n_contexts > 1 else "",
+            "rows": [
+                {
+                    "name": f"arm {arm}",
+                    "mean": means[context, arm],
+                    "regret": gaps[context, arm],
+                    # NaN where an agent never saw the context.
+                    "shares": {agent: p.shares[context, arm] for agent, p in known.items()},
+                }
+                for arm in range(n_arms)
+            ],
+            "regrets": {agent: p.shares[context] @ gaps[context] for agent, p in known.items()},
+        }
+        for context in range(n_contexts)
+    ]
 
 
 def _bandit_data(series: PullSeries) -> dict[str, Any]:
-    bounds = series.bounds
     return {
         "best": series.best,
-        "bounds": None
-        if bounds is None
-        else {"x": bounds.pulls, "auer": bounds.auer, "lai_robbins": bounds.lai_robbins},
-        "curves": {agent: _curves(statistics) for agent, statistics in series.pulls.items()},
-        "arms": _arms(series.arms),
-        "posteriors": [_belief(belief) for belief in series.beliefs],
-    }
-
-
-def _curves(statistics: PullStatistics) -> dict[str, Any]:
-    return {
-        "x": statistics.pulls,
-        "reward": statistics.reward,
-        "optimal": statistics.optimal,
-        "regret": {
-            "mean": _band(mean_regret(statistics)),
-            "runs": _band(regret_of_runs(statistics)),
+        "bounds": series.bounds,
+        "curves": {
+            agent: {
+                "x": pulls.pulls,
+                "reward": pulls.reward,
+                "optimal": pulls.optimal,
+                "regret": {"mean": mean_regret(pulls), "runs": regret_of_runs(pulls)},
+                "simple": pulls.simple_regret,
+            }
+            for agent, pulls in series.pulls.items()
         },
-        "simple": statistics.simple_regret,
-    }
-
-
-def _band(curve: Curve) -> dict[str, Any]:
-    return {"y": curve.y, "low": curve.low, "high": curve.high}
-
-
-def _arms(arms: ArmSeries | None) -> dict[str, Any] | None:
-    if arms is None or len(arms.names) > MOST_ARMS:
-        return None
-    estimates = {agent: {"mean": m, "std": std} for agent, (m, std) in arms.estimates.items()}
-    return {
-        "names": arms.names,
-        "means": arms.means,
-        "shares": arms.shares,
-        "estimates": estimates,
-    }
-
-
-def _belief(belief: Belief) -> dict[str, Any]:
-    """Densities by moment, context and arm."""
-    return {
-        "agent": belief.agent,
-        "moments": belief.moments,
-        "x": belief.points,
-        "truth": belief.true_means,
-        "densities": belief.densities,
+        "arms": series.arms if series.arms and len(series.arms.names) <= MOST_ARMS else None,
+        "beliefs": series.beliefs,
     }
 
 
@@ -205,7 +143,13 @@ def _policy_data(
             "actions": (optimum["optimal_actions"] << np.arange(len(layout.moves))).sum(axis=1),
         },
         "runs": [
-            {"agent": agent, "seed": seed, **_map_data(arrays)}
+            {
+                "agent": agent,
+                "seed": seed,
+                "steps": arrays["timesteps"],
+                "values": arrays["values"],
+                "actions": [_digits(actions) for actions in arrays["actions"]],
+            }
             for (agent, seed), arrays in maps.items()
         ],
     }
@@ -253,14 +197,6 @@ def _read(run: PlannedRun, n_maps: int) -> Arrays:
     return arrays
 
 
-def _map_data(arrays: Arrays) -> dict[str, Any]:
-    return {
-        "steps": arrays["timesteps"],
-        "values": arrays["values"],
-        "actions": [_digits(actions) for actions in arrays["actions"]],
-    }
-
-
 def _digits(numbers: NDArray[Any]) -> str:
     """Numbers below ten as one text, which takes the least room."""
     return "".join(map(str, numbers.astype(np.int64).tolist()))
@@ -272,24 +208,11 @@ MOST_FILMED = 8  # agents of an environment, the best of them
 ALL_BYTES = 1_000_000  # of the films of a page, a third more as text
 
 
-@dataclass(frozen=True)
-class Film:
-    """A greedy episode of an agent."""
-
-    agent: str  # its label
-    still: str  # the first frame as a data URI
-    place: int  # that of its film among those of the page, which agents of one route share
-    width: int  # in pixels
-    height: int
-    caption: str  # how the episode went
-
-
 def played_episodes(report: Report) -> Section | None:
     """The films of each environment; None where nothing can be drawn."""
-    groups: list[list[Film]] = []
-    contents: dict[bytes, int] = {}  # and their places on the page
+    groups: list[list[dict[str, Any]]] = []
+    contents: dict[bytes, int] = {}  # and their places on the page, which agents of one route share
     without_room: list[list[str]] = []
-    not_filmed: list[list[str]] = []
     ranked = first_runs(report.analysis)
     to_film = [run for runs in ranked for run in runs[:MOST_FILMED]]
     report.tell("filming episodes")
@@ -298,7 +221,6 @@ def played_episodes(report: Report) -> Section | None:
     for n_done, runs in enumerate(ranked, start=1):
         groups.append([])
         without_room.append([])
-        not_filmed.append([run.agent for run in runs[MOST_FILMED:]])
         for run in runs[:MOST_FILMED]:
             path = paths[run.path]
             if path is None:
@@ -308,34 +230,29 @@ def played_episodes(report: Report) -> Section | None:
             room = ALL_BYTES * n_done // len(ranked) - sum(map(len, contents))
             if content in contents or len(content) <= room:
                 place = contents.setdefault(content, len(contents))
-                groups[-1].append(_film(run.agent, path, content, place))
+                groups[-1].append({"agent": run.agent, "place": place, **_film(path, content)})
             else:
                 without_room[-1].append(run.agent)
     if not any(groups):
         return None
     data = [data_uri("image/gif", content) for content in contents]
+    not_filmed = [[run.agent for run in runs[MOST_FILMED:]] for runs in ranked]
     context = {"films": groups, "without_room": without_room, "not_filmed": not_filmed}
     return Section("films", "Episodes", context, data, by_environment=True)
 
 
-def _film(agent: str, path: Path, content: bytes, place: int) -> Film:
+def _film(path: Path, content: bytes) -> dict[str, Any]:
+    """The first frame as a data URI, its size in pixels, and how the episode went."""
     still = io.BytesIO()
     with Image.open(io.BytesIO(content)) as picture:
         width, height = picture.size
         picture.convert("RGB").quantize(64).save(still, "PNG", optimize=True)
-    return Film(
-        agent,
-        data_uri("image/png", still.getvalue()),
-        place,
-        width,
-        height,
-        _caption(json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))),
-    )
-
-
-def _caption(episode: dict[str, Any]) -> str:
+    episode = json.loads(read_file(path.with_suffix(".json"), MAX_BYTES))
     shown, steps = episode["frames"] - 1, episode["steps"]
     if steps is None:
-        return f"the first {shown} steps"
-    result = f"return {number(episode['return'])} in {steps} step{'s' if steps > 1 else ''}"
-    return result if shown >= steps else f"{result}, of which these are the first {shown}"
+        caption = f"the first {shown} steps"
+    else:
+        caption = f"return {number(episode['return'])} in {steps} step{'s' if steps > 1 else ''}"
+        caption += f", of which these are the first {shown}" if shown < steps else ""
+    address = data_uri("image/png", still.getvalue())
+    return {"still": address, "width": width, "height": height, "caption": caption}

@@ -90,20 +90,20 @@ def test_the_data_are_the_statistics(analysis, page):
 def test_the_table_by_context(analysis):
     segments = analysis.results.pulls["blind", "segments"]
     tables = world_sections.context_tables({"blind": segments})
-    assert [table.name for table in tables] == ["context 0", "context 1"]
+    assert [table["name"] for table in tables] == ["context 0", "context 1"]
     core, casual = tables
-    assert [row.mean for row in core.rows] == [0.10, 0.25, 0.05]
-    assert [row.regret for row in casual.rows] == pytest.approx([0, 0.06, 0.07])
+    assert [row["mean"] for row in core["rows"]] == [0.10, 0.25, 0.05]
+    assert [row["regret"] for row in casual["rows"]] == pytest.approx([0, 0.06, 0.07])
     for context, table in enumerate(tables):
-        shares = [row.shares["blind"] for row in table.rows]
+        shares = [row["shares"]["blind"] for row in table["rows"]]
         assert shares == pytest.approx(segments.shares[context])
-        gaps = [row.regret for row in table.rows]
-        assert table.regrets["blind"] == pytest.approx(np.dot(shares, gaps))
+        gaps = [row["regret"] for row in table["rows"]]
+        assert table["regrets"]["blind"] == pytest.approx(np.dot(shares, gaps))
         # The same as what was summed up pull by pull.
         known = np.nan_to_num(segments.context_regret[context])
-        assert table.regrets["blind"] == pytest.approx(segments.shares[context] @ known)
+        assert table["regrets"]["blind"] == pytest.approx(segments.shares[context] @ known)
     (alone,) = world_sections.context_tables({"it": analysis.results.pulls["normal", "coins"]})
-    assert alone.name == ""
+    assert alone["name"] == ""
 
 
 def test_beliefs(analysis):
@@ -122,14 +122,14 @@ def test_beliefs(analysis):
 
 def test_posteriors_on_the_page(page):
     coins, segments = data_of(page, "bandits")
-    assert {item["agent"] for item in coins["posteriors"]} == {a.label for a in AGENTS[:3]}
-    by_agent = {item["agent"]: item for item in segments["posteriors"]}
+    assert {item["agent"] for item in coins["beliefs"]} == {a.label for a in AGENTS[:3]}
+    by_agent = {item["agent"]: item for item in segments["beliefs"]}
     item = by_agent[AGENTS[0].label]
     assert item["moments"] == [10, 100, 400]
-    assert np.shape(item["densities"]) == (3, 2, 3, len(item["x"]))
-    assert item["truth"] == [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]
+    assert np.shape(item["densities"]) == (3, 2, 3, len(item["points"]))
+    assert item["true_means"] == [[0.10, 0.25, 0.05], [0.12, 0.06, 0.05]]
     assert np.shape(by_agent["blind"]["densities"])[1] == 1
-    assert by_agent["blind"]["truth"] == [[None] * 3]
+    assert by_agent["blind"]["true_means"] == [[None] * 3]
 
 
 def test_figures(analysis):
@@ -155,7 +155,7 @@ def test_bandits_whose_arms_are_drawn_anew(tmp_path, do_study):
     analysis = analyse(do_study(study, tmp_path))
     (item,) = world_sections.bandits(Report(study_series(analysis), "")).places
     assert item["best"] == pytest.approx(1.5388, abs=1e-4)
-    assert (item["bounds"], item["arms"], item["posteriors"]) == (None, None, [])
+    assert (item["bounds"], item["arms"], item["beliefs"]) == (None, None, ())
     assert set(item["curves"]) == {"normal", "eager"}
     names = {path.stem for path in write_figures(study_series(analysis), None)}
     assert names == {"testbed_pulls", "testbed_regret"}

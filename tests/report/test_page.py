@@ -15,11 +15,10 @@ import pytest
 from plotly.offline import get_plotlyjs
 
 from experiments.looks import Look, LookLog, Looks, Question
-from report.conclusions import conclusion
+from report.conclusions import conclusion, pairs_both_ways
 from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
-from report.page import assembly, result_sections, world_sections, write_report
-from report.page import result_sections as result_sections_module
+from report.page import result_sections, world_sections, write_report
 from report.page.assembly import SECTIONS, render
 from report.page.frame import Report, breakable, inline_script, p_value, packed, plain, setting
 from report.series import (
@@ -177,9 +176,10 @@ def test_settings_command_versions_and_failures(page, report_study):
 def test_settings_have_the_looks_and_of_old_runs_no_machine(report_study, tmp_path, monkeypatch):
     question = Question("final", None, None, 5)
     look = Look("2026-11-22 10:00:00", question, {"a": 4, "b": 4}, {}, {}, 0.045, planned=False)
-    monkeypatch.setattr(assembly, "read_looks", lambda _: LookLog({"Warehouse-v0": Looks((look,))}))
+    looks = LookLog({"Warehouse-v0": Looks((look,))})
+    monkeypatch.setattr(result_sections, "read_looks", lambda _: looks)
     infos = [{"versions": {"numpy": "2"}}]
-    assert assembly._recorded("machine", infos) == {}
+    assert result_sections.recorded("machine", infos) == {}
     write_report(study_series(report_study.analysis), tmp_path / "page.html", "compare.py")
     settings = Page((tmp_path / "page.html").read_text(encoding="utf-8")).all("section")[-1][1]
     assert "These runs have been looked at once." in settings
@@ -199,7 +199,7 @@ def test_a_study_on_one_environment_compares_nothing_over_environments(one_envir
 
 
 def test_the_curves_end_with_the_final_evaluations(page, report_study):
-    curves = data_of(page, "data-curves-0")["evaluation"]["step"]
+    curves = data_of(page, "data-curves-0")["evaluation"]["by_axis"]["step"]
     summary = report_study.analysis.results.curves
     for agent in ("Q-learning & co", "sarsa"):
         rows = summary[
@@ -217,7 +217,9 @@ def test_the_curves_stand_in_a_table_too(page):
     assert len(tables) == 2
     for place, table in enumerate(tables):
         assert re.findall(r"\d+ %", table) == ["10 %", "25 %", "50 %", "100 %"]
-        for agent, curve in data_of(page, f"data-curves-{place}")["evaluation"]["step"].items():
+        for agent, curve in data_of(page, f"data-curves-{place}")["evaluation"]["by_axis"][
+            "step"
+        ].items():
             row = table[table.index(agent) + len(agent) :].replace(",", "")
             cells = re.findall(r"(\S+)\s+(?:\S+ to \S+ )?(\d+) steps", row)[:4]
             means, steps = np.array(cells, dtype=float).T
@@ -235,13 +237,13 @@ def test_an_agent_has_the_colour_of_the_printed_figures(page, report_study):
     ]
 
 
-def test_the_matrix_of_improvement_is_the_pairs_seen_from_both_sides(report_study):
+def test_the_matrices_show_pairs_from_both_sides(report_study):
     environment = report_study.analysis.environments[0]
-    matrix = result_sections.improvement_matrix(environment)
-    assert [matrix[i][i] for i in range(3)] == [None] * 3
-    first = environment.pairs[0]
-    assert matrix[0][1] == first.probability_of_improvement.point
-    assert matrix[1][0] == 1 - matrix[0][1]
+    first, both = environment.pairs[0], pairs_both_ways(environment)
+    assert len(both) == 2 * len(environment.pairs)
+    assert both[first.first, first.second] == first
+    seen = both[first.second, first.first].probability_of_improvement.point
+    assert seen == 1 - first.probability_of_improvement.point
 
 
 def test_the_maps_are_those_of_the_run_folders(page, report_study):
@@ -419,7 +421,7 @@ def test_plotly_is_packed_as_it_is():
 
 
 def test_small_figures_keep_the_lines_within(page, report_study):
-    found = result_sections_module.overview(Report(study_series(report_study.analysis), ""))
+    found = result_sections.overview(Report(study_series(report_study.analysis), ""))
     lake, warehouse = found.context["figures"]
     assert (lake.name, warehouse.name) == ("FrozenLake-v1", "Warehouse-v0")
     for figure in (lake, warehouse):
@@ -434,8 +436,8 @@ def test_small_figures_keep_the_lines_within(page, report_study):
             dtype=float,
         )
         assert (corners >= 0).all()
-        assert corners[:, 0].max() == result_sections_module.WIDTH
-        assert corners[:, 1].max() <= result_sections_module.HEIGHT
+        assert corners[:, 0].max() == result_sections.WIDTH
+        assert corners[:, 1].max() <= result_sections.HEIGHT
         # Nothing lies above the optimum.
         assert corners[:, 1].min() >= figure.optimum - 0.1
 

@@ -15,7 +15,6 @@ from experiments.analysis import analyse
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.documents import MARKUPS, verdicts_as
 from report.page import write_report
-from report.page.assembly import SettingsTable
 from report.page.frame import STYLES, package_file, templates
 from report.page.tuning import write_tuning_page
 from report.series import agent_marks, study_series
@@ -188,7 +187,7 @@ def test_training_on_a_variant_is_marked_at_the_curve_and_in_the_legend(page):
         """
         const element = document.getElementById("data-curves-1");
         const data = JSON.parse(element.textContent);
-        data.training.onVariant = ["sarsa"];
+        data.training.on_variant = ["sarsa"];
         element.textContent = JSON.stringify(data);
         """
     )
@@ -595,7 +594,7 @@ def wide_tables(tmp_path_factory):
             marks=agent_marks(study),
             environments=[SimpleNamespace(environment=place) for place in places],
             scores=[{name: Estimate(-0.1234, -10.25, 0.9876, 9) for name in names} for _ in places],
-            improvement=[[None if i == k else 0.75 for k in range(10)] for i in range(10)],
+            probabilities={(one, two): Estimate(0.75, 0.5, 1, 9) for one in names for two in names},
         )
     )
     settings = (
@@ -605,7 +604,7 @@ def wide_tables(tmp_path_factory):
             study=study,
             marks=agent_marks(study),
             environments=[SimpleNamespace(environment=places[0])],
-            tables=[SettingsTable(names, {"learning_rate": (["exp_0.5_0.003"] * 10, False)})],
+            tables=[{"agents": names, "rows": {"learning_rate": (["exp_0.5_0.003"] * 10, False)}}],
             **dict.fromkeys(("command", "seeds", "absent", "mixed"), ""),
             **dict.fromkeys(("missing", "looks", "machine"), ()),
             versions={},

@@ -97,7 +97,7 @@ def test_the_cost_is_counted(tuning_record):
 
 def test_tables_have_what_changed_and_all_trials(tuning_record):
     trials = trials_of(tuning_record)
-    assert [vars(change) for change in changes(trials, 2)] == [
+    assert [change._asdict() for change in changes(trials, 2)] == [
         {"name": "learning_rate", "shipped": "0", "found": "2"},
         {"name": "tau", "shipped": "-", "found": "1.0"},
     ]

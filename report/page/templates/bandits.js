@@ -54,12 +54,12 @@ report.section("bandits", (root, _, current) => {
   const theory = (bounds, ceiling) => {
     const line = (name, y, dash) => {
       const kept = y.map((value) => (value <= ceiling ? value : null));
-      return { x: bounds.x, y: kept, name, mode: "lines", line: { color: report.css("--muted"), width: 1.6, dash }, hovertemplate: "%{y:,.4~r}" };
+      return { x: bounds.pulls, y: kept, name, mode: "lines", line: { color: report.css("--muted"), width: 1.6, dash }, hovertemplate: "%{y:,.4~r}" };
     };
     return [line("Auer, for UCB1", bounds.auer, "dash"), line("Lai-Robbins slope", bounds.lai_robbins, "dot")];
   };
   figure("pull-regret", () => true, ({ curves, bounds }) => {
-    const shown = agents(curves).map(([label, curve]) => [label, { x: curve.x, ...curve.regret[chosen("pull-spread")] }]);
+    const shown = agents(curves).map(([label, curve]) => [label, curve.regret[chosen("pull-spread")]]);
     // More bands than these lie over each other until none can be told apart.
     const isFew = shown.length <= 4;
     const highest = Math.max(1, ...shown.flatMap(([, curve]) => (isFew ? curve.high : curve.y)));
@@ -118,7 +118,7 @@ report.section("bandits", (root, _, current) => {
     const shown = agents(estimates);
     const offset = (k) => (shown.length > 1 ? 0.6 * (k / (shown.length - 1) - 0.5) : 0);
     return {
-      traces: shown.map(([label, { mean, std }], k) => ({
+      traces: shown.map(([label, [mean, std]], k) => ({
         x: mean.map((_, i) => i + offset(k)),
         y: mean,
         name: report.text(label),
@@ -145,15 +145,15 @@ report.section("bandits", (root, _, current) => {
     pick(name).value = index;
     pick(name).parentElement.hidden = texts.length < 2;
   };
-  const belief = () => current()?.posteriors[Number(pick("belief").value)];
+  const belief = () => current()?.beliefs[Number(pick("belief").value)];
   const fillMoments = () => {
     const item = belief();
     if (item === undefined) return;
-    fill("context", item.truth.map((_, i) => String(i)), 0);
+    fill("context", item.true_means.map((_, i) => String(i)), 0);
     fill("moment", item.moments.map((moment) => `${moment.toLocaleString("en")} pulls`), item.moments.length - 1);
   };
   const fillBeliefs = () => {
-    fill("belief", (current()?.posteriors ?? []).map((item) => item.agent), 0);
+    fill("belief", (current()?.beliefs ?? []).map((item) => item.agent), 0);
     fillMoments();
   };
   let before = report.environment;
@@ -165,13 +165,13 @@ report.section("bandits", (root, _, current) => {
     fillBeliefs();
   });
   root.querySelector(".pulls").hidden = current() === null;
-  figure("pull-posteriors", ({ posteriors }) => posteriors.length > 0, () => {
+  figure("pull-posteriors", ({ beliefs }) => beliefs.length > 0, () => {
     const item = belief();
     const [context, moment] = [Number(pick("context").value), Number(pick("moment").value)];
     const colour = (arm) => report.css(`--agent-${arm % 7}`);
     return {
       traces: item.densities[moment][context].map((y, arm) => ({
-        x: item.x,
+        x: item.points,
         y,
         name: `arm ${arm}`,
         mode: "lines",
@@ -183,7 +183,7 @@ report.section("bandits", (root, _, current) => {
         showlegend: true,
         legend: { orientation: "h", x: 0, y: 1.02, yanchor: "bottom" },
         hovermode: "x unified",
-        shapes: item.truth[context].flatMap((mean, arm) =>
+        shapes: item.true_means[context].flatMap((mean, arm) =>
           mean === null ? [] : [{ type: "line", yref: "paper", y0: 0, y1: 1, x0: mean, x1: mean, line: { color: colour(arm), width: 1.4, dash: "dot" } }],
         ),
         xaxis: { title: { text: "mean reward" }, hoverformat: ".3f" },

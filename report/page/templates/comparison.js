@@ -1,6 +1,6 @@
 report.section("comparison", (root, data, chosen) => {
   report.figure(root.querySelector("#intervals"), () => {
-    const { intervals: rows, linearUpTo: linear } = chosen();
+    const { intervals: rows, linear } = chosen();
     const { optimum, baseline } = report.page.environments[report.environment];
     const values = rows.flatMap((row) => [row.low, row.high, ...row.runs]).filter((v) => v !== null);
     const drawn = [...values, optimum, baseline].filter((v) => v !== null);

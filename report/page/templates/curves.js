@@ -6,7 +6,7 @@ report.section("curves", (root, _, place) => {
   const scale = root.querySelector('[data-switch="scale"]');
   const legend = root.querySelector(".legend");
   let redraw = () => {};
-  const noteOf = (label) => (place()?.[chosen("kind")].onVariant.includes(label) ? "on a variant" : "");
+  const noteOf = (label) => (place()?.[chosen("kind")].on_variant.includes(label) ? "on a variant" : "");
   const { isShown, fill } = report.legend(legend, () => redraw(), noteOf);
 
   const extent = (curves, environment) => {
@@ -17,13 +17,13 @@ report.section("curves", (root, _, place) => {
 
   const build = () => {
     const [kind, by, across] = ["kind", "by", "across"].map(chosen);
-    const { linearUpTo: linear, onVariant } = place()[kind];
+    const { by_axis: byAxis, linear_up_to: linear, on_variant: onVariant } = place()[kind];
     // Nobody is to read returns of a variant against the optimum of the environment itself.
     const judged = report.page.environments[report.environment];
     const environment = onVariant.length ? { ...judged, optimum: null, optimum_at_least: null, baseline: null } : judged;
     const symlog = linear !== null && chosen("scale") === "symlog" ? report.symlog(linear) : null;
     const height = symlog?.height ?? ((value) => value);
-    const curves = Object.entries(place()[kind][by]).filter(([label]) => isShown(label));
+    const curves = Object.entries(byAxis[by]).filter(([label]) => isShown(label));
     detail.textContent = onVariant.length
       ? `Circles: trained on a variant of the environment, so that the optimum is none of theirs: ${onVariant.join(", ")}.`
       : "";
@@ -43,7 +43,7 @@ report.section("curves", (root, _, place) => {
   };
   const isThere = () => {
     root.querySelector(".controls").hidden = place() === null;
-    scale.hidden = (place()?.[chosen("kind")].linearUpTo ?? null) === null;
+    scale.hidden = (place()?.[chosen("kind")].linear_up_to ?? null) === null;
     return place() !== null;
   };
   redraw = report.figure(figure, build, isThere);
