@@ -9,6 +9,7 @@ import io
 import json
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,11 +43,9 @@ def films_of(runs: Sequence[PlannedRun]) -> list[Path | None]:
 
 
 def film_of(planned: PlannedRun) -> Path | None:
-    """The film of a run's final agent, kept in the run folder for the next page.
+    """The film of a run's final agent, a GIF kept in the run folder for the next page.
 
-    Returns:
-        A GIF, which has how the episode went beside it in a JSON file; None where the environment
-        cannot be drawn.
+    How the episode went is in a JSON file beside it. None where the environment cannot be drawn.
     """
     path = planned.path / FILM
     if not has_film(planned):
@@ -85,28 +84,33 @@ def has_film(planned: PlannedRun) -> bool:
 
 def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     """The frames of an episode, and how it went."""
-    import torch as th
-
     from pipeline.evaluation.sampled import evaluation_seed
     from pipeline.filming import film_episode
     from pipeline.models.choose import model_of_run
-    from pipeline.models.load import load_model
-    from pipeline.playing import playing_env
 
     # Pictures alone: no display is needed, nor looked for.
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
-    spec = planned.spec
-    th.set_num_threads(spec.num_threads)
-    chosen = model_of_run(planned.run.model_path, spec, planned.run)
-    env = playing_env(chosen, "rgb_array")
-    try:
-        model = load_model(spec.algo, chosen.file, env, spec.user_modules)
+    with _loaded(model_of_run(planned.run.model_path, planned.spec, planned.run)) as (model, env):
         env.seed(evaluation_seed(planned.seed, 3))
         frames, ended = film_episode(model, env, MAX_STEPS, deterministic=True)
-    finally:
-        env.close()
     total_return, length = ended or (None, None)
     return _shrunk(frames), {"return": total_return, "steps": length}
+
+
+@contextmanager
+def _loaded(chosen: ChosenModel) -> Iterator[tuple[Any, Any]]:
+    """A model, and an environment that draws pictures."""
+    import torch as th
+
+    from pipeline.models.load import load_model
+    from pipeline.playing import playing_env
+
+    th.set_num_threads(chosen.spec.num_threads)
+    env = playing_env(chosen, "rgb_array")
+    try:
+        yield load_model(chosen.spec.algo, chosen.file, env, chosen.spec.user_modules), env
+    finally:
+        env.close()
 
 
 def _shrunk(frames: list[Any]) -> list[Any]:
@@ -126,16 +130,12 @@ def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[P
     """Film an episode at each checkpoint of the first run of every agent, into ``films``.
 
     The agent acts as it did in training, exploration included. A film that is younger than its
-    checkpoint is left as it is.
-
-    Returns:
-        The files, and for runs that cannot be filmed the reason.
+    checkpoint is left as it is. For runs that cannot be filmed, the reason is returned too.
     """
     paths: list[Path] = []
     refused: list[str] = []
     for planned in results.finished:
-        is_asked_for = planned.spec.save_every_n_episodes > 0 and not planned.is_batch
-        if is_asked_for:
+        if planned.spec.save_every_n_episodes > 0 and not planned.is_batch:
             tell(f"{planned.agent} on {planned.environment}")
             try:
                 paths += _films_of(planned, results.root / "films")
@@ -145,11 +145,11 @@ def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[P
 
 
 def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
-    name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"
     from pipeline.evaluation.sampled import evaluation_seed
     from pipeline.filming import write_film
     from pipeline.models.choose import model_of_run
 
+    name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"
     for checkpoint, episode in _checkpoints(planned):
         path = folder / f"{name}_{episode}.gif"
         if not (path.exists() and path.stat().st_mtime >= checkpoint.stat().st_mtime):
@@ -174,31 +174,10 @@ def _checkpoints(planned: PlannedRun) -> Iterator[tuple[Path, int]]:
 
 
 def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[Any]:
-    """The frames of an episode, in which the agent samples or explores as it did in training.
-
-    Args:
-        chosen: the model.
-        seed: of the episode.
-        max_steps: after how many steps to stop, where it has not ended before.
-
-    Returns:
-        Pictures, uint8 of shape (height, width, 3).
-
-    Raises:
-        UserError: if the model cannot be loaded or its environment cannot be drawn.
-    """
-    import torch as th
-
+    """The frames of an episode, in which the agent samples or explores as it did in training."""
     from pipeline.filming import film_episode
-    from pipeline.models.load import load_model
-    from pipeline.playing import playing_env
 
-    th.set_num_threads(chosen.spec.num_threads)
-    env = playing_env(chosen, "rgb_array")
-    try:
-        model = load_model(chosen.spec.algo, chosen.file, env, chosen.spec.user_modules)
+    with _loaded(chosen) as (model, env):
         model.set_random_seed(seed)
         frames, _ = film_episode(model, env, max_steps, deterministic=False)
-    finally:
-        env.close()
     return frames

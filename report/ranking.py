@@ -15,8 +15,6 @@ from experiments.study import COSTS, StudySpec
 from report.words import interval, interval_alone, number
 from verdicts import Estimate, ThresholdSummary
 
-# Figures as cells of the ranking: what stands there, and what it is sorted by.
-
 
 @dataclass(frozen=True)
 class Cell:
@@ -47,12 +45,8 @@ def _known(value: float) -> float | None:
 
 def estimate_cell(estimate: Estimate) -> Cell:
     """A figure with its interval."""
-    return Cell(
-        number(estimate.point),
-        _known(estimate.point),
-        interval_alone(estimate),
-        interval(estimate),
-    )
+    point = estimate.point
+    return Cell(number(point), _known(point), interval_alone(estimate), interval(estimate))
 
 
 def threshold_cell(stays: ThresholdSummary | None) -> Cell | None:
@@ -64,22 +58,12 @@ def threshold_cell(stays: ThresholdSummary | None) -> Cell | None:
     return Cell(number(median), _known(median), note)
 
 
-def crossing(first: ThresholdSummary | None) -> str:
-    """When a curve that may have fallen again was at the threshold for the first time."""
-    if first is None or math.isnan(first.median.point):
-        return ""
-    share = f"{first.share_reached.point:.0%} of runs are there at some evaluation"
-    return f"{share}, the median run first at step {number(first.median.point)}"
-
-
 def number_cell(value: float) -> Cell:
     """A figure without an interval."""
     return Cell(number(value), _known(value))
 
 
-# What the ranking says of an agent: one list of columns, for the terminal and for the page.
-#
-# A new statistic is one more entry of `COLUMNS`.
+# The columns: a new statistic is one more entry of `COLUMNS`.
 
 Order = Literal["ascending", "descending"]
 
@@ -126,11 +110,8 @@ def filled(
 ) -> list[tuple[Column[AnyRow], list[Cell]]]:
     """The columns that apply to some row, each with a cell for every row."""
     found = [(column, [column.cell(row) for row in rows]) for column in columns]
-    return [
-        (column, [cell or Cell("-", None) for cell in cells])
-        for column, cells in found
-        if any(cell is not None for cell in cells)
-    ]
+    dash = Cell("-", None)
+    return [(column, [cell or dash for cell in cells]) for column, cells in found if any(cells)]
 
 
 def _score(row: Row) -> Cell | None:
@@ -169,8 +150,13 @@ def _solved(row: Row) -> Cell | None:
 
 
 def _stays_from(row: Row) -> Cell | None:
-    cell = threshold_cell(row.agent.steps_to_stay)
-    return None if cell is None else replace(cell, aside=crossing(row.agent.steps_to_threshold))
+    cell, first = threshold_cell(row.agent.steps_to_stay), row.agent.steps_to_threshold
+    if cell is None or first is None or math.isnan(first.median.point):
+        return cell
+    # A curve that has crossed the threshold may have fallen again.
+    share = f"{first.share_reached.point:.0%} of runs are there at some evaluation"
+    aside = f"{share}, the median run first at step {number(first.median.point)}"
+    return replace(cell, aside=aside)
 
 
 def _seconds(row: Row) -> Cell | None:

@@ -8,7 +8,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from importlib.resources import files
 from typing import Any
@@ -70,33 +70,33 @@ def package_file(name: str) -> str:
     return (files("report.page") / name).read_text(encoding="utf-8")
 
 
-def plain(value: Any) -> Any:
-    """The value as JSON knows it: rounded, and None in place of what is not finite."""
+def rounded(number: float) -> float | None:
+    """A number for figures; None in place of what is not finite."""
+    return float(f"{number:.{SIGNIFICANT}g}") if math.isfinite(number) else None
+
+
+def plain(value: Any, of_float: Callable[[float], Any] = rounded) -> Any:
+    """The value as JSON knows it, and what ``of_float`` makes of its floats."""
     if is_dataclass(value):
         value = vars(value)
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
     if isinstance(value, float):
-        return float(f"{value:.{SIGNIFICANT}g}") if math.isfinite(value) else None
+        return of_float(value)
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): plain(item, of_float) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [plain(item, of_float) for item in value]
     return value
 
 
-def as_json(value: Any) -> str:
+def as_json(value: Any, of_float: Callable[[float], Any] = rounded) -> str:
     """The value as `plain` makes it, in as few letters as can be."""
-    return json.dumps(plain(value), separators=(",", ":"), allow_nan=False)
+    return json.dumps(plain(value, of_float), separators=(",", ":"), allow_nan=False)
 
 
 def data_uri(kind: str, content: bytes) -> str:
-    """A file inside the page.
-
-    Args:
-        kind: its MIME type.
-        content: its bytes.
-    """
+    """A file inside the page, of a MIME type."""
     return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
 
 
@@ -106,11 +106,7 @@ def packed(text: str) -> str:
 
 
 def inline_script(text: str) -> Markup:
-    """A script as the content of its element.
-
-    Raises:
-        ValueError: if the text would end the element.
-    """
+    """A script as the content of its element; ValueError if it would end the element."""
     if "</script" in text.lower() or "<!--" in text:
         raise ValueError("a script that is put into a page may not hold </script or <!--")
     return Markup(text)  # noqa: S704  # ours or the library's, and checked above
@@ -123,11 +119,7 @@ def script_hash(text: str) -> str:
 
 
 def frame(own: str) -> dict[str, str]:
-    """What every page has: its styles, its scripts, and the policy that admits these alone.
-
-    Args:
-        own: the page's own script.
-    """
+    """What a page with figures has: styles, scripts, its own one too, and the policy for these."""
     from plotly.offline import get_plotlyjs
 
     early, start = package_file("templates/theme.js"), package_file("templates/start.js")

@@ -10,8 +10,7 @@ from concurrent.futures import Executor
 from dataclasses import replace
 from functools import cache, partial
 from hashlib import sha256
-from importlib.resources import files
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
@@ -42,6 +41,7 @@ from pipeline.user_modules import import_again
 from pipeline.watching import LOGGED, MapRecorder, TableRecorder
 from report.page.frame import (
     LearningPage,
+    as_json,
     first_runs,
     inline_script,
     layout_data,
@@ -59,13 +59,17 @@ NO_WORDS = {"kind": "", "extent": "", "note": ""}
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
     """The words that depend on what is shown, by the names that the template has for them."""
-    return _words_of_steps(spec, data) if data["kind"] == "steps" else _words_of_maps(data)
-
-
-def _words_of_steps(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
+    note = ""
+    if data["kind"] == "maps":
+        unit, stride = data["unit"], data["stride"]
+        extent = _count(data["n_units"], unit)
+        if stride > 1:
+            extent += f", one in {stride:,} of which is shown"
+        if unit == "update":
+            note = "an update: all that is learnt from one rollout, at the end of it"
+        return {"kind": f"from {unit} to {unit}", "extent": extent, "note": note}
     n_steps = len(data["steps"]["timesteps"])
     n_episodes = int(np.count_nonzero(data["moves"]["end"]))
-    note = ""
     if data["is_cut"] and spec.watch_episodes:
         asked = _count(spec.watch_episodes, "episode")
         note = f"a page has room for {n_steps:,} steps, and ends before the first {asked} do"
@@ -74,22 +78,8 @@ def _words_of_steps(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
         note = f"from step {first:,} on, as the return of the greedy policy rises"
     elif data["is_longer"] and not spec.watch_episodes:
         note = "the beginning of a longer training"
-    return {
-        "kind": "step by step",
-        "extent": f"{_count(n_steps, 'step')}, {_count(n_episodes, 'whole episode')}",
-        "note": note,
-    }
-
-
-def _words_of_maps(data: Mapping[str, Any]) -> dict[str, str]:
-    unit, stride, n_units = data["unit"], data["stride"], data["n_units"]
-    extent = _count(n_units, unit)
-    if stride > 1:
-        extent += f", one in {stride:,} of which is shown"
-    note = ""
-    if unit == "update":
-        note = "an update: all that is learnt from one rollout, at the end of it"
-    return {"kind": f"from {unit} to {unit}", "extent": extent, "note": note}
+    extent = f"{_count(n_steps, 'step')}, {_count(n_episodes, 'whole episode')}"
+    return {"kind": "step by step", "extent": extent, "note": note}
 
 
 def _count(number: int, word: str) -> str:
@@ -102,12 +92,9 @@ def _count(number: int, word: str) -> str:
 
 
 def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
-    """Steps of an agent that learns in tables.
+    """At most so many steps of an agent that learns in tables.
 
-    Args:
-        recorder: what was kept of it.
-        most_steps: how many of them: of the first episodes the first, else the last, since there
-            the return has risen.
+    Of the first episodes they are the first, else the last, since there the return has risen.
     """
     begin, end = recorder.window()
     if recorder.n_episodes:
@@ -115,15 +102,18 @@ def steps_data(recorder: TableRecorder, most_steps: int) -> dict[str, Any]:
     else:
         begin = max(begin, end - most_steps)
     steps = recorder.steps.rows[begin:end]
-    moves, changes = (
-        _between(kept.rows, begin, end) for kept in (recorder.moves, recorder.changes)
-    )
+    # The tables as they were before the first of the steps.
+    tables = {name: recorder.initial[name].copy() for name in recorder.names}
+    earlier = recorder.changes.rows[recorder.changes.rows["step"] < begin]
+    for number, table in enumerate(tables.values()):
+        moved = earlier[earlier["table"] == number]
+        table.reshape(-1)[moved["entry"]] = moved["after"]  # of several the last
     return {
         "kind": "steps",
-        "tables": [_table(name, table) for name, table in _tables_before(recorder, begin).items()],
+        "tables": [_table(name, table) for name, table in tables.items()],
         "steps": _columns(steps),
-        "moves": _columns(moves),
-        "changes": _columns(changes),
+        "moves": _columns(_between(recorder.moves.rows, begin, end)),
+        "changes": _columns(_between(recorder.changes.rows, begin, end)),
         "begin": begin,
         "is_cut": recorder.is_cut or end - begin < len(recorder.steps),
         "is_longer": recorder.model.num_timesteps > steps["timesteps"][-1],
@@ -137,22 +127,21 @@ def _between(rows: NDArray[np.void], begin: int, end: int) -> NDArray[np.void]:
     return chosen
 
 
-def _tables_before(recorder: TableRecorder, step: int) -> dict[str, Floats]:
-    """The tables as they were before a step."""
-    tables = {name: recorder.initial[name].copy() for name in recorder.names}
-    earlier = recorder.changes.rows[recorder.changes.rows["step"] < step]
-    for number, table in enumerate(tables.values()):
-        moved = earlier[earlier["table"] == number]
-        table.reshape(-1)[moved["entry"]] = moved["after"]  # of several the last
-    return tables
+def _columns(rows: NDArray[np.void]) -> dict[str, Any]:
+    return {name: rows[name] for name in rows.dtype.names or ()}
+
+
+def _table(name: str, values: Floats) -> dict[str, Any]:
+    fill = values.reshape(-1)[0]
+    is_even = bool((values == fill).all())
+    initial = {"fill": float(fill)} if is_even else {"values": values.reshape(-1)}
+    return {"name": name, "shape": values.shape, **initial}
 
 
 def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
     """What an agent did in every state as it learnt, and what each state was worth then.
 
-    Args:
-        recorder: what was kept of it.
-        stride: of how many updates or evaluations one is shown, and the last in any case.
+    Of ``stride`` updates or evaluations one is shown, and the last in any case.
     """
     evaluator, rows = recorder.evaluator, recorder.moments.rows
     is_shown = rows["number"] % stride == 0
@@ -177,50 +166,12 @@ def maps_data(recorder: MapRecorder, stride: int) -> dict[str, Any]:
 
 def place_data(spec: TrainSpec, recorder: TableRecorder | MapRecorder) -> dict[str, Any]:
     """Where states lie, and what actions are called."""
+    layout, n_states, n_actions = None, 0, 0
     if isinstance(recorder, MapRecorder):
-        evaluator = recorder.evaluator
-        return _place(spec, (evaluator.model.n_states, evaluator.model.n_actions), evaluator.layout)
-    has_rows = recorder.has_actions
-    shape = recorder.initial[recorder.names[0]].shape if has_rows else (0, 0)
-    return _place(spec, (shape[-2], shape[-1]))
-
-
-def exact_json(value: Any) -> str:
-    """The value as JSON: every number to its last digit, null for nan, and infinity as a word."""
-    return json.dumps(_plain(value), separators=(",", ":"), allow_nan=False)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
-    if isinstance(value, float):
-        if math.isnan(value):
-            return None
-        if math.isinf(value):
-            return "Infinity" if value > 0 else "-Infinity"
-        return int(value) if value.is_integer() and abs(value) < 2**53 else value
-    if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    return value
-
-
-def _columns(rows: NDArray[np.void]) -> dict[str, Any]:
-    return {name: rows[name] for name in rows.dtype.names or ()}
-
-
-def _table(name: str, values: Floats) -> dict[str, Any]:
-    fill = values.reshape(-1)[0]
-    is_even = bool((values == fill).all())
-    initial = {"fill": float(fill)} if is_even else {"values": values.reshape(-1)}
-    return {"name": name, "shape": values.shape, **initial}
-
-
-def _place(
-    spec: TrainSpec, shape: tuple[int, int], layout: GridLayout | None = None
-) -> dict[str, Any]:
-    n_states, n_actions = shape
+        model, layout = recorder.evaluator.model, recorder.evaluator.layout
+        n_states, n_actions = model.n_states, model.n_actions
+    elif recorder.has_actions:
+        *_, n_states, n_actions = recorder.initial[recorder.names[0]].shape
     env = make_single_env(spec, training=True)
     try:
         layout = layout or _layout_of(env, n_states)
@@ -236,6 +187,15 @@ def _place(
         "layout": None if layout is None else layout_data(layout),
         "is_drawn": 1 < n_states <= MAX_STATES,
     }
+
+
+def exactly(number: float) -> float | str | None:
+    """A number to its last digit, null for nan, and infinity as a word."""
+    if math.isnan(number):
+        return None
+    if math.isinf(number):
+        return "Infinity" if number > 0 else "-Infinity"
+    return int(number) if number.is_integer() and abs(number) < 2**53 else number
 
 
 def _layout_of(env: Any, n_states: int) -> GridLayout | None:
@@ -265,16 +225,9 @@ SCRIPTS = (
 def write_learning_page(
     spec: TrainSpec, recorder: TableRecorder | MapRecorder, path: Path, title: str = ""
 ) -> str:
-    """Write the page of a training.
+    """Write the page of a training; in words what it shows.
 
-    Args:
-        spec: of the training.
-        recorder: what was kept of it.
-        path: the file, which is replaced.
-        title: what the training is called; by default the names of agent and environment.
-
-    Returns:
-        What it shows, in words.
+    It is called ``title``, or by default after agent and environment.
     """
     place = place_data(spec, recorder)
     title = title or f"{spec.algo} on {spec.env_id}"
@@ -311,24 +264,20 @@ def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]
 
 def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     early = package_file("templates/theme.js")
-    own = "\n".join(_file(name) for name in SCRIPTS)
-    style = "\n".join([package_file("templates/page.css"), _file("learning.css")])
+    own = "\n".join(package_file(f"templates/learning/{name}") for name in SCRIPTS)
+    style = [package_file(f"templates/{name}") for name in ("page.css", "learning/learning.css")]
     environment = templates()
     environment.loader = ChoiceLoader(
         [PackageLoader("report.page", "templates/learning"), PackageLoader("report.page")]
     )
     return environment.get_template("learning.html").render(
         **words,
-        data=packed(exact_json(data)),
-        style=Markup(style),  # noqa: S704  # our own
+        data=packed(as_json(data, exactly)),
+        style=Markup("\n".join(style)),  # noqa: S704  # our own
         early=inline_script(early),
         own=inline_script(own),
         policy=" ".join(map(script_hash, [early, own])),
     )
-
-
-def _file(name: str) -> str:
-    return (files("report.page") / "templates" / "learning" / name).read_text(encoding="utf-8")
 
 
 # Pages of learning in the folder of a study, each with a note of what it was made from.
@@ -340,33 +289,23 @@ _MOST_NOTED = 10_000  # bytes
 
 def page_path(root: Path, run: PlannedRun) -> Path:
     """Where the page of a run is written."""
-    return root / _place_in_study(run)
-
-
-def without_page(run: PlannedRun, reason: str) -> LearningPage:
-    """A run that cannot be shown."""
-    return LearningPage(run.agent, run.environment, run.seed, "", reason[:LONGEST_WORDS])
-
-
-def note_page(root: Path, run: PlannedRun, words: str) -> LearningPage:
-    """Note what the page that has just been written was made from."""
-    content = read_file(page_path(root, run), NO_LIMIT)
-    write_json(_note_path(root, run), {"words": words, **_made_from(run, content)})
-    return _page(run, words, content)
+    return root / FOLDER / run.path.parent.name / f"{run.path.name}.html"
 
 
 def kept_page(root: Path, run: PlannedRun) -> LearningPage | None:
     """The page of a run that an earlier command has left; None if it is none of this very run."""
+    path = page_path(root, run)
     try:
-        content = read_file(page_path(root, run), 2 * MOST_BYTES)
-        note = json.loads(read_file(_note_path(root, run), _MOST_NOTED))
+        content = read_file(path, 2 * MOST_BYTES)
+        note = json.loads(read_file(path.with_suffix(".json"), _MOST_NOTED))
     except (OSError, ValueError, RecursionError, UnsafeFileError):
         return None
     words = note.pop("words", None) if isinstance(note, dict) else None
     if not isinstance(words, str) or len(words) > LONGEST_WORDS:
         return None
     made_from = _made_from(run, content)
-    return _page(run, words, content) if made_from["agent"] and note == made_from else None
+    is_whole = made_from["agent"] and note == made_from
+    return _page(root, run, words, content) if is_whole else None
 
 
 def _made_from(run: PlannedRun, content: bytes) -> dict[str, str]:
@@ -379,17 +318,9 @@ def _made_from(run: PlannedRun, content: bytes) -> dict[str, str]:
     }
 
 
-def _page(run: PlannedRun, words: str, content: bytes) -> LearningPage:
-    place = _place_in_study(run).as_posix()
+def _page(root: Path, run: PlannedRun, words: str, content: bytes) -> LearningPage:
+    place = page_path(root, run).relative_to(root).as_posix()
     return LearningPage(run.agent, run.environment, run.seed, place, words, len(content))
-
-
-def _place_in_study(run: PlannedRun) -> PurePosixPath:
-    return PurePosixPath(FOLDER, run.path.parent.name, f"{run.path.name}.html")
-
-
-def _note_path(root: Path, run: PlannedRun) -> Path:
-    return page_path(root, run).with_suffix(".json")
 
 
 # The first training of each agent of a study, done again to be played.
@@ -403,13 +334,8 @@ def write_first_pages(
 ) -> list[LearningPage]:
     """Write a page for the first run of each agent, into ``learning``; those that fit stay.
 
-    Args:
-        analysis: the study.
-        n_workers: trainings at once; each is done in a child process.
-        tell: told how far it is.
-
-    Returns:
-        The pages, and of agents that cannot be shown the reason.
+    ``n_workers`` trainings are done at once, each in a child process. Of agents that cannot be
+    shown, what is returned has the reason.
     """
     root, study = analysis.results.root, analysis.study
     runs = [run for group in first_runs(analysis) for run in group]
@@ -420,23 +346,15 @@ def write_first_pages(
         with local_executor(n_workers) as executor:
             kept |= _trained_again(executor, root, to_do, limits, tell)
     pages = [page for page in kept.values() if page is not None]
-    return pages + _without_run(analysis, pages)
-
-
-def _without_run(analysis: StudyAnalysis, pages: list[LearningPage]) -> list[LearningPage]:
-    """The agents of which there is no run that could be trained again."""
     there = {(page.agent, page.environment) for page in pages}
     batches = {(run.agent, run.environment) for run in analysis.results.finished if run.is_batch}
-    without = [
-        (agent.agent, one.environment)
-        for one in analysis.environments
-        for agent in one.agents
-        if (agent.agent, one.environment) not in there
-    ]
-    return [
-        LearningPage(*names, 0, "", BATCH if names in batches else "no run of it has finished")
-        for names in without
-    ]
+    names = [(each.agent, one.environment) for one in analysis.environments for each in one.agents]
+    for agent, environment in names:
+        if (agent, environment) not in there:
+            is_batch = (agent, environment) in batches
+            reason = BATCH if is_batch else "no run of it has finished"
+            pages.append(LearningPage(agent, environment, 0, "", reason))
+    return pages
 
 
 def _trained_again(
@@ -464,8 +382,11 @@ def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
             )
         except TaskFailedError as error:
             path.unlink(missing_ok=True)
-            return without_page(run, str(error))
-    return note_page(root, run, words)
+            reason = str(error)[:LONGEST_WORDS]
+            return LearningPage(run.agent, run.environment, run.seed, "", reason)
+    content = read_file(path, NO_LIMIT)
+    write_json(path.with_suffix(".json"), {"words": words, **_made_from(run, content)})
+    return _page(root, run, words, content)
 
 
 def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:

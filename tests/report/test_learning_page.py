@@ -15,7 +15,8 @@ from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import carry_out, prepare
 from report.page import learning
-from report.page.learning import _layout_of, exact_json, write_learning_page
+from report.page.frame import as_json
+from report.page.learning import _layout_of, exactly, write_learning_page
 
 
 @pytest.fixture
@@ -45,7 +46,7 @@ def data_in(text):
 
 def test_numbers_are_written_to_their_last_digit():
     values = np.array([0.1 + 0.2, 1e-300, -2.0, np.nan, np.inf, 123456789.123456789])
-    assert json.loads(exact_json({"values": values})) == {
+    assert json.loads(as_json({"values": values}, exactly)) == {
         "values": [0.30000000000000004, 1e-300, -2, None, "Infinity", 123456789.12345679]
     }
 
