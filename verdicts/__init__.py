@@ -19,10 +19,8 @@ if TYPE_CHECKING:
         SpeedComparison,
         ThresholdSummary,
         area_under_curve,
-        best_score,
         compare_speed,
         curve_band,
-        final_score,
         on_grid,
         performance_profile,
         shared_grid,
@@ -57,7 +55,6 @@ if TYPE_CHECKING:
         Statistic,
         Summary,
         estimate,
-        gap_to_optimum,
         optimum_score,
         summarise,
     )
@@ -77,7 +74,6 @@ __all__ = [
     "ahead_p_value",
     "apart_p_value",
     "area_under_curve",
-    "best_score",
     "compare_pairs",
     "compare_speed",
     "count_failures",
@@ -88,8 +84,6 @@ __all__ = [
     "fail_more_often",
     "failure_threshold",
     "fewest_seeds",
-    "final_score",
-    "gap_to_optimum",
     "grow",
     "holm",
     "judge_pairs",
@@ -109,55 +103,13 @@ __all__ = [
     "typical_difference",
 ]
 
-_HOMES = {
-    "PairComparison": "verdicts.pairs",
-    "compare_pairs": "verdicts.pairs",
-    "describe_pairs": "verdicts.pairs",
-    "level_of_look": "verdicts.error_levels",
-    "Estimate": "verdicts.resampling",
-    "Statistic": "verdicts.resampling",
-    "Summary": "verdicts.resampling",
-    "estimate": "verdicts.resampling",
-    "summarise": "verdicts.resampling",
-    "FailureCount": "verdicts.failures",
-    "count_failures": "verdicts.failures",
-    "fail_more_often": "verdicts.failures",
-    "failure_threshold": "verdicts.failures",
-    "Growth": "verdicts.growth",
-    "grow": "verdicts.growth",
-    "look_sizes": "verdicts.growth",
-    "probability_of_improvement": "verdicts.pairs",
-    "FEWEST_SEEDS": "verdicts.pairs",
-    "Verdict": "verdicts.pairs",
-    "judge_pairs": "verdicts.pairs",
-    "Band": "verdicts.curves",
-    "ThresholdSummary": "verdicts.curves",
-    "area_under_curve": "verdicts.curves",
-    "best_score": "verdicts.curves",
-    "curve_band": "verdicts.curves",
-    "final_score": "verdicts.curves",
-    "on_grid": "verdicts.curves",
-    "shared_grid": "verdicts.curves",
-    "steps_to_stay": "verdicts.curves",
-    "steps_to_threshold": "verdicts.curves",
-    "summarise_steps": "verdicts.curves",
-    "holm": "verdicts.rank_tests",
-    "paired_difference": "verdicts.rank_tests",
-    "fewest_seeds": "verdicts.pairs",
-    "seeds_needed": "verdicts.pairs",
-    "performance_profile": "verdicts.curves",
-    "ahead_p_value": "verdicts.rank_tests",
-    "apart_p_value": "verdicts.rank_tests",
-    "equivalent_p_value": "verdicts.rank_tests",
-    "gap_to_optimum": "verdicts.resampling",
-    "optimum_score": "verdicts.resampling",
-    "SpeedComparison": "verdicts.curves",
-    "compare_speed": "verdicts.curves",
-    "typical_difference": "verdicts.rank_tests",
-}
+# Those that load least come first: some of them a command needs before it may take long.
+_MODULES = ("error_levels", "resampling", "rank_tests", "pairs", "failures", "curves", "growth")
 
 
 def __getattr__(name: str) -> object:
-    if name not in _HOMES:
-        raise AttributeError(f"module 'verdicts' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOMES[name]), name)
+    for module in _MODULES if name in __all__ else ():
+        found = importlib.import_module(f"verdicts.{module}")
+        if hasattr(found, name):
+            return getattr(found, name)
+    raise AttributeError(f"module 'verdicts' has no attribute {name!r}")

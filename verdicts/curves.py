@@ -24,8 +24,6 @@ from verdicts.resampling import (
     resample_counts,
 )
 
-# Figures of learning curves: evaluations of one run, at growing steps or episodes.
-
 # As many points as a figure can show.
 _MOST_POINTS = 500
 
@@ -69,19 +67,6 @@ def area_under_curve(steps: ArrayLike, values: ArrayLike) -> Floats:
     if x[-1] == x[0]:
         return y[..., -1]
     return np.asarray(np.trapezoid(y, x, axis=-1) / (x[-1] - x[0]))
-
-
-def final_score(values: ArrayLike) -> Floats:
-    """The last value of each curve: shape (..., n_points) to (...)."""
-    return np.asarray(values, dtype=np.float64)[..., -1]
-
-
-def best_score(values: ArrayLike) -> Floats:
-    """The largest value of each curve: shape (..., n_points) to (...).
-
-    Where the evaluations are sampled, it is too high by the luck of the best of them.
-    """
-    return np.asarray(np.fmax.reduce(np.asarray(values, dtype=np.float64), axis=-1))
 
 
 def shared_grid(curves: Sequence[ArrayLike], n_points: int = _MOST_POINTS) -> Floats:
@@ -315,8 +300,8 @@ def performance_profile(
 class SpeedComparison:
     """How many times the steps of one agent another needs."""
 
-    first: str  #: their names, in the order of the mapping
-    second: str
+    first: str  #: the name of one, in the order of the mapping
+    second: str  #: the name of the other
     #: Steps of the second divided by those of the first: the median over pairs of runs. The
     #: intervals of all pairs hold together, wherever between two evaluations runs arrived.
     ratio: Estimate

@@ -35,8 +35,6 @@ from verdicts.resampling import (
     resample_counts,
 )
 
-# How many seeds it takes until a verdict is likely.
-
 # Nobody runs more; a difference that needs them is as good as none.
 MOST_SEEDS = 10_000
 
@@ -220,7 +218,8 @@ def probability_of_improvement(
     check_confidence(confidence)
     x, y = as_columns(first), as_columns(second)
     same_shape(x, y)
-    pairs = [_both_known(*pair) for pair in zip(x.T, y.T, strict=True)]
+    known = ~np.isnan(x) & ~np.isnan(y)
+    pairs = [(one[k], other[k]) for one, other, k in zip(x.T, y.T, known.T, strict=True)]
     sizes = [len(first_scores) for first_scores, _ in pairs]
     n, n_missing = sum(sizes), x.size - sum(sizes)
     if min(sizes) == 0:
@@ -258,12 +257,6 @@ def _normal_interval(
     return max(point - float(reach), 0.0), min(point + float(reach), 1.0)
 
 
-def _both_known(first: Floats, second: Floats) -> tuple[Floats, Floats]:
-    """The scores of the seeds where neither is NaN."""
-    both = ~np.isnan(first) & ~np.isnan(second)
-    return first[both], second[both]
-
-
 def _table(first: Floats, second: Floats) -> Floats:
     """1 where a run of the first (rows) beats one of the second (columns), 0.5 where equal."""
     return (1 + np.sign(differences(first[:, None], second[None, :]))) / 2
@@ -288,8 +281,8 @@ _OPPOSITE: dict[Verdict, Verdict] = {
 class PairComparison:
     """What the seeds say about two agents."""
 
-    first: str  #: their names
-    second: str
+    first: str  #: the name of one
+    second: str  #: the name of the other
     #: The median difference between a run of the first and one of the second. The intervals of all
     #: pairs hold together, and agree with the verdicts.
     difference: Estimate
@@ -396,11 +389,12 @@ def describe_pairs(
     level, later = (each / n_pairs for each in levels)
     comparisons = []
     for (one, two), (judgement, n_seeds) in judged.items():
-        x, y = scores[one][:n_seeds], scores[two][:n_seeds]
+        both = np.array([scores[one][:n_seeds], scores[two][:n_seeds]])
+        paired = np.where(np.isfinite(both).all(axis=0), both, np.nan)
         improvement = probability_of_improvement(
-            *_paired(x, y), seed=seed, confidence=confidence, n_resamples=n_resamples
+            *paired, seed=seed, confidence=confidence, n_resamples=n_resamples
         )
-        x, y = x[np.isfinite(x)], y[np.isfinite(y)]
+        x, y = (values[np.isfinite(values)] for values in both)
         comparison = PairComparison(
             first=one,
             second=two,
@@ -431,12 +425,6 @@ def _check(scores: Mapping[str, ArrayLike], margin: float, confidence: float) ->
     for shape in set(shapes.values()):
         if len(shape) != 1:
             raise ValueError(f"scores have shape {shape}, they must have (n_seeds,)")
-
-
-def _paired(first: Floats, second: Floats) -> Floats:
-    """Both agents' scores, shape (2, n_seeds); NaN for both where one is not finite."""
-    both = np.array([first, second])
-    return np.where(np.isfinite(both).all(axis=0), both, np.nan)
 
 
 def _difference(

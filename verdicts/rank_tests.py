@@ -26,11 +26,7 @@ def differences(first: Floats, second: Floats) -> Floats:
 
 
 def same_shape(first: Floats, second: Floats) -> None:
-    """Refuse scores that do not pair up.
-
-    Raises:
-        ValueError: if the shapes differ.
-    """
+    """Refuse scores that do not pair up."""
     if first.shape != second.shape:
         raise ValueError(
             f"scores of shapes {first.shape} and {second.shape} do not pair up: give both agents "
@@ -59,11 +55,21 @@ def paired_difference(first: ArrayLike, second: ArrayLike, confidence: float = 0
         ValueError: for arguments out of range, or shapes that do not pair up.
     """
     check_confidence(confidence)
-    apart = paired_differences(first, second)
-    n_missing = np.size(first) - len(apart)
-    mean, spread = mean_and_spread(apart)
-    half = _half_width(spread, len(apart), confidence)
-    return Estimate(mean, mean - half, mean + half, len(apart), n_missing)
+    x, y = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    same_shape(x, y)
+    if x.ndim != 1:
+        raise ValueError(f"scores to be paired have shape {x.shape}, they must have (n_seeds,)")
+    both = np.isfinite(x) & np.isfinite(y)
+    apart = differences(x[both], y[both])
+    n = len(apart)
+    if n == 0:
+        return Estimate(np.nan, np.nan, np.nan, 0, x.size)
+    # Counted from the first, so that equal differences have a spread of exactly 0.
+    offsets = apart - apart[0]
+    mean, half = float(apart[0] + offsets.mean()), np.nan
+    if n > 1:
+        half = float(stats.t.isf((1 - confidence) / 2, n - 1) * offsets.std(ddof=1) / np.sqrt(n))
+    return Estimate(mean, mean - half, mean + half, n, x.size - n)
 
 
 def holm(p_values: ArrayLike) -> Floats:
@@ -83,39 +89,6 @@ def holm(p_values: ArrayLike) -> Floats:
     stepped = adjusted[order] * np.arange(len(order), 0, -1)
     adjusted[order] = np.minimum(np.maximum.accumulate(stepped), 1)
     return adjusted
-
-
-def paired_differences(first: ArrayLike, second: ArrayLike) -> Floats:
-    """The differences on the seeds where both agents have a finite score, shape (n,).
-
-    Raises:
-        ValueError: unless both have the same shape (n_seeds,).
-    """
-    x, y = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    same_shape(x, y)
-    if x.ndim != 1:
-        raise ValueError(f"scores to be paired have shape {x.shape}, they must have (n_seeds,)")
-    both = np.isfinite(x) & np.isfinite(y)
-    return differences(x[both], y[both])
-
-
-def mean_and_spread(values: Floats) -> tuple[float, float]:
-    """Mean and standard deviation; NaN where there are too few values for them.
-
-    Counted from the first value, so that equal values have a spread of exactly 0.
-    """
-    if len(values) == 0:
-        return float("nan"), float("nan")
-    offsets = values - values[0]
-    spread = offsets.std(ddof=1) if len(values) > 1 else np.nan
-    return float(values[0] + offsets.mean()), float(spread)
-
-
-def _half_width(spread: float, n: int, confidence: float) -> float:
-    """How far the t interval of a mean of ``n`` values reaches to each side."""
-    if n < 2:
-        return float("nan")
-    return float(stats.t.isf((1 - confidence) / 2, n - 1) * spread / np.sqrt(n))
 
 
 # Which of two agents is ahead: the exact rank-sum test, guarded against unequal spreads.
@@ -165,10 +138,7 @@ def equivalent_p_value(first: Floats, second: Floats, margin: float) -> float:
 
     Two one-sided tests, each agent in turn with ``margin`` added to its scores.
     """
-    return max(
-        ahead_p_value(first + margin, second),
-        ahead_p_value(second + margin, first),
-    )
+    return max(ahead_p_value(first + margin, second), ahead_p_value(second + margin, first))
 
 
 def rank_sum_p_value(first: Floats, second: Floats) -> float:
@@ -201,7 +171,7 @@ def share_p_value(first: Floats, second: Floats) -> float:
     share = float(ahead.mean())
     if n < 2 or share <= 0.5:
         return 1.0
-    variance = _variance_of_mean(ahead) + _variance_of_mean(behind)
+    variance = sum(float(wins.var(ddof=1)) / len(wins) for wins in (ahead, behind))
     effective = max(n, share * (1 - share) / variance) if variance > 0 else n
     won = share * effective
     return max(float(special.betainc(won, effective - won + 1, 0.5)), 0.5**n)
@@ -261,10 +231,6 @@ def _normal_tail(ranks: Floats, n: int, m: int, found: int) -> float:
         return 1.0
     step = np.gcd.reduce(np.diff(np.unique(ranks)).astype(np.int64))
     return float(stats.norm.sf((found - n * (total + 1) - step / 2) / spread))
-
-
-def _variance_of_mean(values: Floats) -> float:
-    return float(values.var(ddof=1)) / len(values)
 
 
 # How far apart the typical runs of two agents are.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -12,19 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
-# Names for the kinds of arrays that judgements take and return.
-
 Floats = NDArray[np.float64]
-
-# How often something was drawn.
-Counts = NDArray[np.int64]
+Counts = NDArray[np.int64]  # how often something was drawn
 
 
 # Resampling of seeds, within each environment apart from the others.
 #
 # A resample is kept as how often it drew each seed. Sums over resamples are then matrix products,
-# and
-# sorting is done once and not once per resample.
+# and sorting is done once and not once per resample.
 
 # The ends of an interval over few seeds lie beyond the 1 % quantiles: fewer would vary too much.
 N_RESAMPLES = 10_000
@@ -34,14 +28,7 @@ _MOST_DRAWS = 2_000_000
 
 
 def as_columns(scores: ArrayLike) -> Floats:
-    """Scores as a table with one environment per column.
-
-    Args:
-        scores: shape (n_seeds,) or (n_seeds, n_envs).
-
-    Raises:
-        ValueError: for another shape, or where there is nothing.
-    """
+    """Scores of shape (n_seeds,) or (n_seeds, n_envs) as a table, an environment per column."""
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim not in {1, 2} or table.size == 0:
         raise ValueError(
@@ -51,11 +38,7 @@ def as_columns(scores: ArrayLike) -> Floats:
 
 
 def check_confidence(confidence: float) -> None:
-    """Refuse a confidence that is no share, as 95 would be.
-
-    Raises:
-        ValueError: unless it lies strictly between 0 and 1.
-    """
+    """Refuse a confidence that is no share, as 95 would be."""
     if not 0 < confidence < 1:
         raise ValueError(f"confidence is {confidence}, it must lie between 0 and 1, as 0.95 does")
 
@@ -77,14 +60,8 @@ def interval_tail(strata: Sequence[Floats], confidence: float) -> float:
     Percentiles of the bootstrap distribution are too narrow for few seeds: it uses the variance
     with n in the denominator instead of n - 1, and the normal instead of the t distribution. The
     share is widened for both, so that the interval for a mean is about as long as the t interval;
-    over several environments, with the degrees of freedom of Welch and Satterthwaite.
-
-    Args:
-        strata: the values of each environment that the statistic varies with, one per seed.
-        confidence: of the interval.
-
-    Returns:
-        The share; NaN where an environment has fewer than two seeds, so that there is no interval.
+    over several environments, with the degrees of freedom of Welch and Satterthwaite. NaN where
+    an environment has fewer than two seeds, so that there is no interval.
 
     Source: Hesterberg (2015), "What teachers should know about the bootstrap", The American
     Statistician 69(4), the expanded percentile interval.
@@ -129,8 +106,8 @@ class Estimate:
     """A figure and how sure it is."""
 
     point: float  #: the figure; NaN where there is nothing to compute it from
-    low: float  #: the ends of its interval; both NaN where there is none, as with a single seed
-    high: float
+    low: float  #: the lower end of its interval; NaN where there is none, as with a single seed
+    high: float  #: the upper end, likewise
     n: int  #: the number of values that it is computed from
     n_missing: int = 0  #: the number of values left out, from runs that failed
 
@@ -194,12 +171,12 @@ def estimate(
 class _Resampled:
     """Pooled scores in order, and how much each resample weighs them."""
 
-    values: Floats  #: ascending, shape (n,)
-    #: Cumulated over ``values``, shape (1 + n_resamples, n), the scores as they are first. A row
-    #: ends at n.
+    values: Floats  # ascending, shape (n,)
+    # Cumulated over ``values``, shape (1 + n_resamples, n), the scores as they are first. A row
+    # ends at n.
     weights: Floats
-    tail: float  #: what an interval leaves out on each side
-    n_missing: int  #: scores left out
+    tail: float  # what an interval leaves out on each side
+    n_missing: int  # scores left out
 
     def estimate(self, statistic: Statistic) -> Estimate:
         n = len(self.values)
@@ -239,13 +216,7 @@ def _drawn(sizes: tuple[int, ...], n_resamples: int, seed: int) -> tuple[Counts,
 
 
 def _trimmed_means(values: Floats, weights: Floats, cut: int) -> Floats:
-    """The mean of each resample's values without ``cut`` of them at either end.
-
-    Args:
-        values: ascending, shape (n,).
-        weights: cumulated over ``values``, shape (n_resamples, n).
-        cut: weight to leave out at each end.
-    """
+    """The mean of each resample's values without ``cut`` of them at either end."""
     n = len(values)
     below = np.clip(weights[:, :-1], cut, n - cut)
     # The weighted sum, by parts. Counting from the smallest value keeps equal values exact.
@@ -253,38 +224,9 @@ def _trimmed_means(values: Floats, weights: Floats, cut: int) -> Floats:
     return np.asarray(values[0] + above_smallest / (n - 2 * cut))
 
 
-# How low a mean can be, for sure: of bounded values, whatever their distribution.
-
-
-def least_mean(values: Floats, low: float, high: float, level: float) -> float:
-    """A number that is above the mean that values are drawn with in at most ``level`` of all cases.
-
-    It takes nothing for granted but that no value lies outside ``low`` and ``high``: not even that
-    what was never seen among so many is rare.
-
-    Args:
-        values: drawn independently, shape (n,) with n > 1.
-        low: the least that a value can be.
-        high: the greatest.
-        level: how often the bound may be too high.
-
-    Source: Maurer and Pontil (2009), "Empirical Bernstein bounds and sample variance penalization",
-    theorem 4.
-    """
-    n, doubt = len(values), math.log(2 / level)
-    by_spread = math.sqrt(2 * float(values.var(ddof=1)) * doubt / n)
-    by_range = 7 * (high - low) * doubt / (3 * (n - 1))
-    return float(np.mean(values)) - by_spread - by_range
-
-
 # Returns measured against the best possible and the best random or constant policy.
 #
 # The same scale as `pipeline.evaluation.sampled.Yardstick`, for arrays.
-
-
-def gap_to_optimum(returns: ArrayLike, optimum: float) -> Floats:
-    """How far returns stay behind the optimum, elementwise."""
-    return optimum - np.asarray(returns, dtype=np.float64)
 
 
 def optimum_score(returns: ArrayLike, optimum: float, baseline: float) -> Floats:

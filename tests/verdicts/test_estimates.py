@@ -12,7 +12,6 @@ from pipeline.evaluation.sampled import Yardstick
 from verdicts import (
     compare_pairs,
     estimate,
-    gap_to_optimum,
     optimum_score,
     performance_profile,
     summarise,
@@ -239,7 +238,6 @@ def test_scores_are_those_of_the_yardstick():
     assert scores[1, 0] == 0.5
     for index, value in np.ndenumerate(returns):
         assert scores[index] == yardstick.score(value)
-        assert gap_to_optimum(returns, 79.0)[index] == yardstick.gap(value)
 
 
 def test_scores_where_the_blind_policy_is_optimal():

@@ -8,10 +8,8 @@ from scipy import stats
 
 from verdicts import (
     area_under_curve,
-    best_score,
     curve_band,
     estimate,
-    final_score,
     on_grid,
     shared_grid,
     steps_to_threshold,
@@ -36,13 +34,6 @@ def test_the_area_under_a_line_is_its_middle(gaps, start, slope):
     steps = np.cumsum([0, *gaps])
     middle = start + slope * steps[-1] / 2
     assert area_under_curve(steps, start + slope * steps) == pytest.approx(middle, abs=1e-9)
-
-
-def test_final_and_best_scores():
-    values = [[1, 9, 4], [5, NAN, 2]]
-    assert final_score(values).tolist() == [4, 2]
-    assert best_score(values).tolist() == [9, 5]
-    assert np.isnan(best_score([NAN, NAN]))
 
 
 @pytest.mark.parametrize(
