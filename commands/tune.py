@@ -37,13 +37,23 @@ from pipeline.failures import exits_as_mistakes
 from pipeline.signs_of_life import doing, duration
 from pipeline.stopping import stops_noticed
 from tuning.pruning import PRUNERS
-from tuning.tuning_spec import AUTO, FIGURES, OBJECTIVES, SAMPLERS, SHIPPED, TuningSpec
+from tuning.tuning_spec import (
+    AUTO,
+    FIGURES,
+    OBJECTIVES,
+    SAMPLERS,
+    SHIPPED,
+    TuningSpec,
+    failing_in_a_line,
+    kind_of,
+    without_secret,
+)
 
 if TYPE_CHECKING:
     from tuning.retesting import Candidate, Outcome
     from tuning.searching import OpenTuning
 
-# --- flags ----------------------------------------------------------------------------------------
+# Flags.
 
 TRIALS = whole_number(1, 100_000)
 SEEDS = whole_number(1, 1000)
@@ -171,7 +181,7 @@ def build_parser() -> argparse.ArgumentParser:
     return parser
 
 
-# --- what is done ---------------------------------------------------------------------------------
+# What is done.
 
 
 def main() -> int:
@@ -185,7 +195,6 @@ def _tune(args: argparse.Namespace) -> int:
     tuning = tuning_spec(args)
     from experiments.child_processes import end_server
     from experiments.run_limits import RunLimits
-    from tuning.trial_storage import failing_in_a_line, without_secret
 
     go_on_unread()
     console = table_console()
@@ -317,7 +326,7 @@ def _write_down(context: RunContext, opened: OpenTuning, outcome: Outcome | None
     say(context.console, f"files: {', '.join(map(str, files))}")
 
 
-# --- from flags to a tuning -----------------------------------------------------------------------
+# From flags to a tuning.
 
 
 def tuning_spec(args: argparse.Namespace) -> TuningSpec:
@@ -329,7 +338,6 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     from pipeline.runs import environment_name
     from pipeline.settings.values import parse_assignments
     from pipeline.user_modules import import_typed
-    from tuning.trial_storage import kind_of
 
     if importlib.util.find_spec("optuna") is None:
         raise UserError("tuning needs: pip install 'rl-yardstick[tune]'")
@@ -388,7 +396,7 @@ def tuning_spec(args: argparse.Namespace) -> TuningSpec:
     return tuning
 
 
-# --- what is printed ------------------------------------------------------------------------------
+# What is printed.
 
 
 def print_opened(context: RunContext, opened: OpenTuning) -> None:
@@ -468,7 +476,7 @@ def print_outcome(console: Console, opened: OpenTuning, outcome: Outcome) -> Non
         say(console, f"no winner: {outcome.reason}; they stay as they are")
 
 
-# --- what a person watching sees: a line that moves, or one now and then --------------------------
+# What a person watching sees: a line that moves, or one now and then.
 
 # To read all trials takes time, where there are many.
 SECONDS_BETWEEN_QUESTIONS = 5.0

@@ -167,7 +167,7 @@ def speed_sentences(environment: EnvironmentAnalysis) -> Iterable[str]:
     arrived = sorted((one for one in told if one[1].point > 0), key=lambda one: one[2])
     if len(told) < 2 or not arrived:
         return
-    parts = []
+    parts: list[str] = []
     for name, share, steps in arrived:
         goal = "" if parts else f"reaches {_goal(environment)} and keeps it to the end "
         parts.append(f"{name} {goal}in {round(share.point * share.n)} of {share.n} runs")

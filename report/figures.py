@@ -414,8 +414,8 @@ def draw_learning_curves(
         for agent, curve in found.by_axis[by].items():
             if agent in found.on_variant:
                 # Circles along the curve, which tell it from the others without colour.
-                style = {"color": COLOURS[marks[agent].colour], "markerfacecolor": "white"}
-                (circles,) = place.plot(curve.x, curve.y, "o", markersize=5, **style)
+                colour = COLOURS[marks[agent].colour]
+                (circles,) = place.plot(curve.x, curve.y, "o", ms=5, mfc="white", color=colour)
                 circles.set_markevery(CIRCLES_APART)
         if not found.on_variant:
             _draw_references(place, environment)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from enum import Enum
 from functools import cached_property
 from typing import Any, Literal
 
@@ -41,13 +40,7 @@ _DIGITS = 6
 _PREFIXES: Mapping[str, str] = {"log_below_one": "one_minus_", "powers_of_two": "log2_"}
 
 
-class Absent(Enum):
-    """A setting that is not said."""
-
-    LEFT_OUT = "left out"
-
-
-LEFT_OUT = Absent.LEFT_OUT
+LEFT_OUT = object()  # in place of a setting that is not said
 
 
 @dataclass(frozen=True)
@@ -73,11 +66,7 @@ class Choice:
         return self._decided(self.options[pick(self.name, self.distributions[self.name])])
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that lead to these settings.
-
-        Raises:
-            LookupError: if none do.
-        """
+        """The parameters that lead to these settings; LookupError if none do."""
         for word, option in self.options.items():
             if same(self._decided(option), self._decided(settings)):
                 return {self.name: word}
@@ -89,17 +78,16 @@ class Choice:
             self.params_of(settings)
         except LookupError:
             added = self._decided(settings)
-            return replace(self, options={**self.options, self._word_for(added): added})
+            value = added.get(self.name, LEFT_OUT)
+            # The value itself where that tells the reader more.
+            speaks = all(is_word(option.get(self.name)) for option in self.options.values())
+            speaks = speaks and is_word(value) and value not in self.options
+            word = value if speaks else SHIPPED
+            return replace(self, options={**self.options, word: added})
         return self
 
     def _decided(self, settings: Mapping[str, Any]) -> dict[str, Any]:
         return {key: settings.get(key, LEFT_OUT) for key in self.keys}
-
-    def _word_for(self, added: Mapping[str, Any]) -> Word:
-        """The value itself where that tells the reader more."""
-        value = added.get(self.name, LEFT_OUT)
-        speaks = all(is_word(option.get(self.name)) for option in self.options.values())
-        return value if speaks and is_word(value) and value not in self.options else SHIPPED
 
 
 @dataclass(frozen=True)
@@ -147,34 +135,28 @@ class NumberRange:
         found: dict[str, BaseDistribution] = {}
         if len(self._words) > 1:
             found[self._form] = CategoricalDistribution(self._words)
-        found[self._number] = self._number_distribution()
+        low, high = sorted((self._parameter(self.low), self._parameter(self.high)))
+        is_log = self.scale in ("log", "log_below_one")
+        if isinstance(low, int) and isinstance(high, int):
+            found[self._number] = IntDistribution(low, high, log=is_log)
+        else:
+            found[self._number] = FloatDistribution(low, high, log=is_log)
         if "exponential" in self.forms:
             found[self._share] = FloatDistribution(*self.final_share, log=True)
         return found
 
-    def _number_distribution(self) -> BaseDistribution:
-        low, high = sorted((self._parameter(self.low), self._parameter(self.high)))
-        is_log = self.scale in ("log", "log_below_one")
-        if isinstance(low, int) and isinstance(high, int):
-            return IntDistribution(low, high, log=is_log)
-        return FloatDistribution(low, high, log=is_log)
-
     def _parameter(self, number: float) -> float:
         """What Optuna is told of a number."""
-        match self.scale:
-            case "log_below_one":
-                return tidy(1.0 - number)
-            case "powers_of_two":
-                return int(number).bit_length() - 1
-        return number
+        if self.scale == "log_below_one":
+            return tidy(1.0 - number)
+        return int(number).bit_length() - 1 if self.scale == "powers_of_two" else number
 
     def _number_of(self, parameter: float) -> float:
         """The number that a parameter stands for."""
-        match self.scale:
-            case "log_below_one":
-                return round(1.0 - tidy(parameter), 12)
-            case "powers_of_two":
-                return 1 << int(parameter)
+        if self.scale == "log_below_one":
+            return round(1.0 - tidy(parameter), 12)
+        if self.scale == "powers_of_two":
+            return 1 << int(parameter)
         number = parameter if isinstance(parameter, int) else tidy(parameter)
         return min(max(number, self.low), self.high)
 
@@ -193,11 +175,7 @@ class NumberRange:
         return {self.name: f"exp_{number}_{end}"}
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that lead to these settings.
-
-        Raises:
-            LookupError: if none do.
-        """
+        """The parameters that lead to these settings; LookupError if none do."""
         value = settings.get(self.name, LEFT_OUT)
         for word, other in self.instead.items():
             if same(value, other):
@@ -253,8 +231,7 @@ def spread(distribution: BaseDistribution, n: int) -> list[Any]:
     """At most ``n`` values from one end of a distribution to the other; of words all."""
     if isinstance(distribution, CategoricalDistribution):
         return list(distribution.choices)
-    if not isinstance(distribution, FloatDistribution | IntDistribution):
-        raise TypeError(distribution)
+    assert isinstance(distribution, FloatDistribution | IntDistribution)
     between = np.geomspace if distribution.log else np.linspace
     values = between(distribution.low, distribution.high, n).tolist()
     if isinstance(distribution, IntDistribution):
@@ -273,11 +250,9 @@ def _read(value: Any) -> tuple[str | None, float, float]:
     if isinstance(value, int | float) and not isinstance(value, bool):
         return "constant", value, value
     if isinstance(value, str):
-        try:
+        with contextlib.suppress(UserError):
             schedule = parse_schedule(value, "")
-        except UserError:
-            return None, 0.0, 0.0
-        return schedule.kind, schedule.start, schedule.end
+            return schedule.kind, schedule.start, schedule.end
     return None, 0.0, 0.0
 
 

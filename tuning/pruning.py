@@ -68,29 +68,21 @@ def is_hopeless(
     n_seeds: int | None = None,
     ceiling: float = -math.inf,
 ) -> bool:
-    """Whether to end a trial early.
+    """Whether to end a trial early, by its scores and those of all others, the higher the better.
 
     Args:
-        scores: of the trial's seeds so far, the higher the better.
-        others: the same of all other trials, ended ones and those under way.
+        scores: of the trial's seeds so far.
+        others: the same of ended trials and those under way.
         method: a key of `PRUNERS`.
         value: what scores are worth together.
         n_seeds: how many a whole trial has; None for as many as any has so far.
         ceiling: no score is above that; what has been seen counts where it is not said.
-
-    Raises:
-        UserError: if there is no such method.
     """
     if method not in PRUNERS:
         raise unknown("--pruner: there is none called", method, PRUNERS)
     longest = max(map(len, others), default=0)
     rivals = Rivals(others, longest if n_seeds is None else n_seeds, value, ceiling)
     return len(scores) > 0 and PRUNERS[method](scores, rivals)
-
-
-def never(scores: Scores, rivals: Rivals) -> bool:
-    """No trial is ended early."""
-    return False
 
 
 def below_median(scores: Scores, rivals: Rivals) -> bool:
@@ -177,7 +169,7 @@ def no_chance(scores: Scores, rivals: Rivals) -> bool:
 
 PRUNERS: Mapping[str, Callable[[Scores, Rivals], bool]] = {
     "auto": no_chance,
-    "none": never,
+    "none": lambda scores, rivals: False,
     "bound": cannot_win,
     "median": below_median,
     "halving": out_of_the_race,

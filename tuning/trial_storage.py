@@ -11,43 +11,35 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import re
 import secrets
+import sqlite3
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 from urllib.parse import urlsplit
+
+import optuna
+from optuna import Study, Trial
+from optuna.exceptions import ExperimentalWarning, OptunaError, StorageInternalError
+from optuna.samplers import BaseSampler
+from optuna.storages import BaseStorage, GrpcStorageProxy, JournalStorage, RDBStorage
+from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
+from optuna.trial import FrozenTrial, TrialState, create_trial
 
 from pipeline import locks
 from pipeline.errors import UserError, one_line, shown
 from pipeline.locks import FolderGoneError, FolderInUseError, folder_lock, is_gone
 from pipeline.signs_of_life import Heartbeat
+from tuning.tuning_spec import OWN_FILE, TuningSpec, kind_of, reason_of, without_secret
 
-# Optuna takes long to load, and a mistake on the command line is told before.
-if TYPE_CHECKING:
-    from optuna import Study, Trial
-    from optuna.samplers import BaseSampler
-    from optuna.storages import BaseStorage
-    from optuna.trial import FrozenTrial
-
-    from tuning.tuning_spec import TuningSpec
-
-OWN_FILE = "trials.db"
 SECONDS_TO_WAIT = 120  # for others who write into the same SQLite file
 SECONDS_TO_CONNECT = 15  # to a proxy
 _LONGEST_LINE = 1 << 20  # bytes
 _TRIES, _SECONDS_BETWEEN_TRIES = 5, 0.2
-# Whose errors are the storage's.
-_LIBRARIES = frozenset({"optuna", "sqlalchemy", "sqlite3", "grpc", "json"})
 _JOURNAL = "journal:"
-_GRPC = "grpc"
-_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://)", re.IGNORECASE)
-_SECRET = re.compile(r"(?<=://)([^\s/@:]*):[^\s/@]*@")
 _ANY_PORT = 13000  # of Optuna's proxy
-_DATABASES = ("sqlite", "postgresql", "mysql", "mariadb")
-KNOWN = "a file for a journal, sqlite:///FILE, postgresql://..., mysql://..., grpc://HOST:PORT"
 
 # What the study says of all of its trials.
 ASKED, JUDGED_BY = "asked", "judged by"
@@ -79,40 +71,8 @@ def open_storage(root: Path, given: str | None) -> BaseStorage:
         raise UserError(f"--storage {without_secret(given)}: {what}: install that") from error
 
 
-@contextlib.contextmanager
-def failing_in_a_line(given: str | None) -> Iterator[None]:
-    """Say in one line what the storage fails of, whenever it does: full, gone, or damaged."""
-    try:
-        yield
-    except Exception as error:
-        if not _LIBRARIES & {kind.__module__.partition(".")[0] for kind in type(error).__mro__}:
-            raise
-        name = OWN_FILE if given is None else f"--storage {without_secret(given)}"
-        goes_on = "; what is done stays, and the same command goes on"
-        if isinstance(error, json.JSONDecodeError):
-            name, goes_on = f"{name} is damaged", ""
-        raise UserError(f"{name}: {_reason(error)}{goes_on}") from error
-
-
-def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
-    """What a storage is by its name."""
-    scheme = _SCHEME.match(given)
-    if scheme is None:
-        return "journal"
-    name = scheme[0].partition("+")[0].lower()
-    if name not in (*_DATABASES, _GRPC):
-        raise UserError(f"--storage: {shown(without_secret(given))} is no storage: {KNOWN}")
-    return "proxy" if name == _GRPC else "database"
-
-
-def without_secret(text: str) -> str:
-    """The text with the password of each address in it left out."""
-    return _SECRET.sub(r"\1:***@", text)
-
-
 def _own_file(path: Path) -> BaseStorage:
     """A SQLite file. In an address, some signs of its path would mean something else."""
-    import sqlite3
 
     def connect() -> sqlite3.Connection:
         return sqlite3.connect(path, timeout=SECONDS_TO_WAIT, check_same_thread=False)
@@ -121,9 +81,6 @@ def _own_file(path: Path) -> BaseStorage:
 
 
 def _journal(path: Path) -> BaseStorage:
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend, JournalFileOpenLock
-
     _check_journal(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     backend = JournalFileBackend(str(path), lock_obj=JournalFileOpenLock(str(path)))
@@ -159,9 +116,6 @@ def _ends_whole(path: Path) -> bool:
 
 
 def _proxy(url: str) -> BaseStorage:
-    from optuna.exceptions import ExperimentalWarning
-    from optuna.storages import GrpcStorageProxy
-
     parts = urlsplit(url)
     if not parts.hostname:
         raise UserError(f"--storage: which machine? {shown(url)} names none: grpc://HOST:PORT")
@@ -186,26 +140,15 @@ def _database(url: str) -> BaseStorage:
 
 
 def _opened(url: str, options: dict[str, Any], name: str) -> BaseStorage:
-    from optuna.exceptions import StorageInternalError
-    from optuna.storages import RDBStorage
     from sqlalchemy.exc import SQLAlchemyError
 
     try:
         return RDBStorage(url, engine_kwargs=options)
     except (SQLAlchemyError, StorageInternalError, RuntimeError, ValueError) as error:
-        raise UserError(f"--storage {name}: cannot be opened: {_reason(error)}") from error
+        raise UserError(f"--storage {name}: cannot be opened: {reason_of(error)}") from error
 
 
-def _reason(error: Exception) -> str:
-    """What a library says in a line, without its questions, its manual's address and passwords."""
-    cause = error.__cause__ if type(error).__name__ == "StorageInternalError" else None
-    said = one_line(cause or error)
-    for rest in ("(Background on", "[SQL: "):
-        said = said.partition(rest)[0]
-    return without_secret(said.strip())
-
-
-# --- the study ------------------------------------------------------------------------------------
+# The study.
 
 
 def open_study(
@@ -219,8 +162,6 @@ def open_study(
 
     ``asked`` is what makes it this tuning and no other, as JSON.
     """
-    import optuna
-
     name = tuning.study.name
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     with turn(root):
@@ -266,7 +207,7 @@ def _flat(asked: object) -> dict[str, Any]:
     return flat
 
 
-# --- the places of a study ------------------------------------------------------------------------
+# The places of a study.
 
 
 class TrialQueue:
@@ -286,8 +227,6 @@ class TrialQueue:
 
     def add_places(self) -> None:
         """Make sure that the study has a place for each trial."""
-        from optuna.trial import TrialState, create_trial
-
         with turn(self.root):
             for _ in range(len(self.study.get_trials(deepcopy=False)), self.n_trials):
                 self.study.add_trial(create_trial(state=TrialState.WAITING))
@@ -320,9 +259,6 @@ class TrialQueue:
 
     def claim(self, params: Callable[[int], Mapping[str, Any]]) -> Trial | None:
         """Take a free place, if there is one; ``params`` says what is settled by its number."""
-        from optuna import Trial
-        from optuna.trial import TrialState
-
         with turn(self.root):  # SQLite would let two drivers take the same place
             for place in self.trials():
                 number = place._trial_id
@@ -339,9 +275,6 @@ class TrialQueue:
 
     def give_back(self, trial: Trial) -> None:
         """Let another driver, or this one later, go on with a trial."""
-        from optuna.exceptions import OptunaError
-        from optuna.trial import TrialState
-
         with contextlib.suppress(OptunaError, ValueError), turn(self.root):
             now = self.storage.get_trial(trial._trial_id)
             is_mine = now.user_attrs.get(DRIVER, {}).get("token") == self._token
@@ -350,8 +283,6 @@ class TrialQueue:
 
     def free_dead(self) -> list[int]:
         """Give back the trials of drivers that are gone; their numbers."""
-        from optuna.trial import TrialState
-
         if not any(map(self._is_dead, self.trials())):
             return []
         freed = []
@@ -364,8 +295,6 @@ class TrialQueue:
 
     def _is_dead(self, trial: FrozenTrial) -> bool:
         """Whether nobody is at work on it: of a driver elsewhere, once it has long been silent."""
-        from optuna.trial import TrialState
-
         if trial.state != TrialState.RUNNING:
             return False
         owner = trial.user_attrs.get(DRIVER)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import contextlib
+import json
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -11,7 +14,7 @@ import numpy as np
 
 from agents import ALGORITHMS
 from experiments.study import COSTS, METRICS, AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.errors import UserError
+from pipeline.errors import UserError, one_line, shown
 from pipeline.files import plain
 
 Sampler = Literal["tpe", "gp", "random", "grid"]
@@ -134,3 +137,54 @@ def judged(figures: Sequence[float], objective: Objective, *, is_cost: bool) -> 
         cut = len(values) // 4
         return float(values[cut : len(values) - cut].mean())
     return float(np.quantile(values, 1 - LOWER if is_cost else LOWER))
+
+
+# What ``--storage`` names, and in a line what a storage fails of: Optuna itself is loaded later.
+
+OWN_FILE = "trials.db"
+KNOWN = "a file for a journal, sqlite:///FILE, postgresql://..., mysql://..., grpc://HOST:PORT"
+# Whose errors are the storage's.
+_LIBRARIES = frozenset({"optuna", "sqlalchemy", "sqlite3", "grpc", "json"})
+_DATABASES = ("sqlite", "postgresql", "mysql", "mariadb")
+_SCHEME = re.compile(r"[a-z][a-z0-9+.-]*(?=://)", re.IGNORECASE)
+_SECRET = re.compile(r"(?<=://)([^\s/@:]*):[^\s/@]*@")
+
+
+def kind_of(given: str) -> Literal["journal", "proxy", "database"]:
+    """What a storage is by its name."""
+    scheme = _SCHEME.match(given)
+    if scheme is None:
+        return "journal"
+    name = scheme[0].partition("+")[0].lower()
+    if name not in (*_DATABASES, "grpc"):
+        raise UserError(f"--storage: {shown(without_secret(given))} is no storage: {KNOWN}")
+    return "proxy" if name == "grpc" else "database"
+
+
+def without_secret(text: str) -> str:
+    """The text with the password of each address in it left out."""
+    return _SECRET.sub(r"\1:***@", text)
+
+
+@contextlib.contextmanager
+def failing_in_a_line(given: str | None) -> Iterator[None]:
+    """Say in one line what the storage fails of, whenever it does: full, gone, or damaged."""
+    try:
+        yield
+    except Exception as error:
+        if not _LIBRARIES & {kind.__module__.partition(".")[0] for kind in type(error).__mro__}:
+            raise
+        name = OWN_FILE if given is None else f"--storage {without_secret(given)}"
+        goes_on = "; what is done stays, and the same command goes on"
+        if isinstance(error, json.JSONDecodeError):
+            name, goes_on = f"{name} is damaged", ""
+        raise UserError(f"{name}: {reason_of(error)}{goes_on}") from error
+
+
+def reason_of(error: Exception) -> str:
+    """What a library says in a line, without its questions, its manual's address and passwords."""
+    cause = error.__cause__ if type(error).__name__ == "StorageInternalError" else None
+    said = one_line(cause or error)
+    for rest in ("(Background on", "[SQL: "):
+        said = said.partition(rest)[0]
+    return without_secret(said.strip())

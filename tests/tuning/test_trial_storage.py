@@ -9,15 +9,8 @@ from optuna.trial import TrialState
 from pipeline import locks
 from pipeline.errors import UserError
 from tuning import trial_storage
-from tuning.trial_storage import (
-    DRIVER,
-    failing_in_a_line,
-    figures_of,
-    kind_of,
-    open_storage,
-    seconds_of,
-    without_secret,
-)
+from tuning.trial_storage import DRIVER, figures_of, open_storage, seconds_of
+from tuning.tuning_spec import failing_in_a_line, kind_of, without_secret
 
 
 @pytest.mark.parametrize(
