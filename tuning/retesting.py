@@ -138,10 +138,8 @@ def concluded(
         for label, number in numbers.items()
     ]
     winner, reason = _winner(tuning, retested)
-    best = ranked[0].number if ranked else None
-    found = next((each for each in retested if each.number == best), None)
-    apart = None if found is None else optimism(tuning, found)
-    return Outcome(tuple(retested), winner, apart, reason)
+    best = [each for each in retested if ranked and each.number == ranked[0].number]
+    return Outcome(tuple(retested), winner, optimism(tuning, best[0]) if best else None, reason)
 
 
 def optimism(tuning: TuningSpec, best: Retested) -> float | None:
@@ -181,26 +179,19 @@ def _retested(
     )
 
 
-def interval_of(tuning: TuningSpec) -> str:
-    """What the intervals are of: there are none for quartiles and times to a threshold."""
-    statistic = "interquartile mean" if tuning.objective == "iqm" else "mean"
-    return f"{statistic} of {tuning.figure if tuning.figure in METRICS else 'score'}"
-
-
 def _interval(tuning: TuningSpec, agent: AgentAnalysis | None) -> Estimate:
     if agent is None:
         return Estimate(math.nan, math.nan, math.nan, 0)
-    is_score = tuning.figure in ("score", "steps", "seconds") and agent.score is not None
-    summary = agent.score if is_score and agent.score is not None else agent.metric
+    of_score = tuning.figure in ("score", "steps", "seconds")
+    summary = (agent.score if of_score else None) or agent.metric
     return summary.iqm if tuning.objective == "iqm" else summary.mean
 
 
 def _verdict(environment: EnvironmentAnalysis | None, label: str) -> str:
     for pair in () if environment is None else environment.pairs:
-        if (pair.first, pair.second) == (label, SHIPPED):
-            return pair.verdict
-        if (pair.first, pair.second) == (SHIPPED, label):
-            return pair.swapped().verdict
+        for seen in (pair, pair.swapped()):
+            if (seen.first, seen.second) == (label, SHIPPED):
+                return seen.verdict
     return "undecided"
 
 
@@ -223,7 +214,7 @@ def _winner(tuning: TuningSpec, retested: Sequence[Retested]) -> tuple[Retested 
     return best, ""
 
 
-# --- entries of hyperparameters, which say what they were tuned on --------------------------------
+# Entries of hyperparameters, which say what they were tuned on.
 
 
 def entry_text(tuning: TuningSpec, entry: Mapping[str, Any], lines: Sequence[str]) -> str:
@@ -254,27 +245,22 @@ def tuned_seeds(tuning: TuningSpec) -> list[range]:
 class _Dumper(yaml.SafeDumper):
     """Writes a setting a line; lists of plain values, and seeds, in one."""
 
+    def represent_sequence(
+        self, tag: str, sequence: Any, _: bool | None = None
+    ) -> yaml.SequenceNode:
+        are_plain = not any(isinstance(item, list | dict) for item in sequence)
+        return super().represent_sequence(tag, sequence, flow_style=are_plain)
 
-def _list(dumper: yaml.SafeDumper, items: list[Any]) -> yaml.Node:
-    are_plain = not any(isinstance(item, list | dict) for item in items)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=are_plain)
-
-
-def _mapping(dumper: yaml.SafeDumper, items: dict[str, Any]) -> yaml.Node:
-    return dumper.represent_mapping(
-        "tag:yaml.org,2002:map", items, flow_style=items.keys() == {"first", "count"}
-    )
-
-
-_Dumper.add_representer(list, _list)
-_Dumper.add_representer(dict, _mapping)
+    def represent_mapping(self, tag: str, mapping: Any, _: bool | None = None) -> yaml.MappingNode:
+        are_seeds = mapping.keys() == {"first", "count"}
+        return super().represent_mapping(tag, mapping, flow_style=are_seeds)
 
 
 def _yaml(data: Mapping[str, Any]) -> str:
     return str(yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True))
 
 
-# --- the winner -----------------------------------------------------------------------------------
+# The winner.
 
 
 def write_winner(
@@ -321,11 +307,13 @@ def _held_out(tuning: TuningSpec, each: Retested) -> str:
         return text
     ends = f"{found.low:.4g} to {found.high:.4g}"
     failed = f", {each.n_failed} of them failed" if each.n_failed else ""
-    of_what = interval_of(tuning)
+    # There are no intervals for quartiles and times to a threshold.
+    statistic = "interquartile mean" if tuning.objective == "iqm" else "mean"
+    of_what = f"{statistic} of {tuning.figure if tuning.figure in METRICS else 'score'}"
     return f"{text} (95 % interval of the {of_what}: {ends}, {each.n_runs} runs{failed})"
 
 
-# --- the record -----------------------------------------------------------------------------------
+# The record.
 
 
 def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> dict[str, Any]:
@@ -345,7 +333,14 @@ def write_record(place: OpenTuning, outcome: Outcome | None, command: str) -> di
         "engine": place.suggestions.shipped.get("engine"),
         "widened": list(place.suggestions.space.widened),
         "trials": [_trial(trial) for trial in place.queue.trials()],
-        "retest": None if outcome is None else _outcome(outcome),
+        "retest": outcome
+        and {
+            "settings": [asdict(each) for each in outcome.retested],
+            "winner": outcome.winner and outcome.winner.label,
+            "winner_file": outcome.winner and WINNER,
+            "reason": outcome.reason,
+            "optimism": outcome.optimism,
+        },
     }
     data = plain(data)
     write_json(place.root / RECORD, data)
@@ -364,16 +359,6 @@ def _trial(trial: FrozenTrial) -> dict[str, Any]:
         "figures": {str(seed): figure for seed, figure in figures_of(said).items()},
         "seconds": seconds_of(said),
         "failure": said.get(FAILURE),
-        "began": None if began is None else began.isoformat(),
-        "ended": None if ended is None else ended.isoformat(),
-    }
-
-
-def _outcome(outcome: Outcome) -> dict[str, Any]:
-    return {
-        "settings": [asdict(each) for each in outcome.retested],
-        "winner": None if outcome.winner is None else outcome.winner.label,
-        "winner_file": None if outcome.winner is None else WINNER,
-        "reason": outcome.reason,
-        "optimism": outcome.optimism,
+        "began": began and began.isoformat(),
+        "ended": ended and ended.isoformat(),
     }

@@ -70,17 +70,12 @@ _SETS: Mapping[str, Any] = {"sets": dict[str, dict[str, Any]], "when": dict[str,
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """What a search chooses for one agent on one environment.
+    """What a search chooses for one agent on one environment."""
 
-    Attributes:
-        entries: dimensions by name, in the order in which they are asked.
-        defaults: what a setting is where none is said; those not named are just left out.
-        widened: names of the dimensions that `including` made wider.
-    """
-
-    entries: Mapping[str, Dimension]
+    entries: Mapping[str, Dimension]  #: dimensions by name, in the order in which they are asked
+    #: What a setting is where none is said; those not named are just left out.
     defaults: Mapping[str, Any]
-    widened: tuple[str, ...] = ()
+    widened: tuple[str, ...] = ()  #: names of the dimensions that `including` made wider
 
     @property
     def keys(self) -> tuple[str, ...]:
@@ -90,9 +85,7 @@ class SearchSpace:
     def suggest(self, trial: BaseTrial) -> dict[str, Any]:
         """Settings in the form of hyperparameter files, to be put into an entry by `merged`.
 
-        Args:
-            trial: of Optuna; a FixedTrial does too. Only what exists under what was chosen before
-                is asked for.
+        Only what exists under what was chosen before is asked for. A FixedTrial does too.
         """
         return self._chosen(lambda name, ends: _ask(trial, name, ends))
 
@@ -131,10 +124,7 @@ class SearchSpace:
         return {name: spread(ends, n) for name, ends in self.distributions().items()}
 
     def params_of(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """The parameters that make `suggest` say these settings.
-
-        Args:
-            settings: an entry of hyperparameters. What it leaves out is at its default.
+        """The parameters that make `suggest` say these settings; what they leave out is default.
 
         Raises:
             UserError: if they lie outside of the space, see `including`.
@@ -167,14 +157,10 @@ class SearchSpace:
         return replace(self, entries=entries, widened=tuple(widened))
 
     def merged(self, shipped: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-        """An entry of hyperparameters with chosen settings in it.
+        """The shipped entry of hyperparameters with the settings in it that `suggest` returned.
 
         What the space decides and the settings do not hold is taken out: it exists under
         conditions that are not met.
-
-        Args:
-            shipped: the entry before.
-            settings: what `suggest` returned.
         """
         kept = _with_mappings(shipped, self.keys)
         for key in self.keys:
@@ -222,6 +208,7 @@ def _plain(value: Any) -> Any:
 
 
 def _is_there(dimension: Dimension, chosen: Mapping[str, Any]) -> bool:
+    """Whether the choices that a dimension depends on are made so that it exists."""
     return all(
         other in chosen and any(same(chosen[other], word) for word in words)
         for other, words in dimension.when.items()
@@ -239,7 +226,7 @@ def _ask(trial: BaseTrial, name: str, kind: BaseDistribution) -> Any:
     raise TypeError(kind)
 
 
-# --- points of a space ----------------------------------------------------------------------------
+# Points of a space.
 
 
 def corners(space: SearchSpace) -> Iterator[dict[str, Any]]:
@@ -277,7 +264,7 @@ def _with_one(
     return space.at({**params, **needed, changed: value})
 
 
-# --- read from a file -----------------------------------------------------------------------------
+# Read from a file.
 
 
 def read_search_space(algo: str, env_id: str, path: Path | str | None = None) -> SearchSpace:

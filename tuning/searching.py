@@ -51,8 +51,8 @@ SECONDS_BETWEEN_LOOKS = 1.0
 # So many that fail in a row, and none before that did not: then it is not their settings.
 MOST_FAILURES = 5
 _ROOM_FOR_A_RUN = 1 << 18  # bytes, of a small one
-# What a run costs that never comes to the threshold, in whole runs: with the cost of what was done
-# alone, giving up early would look cheap.
+# Penalty for never reaching the threshold: twice the budget (PAR-2). At the cost of what was done,
+# giving up early would look cheap.
 WHOLE_RUNS = 2
 
 
@@ -133,7 +133,7 @@ def _made(root: Path) -> Iterator[None]:
         raise
 
 
-# --- what a run is worth --------------------------------------------------------------------------
+# What a run is worth.
 
 
 class UnjudgedError(Exception):
@@ -152,32 +152,26 @@ class RunOutcome:
 def outcome_of(tuning: TuningSpec, planned: PlannedRun) -> RunOutcome:
     """What a finished run is judged by, and what it took.
 
-    Raises:
-        UnjudgedError: if it has no such figure.
-        DamagedFileError: if a file of it is missing or changed.
-        UserError: if no run has such a figure here, since nobody says what the threshold is.
+    UnjudgedError if it has no such figure, DamagedFileError if a file of it is missing or changed,
+    UserError if no run can have one here, since nobody says what the threshold is.
     """
     results = read_run(tuning.study, planned)
     if results is None:
         raise UnjudgedError("it has not finished")
     row, name = results.rows[0], tuning.figure
-    figure: float | None
-    if name in ("steps", "seconds"):
-        figure = _cost(tuning, row, results.curves[0])
-    else:
-        if name == "score" and row.get(name) is None:  # where no optimum is known
-            name = "final"
-        figure = row.get(name)
-        if figure is None or not math.isfinite(figure):
-            raise UnjudgedError(f"it has no figure for {name}")
+    if name == "score" and row.get(name) is None:  # where no optimum is known
+        name = "final"
+    is_cost = name in ("steps", "seconds")
+    figure = _cost(tuning, row, results.curves[0]) if is_cost else row.get(name)
+    if figure is None or not math.isfinite(figure):
+        raise UnjudgedError(f"it has no figure for {name}")
     return RunOutcome(float(figure), float(row.get("cpu_seconds") or row["seconds"]), name)
 
 
 def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> float:
     """Steps or seconds until the learning curve comes to the threshold.
 
-    Source: a run that never does counts twice, as in the PAR-k of Hutter et al. (2009), "ParamILS",
-    JAIR 36.
+    Source: for PAR-k, Hutter et al. (2009), "ParamILS", JAIR 36.
     """
     threshold, name = row.get("threshold"), tuning.figure
     if threshold is None:
@@ -192,7 +186,7 @@ def _cost(tuning: TuningSpec, row: Mapping[str, Any], evaluations: Curve) -> flo
     return float(reached) if math.isfinite(reached) else WHOLE_RUNS * whole
 
 
-# --- the loop -------------------------------------------------------------------------------------
+# The loop.
 
 
 class Listener(Protocol):

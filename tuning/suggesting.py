@@ -190,7 +190,7 @@ class Suggestions:
         return layered(entry, self.tuning.agent.settings)
 
 
-# --- the runs of a trial: one for each seed, in folders that equal settings share -----------------
+# The runs of a trial: one for each seed, in folders that equal settings share.
 
 
 def name_of(entry: Mapping[str, Any]) -> str:
