@@ -33,13 +33,6 @@ PHRASES: dict[Verdict, str] = {
 LEGEND = "> better than the agent of the column, < worse, = equivalent, ? undecided"
 
 
-def verdict_matrix(environment: EnvironmentAnalysis) -> list[list[Verdict | None]]:
-    """By row and column, the verdict on the row's agent against the column's; None on itself."""
-    verdicts = {names: pair.verdict for names, pair in pairs_both_ways(environment).items()}
-    names = [agent.agent for agent in environment.agents]
-    return [[verdicts.get((row, column)) for column in names] for row in names]
-
-
 def says_more(environment: EnvironmentAnalysis) -> bool:
     """Whether there is more to be seen than a sentence says: three agents or more, and verdicts."""
     decided = [pair for pair in environment.pairs if pair.verdict != "undecided"]
@@ -90,8 +83,9 @@ def _matrix(environment: EnvironmentAnalysis) -> Table:
     numbers = [str(place) for place in range(1, len(names) + 1)]
     for place in numbers:
         table.add_column(place, justify="right", no_wrap=True)
-    for place, name, row in zip(numbers, names, verdict_matrix(environment), strict=True):
-        signs = ["·" if verdict is None else SIGNS[verdict] for verdict in row]
+    pairs = pairs_both_ways(environment)
+    for place, name in zip(numbers, names, strict=True):
+        signs = [SIGNS[pairs[name, n].verdict] if (name, n) in pairs else "·" for n in names]
         table.add_row(place, name, *signs)
     return table
 

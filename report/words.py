@@ -10,8 +10,6 @@ from experiments.looks import Look, Looks
 from experiments.plan import Seeds, TuningSeeds
 from verdicts import Estimate
 
-# Figures as a reader wants them, and words in a row.
-
 SIGNIFICANT = 4  # digits
 
 _ORDINALS = ("first", "second", "third", "fourth", "fifth", "sixth", "seventh", "eighth", "ninth")
@@ -79,17 +77,12 @@ MOST_NAMES = 6
 
 
 def seed_sentence(seeds: range, tuning: TuningSeeds) -> str:
-    """Say which of the seeds that agents are judged on their settings were tuned on.
-
-    Args:
-        seeds: of the study.
-        tuning: what is known of its settings.
-    """
+    """Say which of the seeds of a study the settings of its agents were tuned on."""
     parts = [
         *_tuned(seeds, tuning.shipped, "the shipped settings of"),
         *_tuned(seeds, tuning.files, "the settings in"),
     ]
-    these = "these" if len(seeds) > 1 else "it"
+    these = _these(seeds)
     if tuning.elsewhere:
         names = _names(tuning.elsewhere)
         parts.append(f"the settings of {names} were tuned with other arguments of the environment")
@@ -109,16 +102,15 @@ def _tuned(seeds: range, found: Mapping[str, Seeds], whose: str) -> list[str]:
     for name, shared in found.items():
         if shared:
             groups.setdefault(shared, []).append(name)
-    return [
-        f"{whose} {_names(names)} were tuned on {_which(seeds, shared)}"
-        for shared, names in groups.items()
-    ]
+    told = []
+    for shared, names in groups.items():
+        which = f"{spans(shared)} of these" if len(shared) < len(seeds) else _these(seeds)
+        told.append(f"{whose} {_names(names)} were tuned on {which}")
+    return told
 
 
-def _which(seeds: range, shared: Seeds) -> str:
-    if len(shared) == len(seeds):
-        return "these" if len(seeds) > 1 else "it"
-    return f"{spans(shared)} of these"
+def _these(seeds: range) -> str:
+    return "these" if len(seeds) > 1 else "it"
 
 
 def _names(names: Sequence[str]) -> str:
@@ -148,12 +140,10 @@ def look_sentences(looks: Looks) -> list[str]:
     if looks.design is not None:
         sizes = [f"{size:,}" for size in looks.design.sizes]
         told.append(f"Fixed before the first of them: looks at {enumeration(sizes)} seeds.")
-    return [*told, *map(_on, looks.taken)]
-
-
-def _on(look: Look) -> str:
-    level = f"{100 * look.level:.2g} %"
-    return f"{look.date[:10]}: {'; '.join(_seeds(look))}; claims at {level}."
+    for look in looks.taken:
+        level = f"{100 * look.level:.2g} %"
+        told.append(f"{look.date[:10]}: {'; '.join(_seeds(look))}; claims at {level}.")
+    return told
 
 
 def _seeds(look: Look) -> Iterable[str]:

@@ -2,9 +2,116 @@
 
 A page is a list of sections. Each is a function that looks at a study and returns a `Section`, or
 None where it has nothing to show; its template lies in ``templates/<name>.html``, and
-what makes it move, if anything does, in ``templates/<name>.js``. `report.page.assembly` lists them.
+what makes it move, if anything does, in ``templates/<name>.js``.
 """
 
-from report.page.assembly import write_report
+from __future__ import annotations
 
-__all__ = ["write_report"]
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from pipeline.files import write_text
+from pipeline.signs_of_life import Tell, tell_nobody
+from report.page import result_sections, world_sections
+from report.page.frame import (
+    SHARED,
+    LearningPage,
+    Report,
+    Section,
+    as_json,
+    frame,
+    packed,
+    templates,
+)
+from report.series import StudySeries
+
+# A new kind of section is such a function, named here.
+SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
+    result_sections.verdict,
+    result_sections.overview,
+    result_sections.ranking,
+    result_sections.curves,
+    world_sections.bandits,
+    result_sections.comparison,
+    result_sections.overall,
+    world_sections.policies,
+    world_sections.played_episodes,
+    result_sections.watching,
+    result_sections.settings,
+)
+
+
+def write_report(
+    series: StudySeries,
+    path: Path,
+    command: str,
+    tell: Tell = tell_nobody,
+    learning: Sequence[LearningPage] = (),
+) -> None:
+    """Write the page of a study, one file that needs nothing else and no network.
+
+    Args:
+        series: the numbers that its figures show.
+        path: the file, which is replaced.
+        command: the command that reproduces the study.
+        tell: told how far the writing is.
+        learning: the pages that play trainings, where they were asked for.
+    """
+    report = Report(series, command, tell, learning)
+    sections = []
+    for place, make in enumerate(SECTIONS, start=1):
+        tell(f"section {place} of {len(SECTIONS)}")
+        section = make(report)
+        if section is not None:
+            sections.append(section)
+    tell("all sections as one file")
+    write_text(path, render(report, sections))
+
+
+def render(report: Report, sections: list[Section]) -> str:
+    """The page as HTML."""
+    environment = templates()
+    study, environments = report.analysis.study, report.analysis.environments
+    shared = {"study": study, "environments": environments, "marks": report.series.marks}
+    bodies = {
+        section.name: Markup(  # noqa: S704  # a template's output, escaped already
+            environment.get_template(f"{section.name}.html").render(**shared, **section.context)
+        )
+        for section in sections
+    }
+    moving = [section for section in sections if section.data is not None or section.places]
+    scripts = [*SHARED, *(f"{section.name}.js" for section in moving), "paper.js"]
+    return environment.get_template("page.html").render(
+        title=study.title,
+        study=study,
+        environments=environments,
+        sections=sections,
+        bodies=bodies,
+        is_sweep=any(one.sweeps or one.grids for one in report.series.environments),
+        data={name: packed(as_json(item)) for name, item in _data(report, sections).items()},
+        **frame(scripts),
+    )
+
+
+def _data(report: Report, sections: list[Section]) -> dict[str, Any]:
+    """What the scripts work with, by the name of its element."""
+    page = {
+        "agents": list(report.series.marks.values()),
+        "environments": [
+            {
+                "label": environment.environment,
+                "optimum": environment.optimum,
+                "optimum_at_least": environment.optimum_at_least,
+                "baseline": environment.baseline,
+                "agents": [agent.agent for agent in environment.agents],
+            }
+            for environment in report.analysis.environments
+        ],
+    }
+    data = {"page": page, **{section.name: section.data for section in sections}}
+    for section in sections:
+        data |= {f"{section.name}-{place}": item for place, item in enumerate(section.places)}
+    return {name: item for name, item in data.items() if item is not None}

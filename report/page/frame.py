@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from envs.layout import GridLayout
@@ -31,17 +31,18 @@ from report.words import interval_alone, number, optimum_words
 
 _WORD_ENDS = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[-_/:.])(?=\w)")
 
-STYLES = ("templates/parts.css", "templates/page.css", "templates/paper.css")
+STYLES = ("parts.css", "page.css", "paper.css")
 # Scripts that sections build on, before their own.
 SHARED = ("core.js", "exports.js", "figures.js", "tables.js")
 
 SIGNIFICANT = 5  # digits in the data of figures; a screen shows fewer
 
 
-def templates() -> Environment:
-    """The templates; whatever they are filled with is escaped, and control characters are."""
+def templates(folder: str = "") -> Environment:
+    """The templates, those of a folder first; whatever they are filled with is escaped."""
+    paths = [f"templates/{folder}", "templates"]
     environment = Environment(
-        loader=PackageLoader("report.page"),
+        loader=ChoiceLoader([PackageLoader("report.page", path) for path in paths]),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -59,15 +60,9 @@ def templates() -> Environment:
     return environment
 
 
-def template_file(name: str) -> str | None:
-    """The text of a file beside the templates, or None where there is none."""
-    file = files("report.page") / "templates" / name
-    return file.read_text(encoding="utf-8") if file.is_file() else None
-
-
-def package_file(name: str) -> str:
-    """The text of a file of this package."""
-    return (files("report.page") / name).read_text(encoding="utf-8")
+def template_file(name: str) -> str:
+    """The text of a file beside the templates."""
+    return (files("report.page") / "templates" / name).read_text(encoding="utf-8")
 
 
 def rounded(number: float) -> float | None:
@@ -118,14 +113,14 @@ def script_hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
-def frame(own: str) -> dict[str, str]:
-    """What a page with figures has: styles, scripts, its own one too, and the policy for these."""
+def frame(scripts: Sequence[str]) -> dict[str, str]:
+    """What a page with figures has: styles, its own scripts and others, the policy for these."""
     from plotly.offline import get_plotlyjs
 
-    early, start = package_file("templates/theme.js"), package_file("templates/start.js")
-    plotly = get_plotlyjs()
+    early, start = template_file("theme.js"), template_file("start.js")
+    own, plotly = "\n".join(map(template_file, scripts)), get_plotlyjs()
     return {
-        "style": Markup("\n".join(package_file(name) for name in STYLES)),  # noqa: S704  # our own
+        "style": Markup("\n".join(map(template_file, STYLES))),  # noqa: S704  # our own
         "early": inline_script(early),
         "plotly": packed(plotly),
         "own": inline_script(own),

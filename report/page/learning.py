@@ -15,7 +15,6 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from jinja2 import ChoiceLoader, PackageLoader
 from markupsafe import Markup
 from numpy.typing import NDArray
 from rich.console import Console
@@ -45,9 +44,9 @@ from report.page.frame import (
     first_runs,
     inline_script,
     layout_data,
-    package_file,
     packed,
     script_hash,
+    template_file,
     templates,
 )
 from safe_files.files import NO_LIMIT, UnsafeFileError, hold, read_file
@@ -263,17 +262,14 @@ def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]
 
 
 def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    early = package_file("templates/theme.js")
-    own = "\n".join(package_file(f"templates/learning/{name}") for name in SCRIPTS)
-    style = [package_file(f"templates/{name}") for name in ("page.css", "learning/learning.css")]
-    environment = templates()
-    environment.loader = ChoiceLoader(
-        [PackageLoader("report.page", "templates/learning"), PackageLoader("report.page")]
-    )
-    return environment.get_template("learning.html").render(
+    early = template_file("theme.js")
+    own = "\n".join(template_file(f"learning/{name}") for name in SCRIPTS)
+    style = f"{template_file('page.css')}\n{template_file('learning/learning.css')}"
+    template = templates("learning").get_template("learning.html")
+    return template.render(
         **words,
         data=packed(as_json(data, exactly)),
-        style=Markup("\n".join(style)),  # noqa: S704  # our own
+        style=Markup(style),  # noqa: S704  # our own
         early=inline_script(early),
         own=inline_script(own),
         policy=" ".join(map(script_hash, [early, own])),

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from jinja2 import ChoiceLoader, PackageLoader
 
 from pipeline.files import write_text
 from report.page.frame import (
@@ -20,7 +19,6 @@ from report.page.frame import (
     Section,
     as_json,
     frame,
-    package_file,
     packed,
     setting,
     templates,
@@ -310,30 +308,13 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
     trials = trials_of(record)
     shares = importances(trials)
     asked, retest = record["asked"] or {}, record["retest"]
-    sections = [
-        Section("verdict", "What was found"),
-        Section("history", "History", data=history(trials)),
-        Section("cost", "Cost"),
-        Section("trials", "All trials"),
-    ]
-    winner = None
-    if retest:
-        retested = {each["label"]: each for each in retest["settings"]}
-        winner = retested.get(retest["winner"])
-    if shares:
-        data = {"names": [*shares], "shares": [*shares.values()]}
-        sections.insert(2, Section("importances", "What matters", data=data))
-    if trials.judged and asked:
-        data = {**parallel(trials, shares), "winner": winner and winner["number"]}
-        sections.insert(2, Section("parallel", "Settings tried", data=data))
+    retested = {each["label"]: each for each in retest["settings"]} if retest else {}
+    winner = retested.get(retest["winner"]) if retest else None
+    sections = _sections(trials, shares, winner)
     data = {"page": {"agents": [], "environments": []}}
     data |= {section.name: section.data for section in sections if section.data}
-    environment = templates()
-    environment.loader = ChoiceLoader(
-        [PackageLoader("report.page", "templates/tuning"), PackageLoader("report.page")]
-    )
-    scripts = [*SHARED, "tuning/tuning.js", "paper.js"]
-    text = environment.get_template("tuning.html").render(
+    template = templates("tuning").get_template("tuning.html")
+    text = template.render(
         title=f"{asked.get('algo', 'an agent')} on {asked.get('env', 'an environment')}",
         record=record,
         asked=asked,
@@ -347,6 +328,23 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         rows=rows(trials),
         shares=shares,
         data={name: packed(as_json(item)) for name, item in data.items()},
-        **frame("\n".join(package_file(f"templates/{name}") for name in scripts)),
+        **frame([*SHARED, "tuning/tuning.js", "paper.js"]),
     )
     write_text(path, text)
+
+
+def _sections(
+    trials: Trials, shares: Mapping[str, float], winner: Mapping[str, Any] | None
+) -> list[Section]:
+    """What the page has, with the numbers of the figures."""
+    sections = [
+        Section("verdict", "What was found"),
+        Section("history", "History", data=history(trials)),
+    ]
+    if trials.judged and trials.record["asked"]:
+        lines = {**parallel(trials, shares), "winner": winner and winner["number"]}
+        sections.append(Section("parallel", "Settings tried", data=lines))
+    if shares:
+        bars = {"names": [*shares], "shares": [*shares.values()]}
+        sections.append(Section("importances", "What matters", data=bars))
+    return [*sections, Section("cost", "Cost"), Section("trials", "All trials")]

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from report.conclusions import conclusion
-from report.terminal import says_more, verdict_matrix
+from report.conclusions import conclusion, pairs_both_ways
+from report.terminal import says_more
 from verdicts import FailureCount, Summary
 
 MEANS = {"a": 100.0, "b": 90.0, "c": 80.0}
@@ -153,11 +153,13 @@ def test_what_is_open_is_in_one_sentence_for_each_agent(made_up):
 
 def test_the_matrix_has_each_pair_from_both_sides(made_up):
     place = place_of(made_up, {("a", "b"): "worse", ("b", "c"): "equivalent"})
-    assert verdict_matrix(place) == [
-        [None, "worse", None],
-        ["better", None, "equivalent"],
-        [None, "equivalent", None],
-    ]
+    verdicts = {names: pair.verdict for names, pair in pairs_both_ways(place).items()}
+    assert verdicts == {
+        ("a", "b"): "worse",
+        ("b", "a"): "better",
+        ("b", "c"): "equivalent",
+        ("c", "b"): "equivalent",
+    }
     assert says_more(place)
 
 

@@ -18,8 +18,7 @@ from experiments.looks import Look, LookLog, Looks, Question
 from report.conclusions import conclusion, pairs_both_ways
 from report.figures import line_style
 from report.films import MAX_BYTES, MAX_SIDE, film_of
-from report.page import result_sections, world_sections, write_report
-from report.page.assembly import SECTIONS, render
+from report.page import SECTIONS, render, result_sections, world_sections, write_report
 from report.page.frame import Report, breakable, inline_script, p_value, packed, plain, setting
 from report.series import (
     COLOURS,

@@ -15,7 +15,7 @@ from experiments.analysis import analyse
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.documents import MARKUPS, verdicts_as
 from report.page import write_report
-from report.page.frame import STYLES, package_file, templates
+from report.page.frame import STYLES, template_file, templates
 from report.page.tuning import write_tuning_page
 from report.series import agent_marks, study_series
 from tests.report.browsing import (
@@ -610,7 +610,7 @@ def wide_tables(tmp_path_factory):
             versions={},
         )
     )
-    style = "".join(package_file(name) for name in STYLES)
+    style = "".join(template_file(name) for name in STYLES)
     path = tmp_path_factory.mktemp("wide") / "wide.html"
     text = f"<!DOCTYPE html><meta charset=utf-8><style>{style}</style><main>"
     text += f"<section id=wide>{body}</section><section id=settings>{settings}</section>"
