@@ -91,18 +91,16 @@ def _on_equivalent(environment: EnvironmentAnalysis, group: Sequence[str]) -> st
 def _equivalent_groups(environment: EnvironmentAnalysis) -> list[list[str]]:
     """Agents of which every two are equivalent, in groups that hold all such pairs."""
     names = [agent.agent for agent in environment.agents]
-    pairs = [(p.first, p.second) for p in environment.pairs if p.verdict == "equivalent"]
+    pairs = pairs_both_ways(environment)
+    equal = [both for both, pair in pairs.items() if pair.verdict == "equivalent"]
     groups: list[list[str]] = []
-    for first, second in pairs:
-        if any(first in group and second in group for group in groups):
-            continue
-        group = [first, second]
-        for name in names:
-            if name not in group and all(
-                (name, member) in pairs or (member, name) in pairs for member in group
-            ):
-                group.append(name)
-        groups.append(sorted(group, key=names.index))
+    for pair in equal:
+        if not any(set(pair) <= set(group) for group in groups):
+            group = list(pair)
+            for name in names:
+                if all((name, member) in equal for member in group):
+                    group.append(name)
+            groups.append(sorted(group, key=names.index))
     return groups
 
 
@@ -200,9 +198,7 @@ def _on_ratios(environment: EnvironmentAnalysis, fastest: str) -> Iterable[str]:
 def _goal(environment: EnvironmentAnalysis) -> str:
     threshold, optimum, baseline = environment.threshold, environment.optimum, environment.baseline
     if threshold is not None and optimum is not None and baseline is not None:
-        share = (
-            (threshold - baseline) / (optimum - baseline) if optimum > baseline else float("nan")
-        )
+        share = (threshold - baseline) / (optimum - baseline) if optimum > baseline else 0.0
         if math.isclose(share, 0.95):
             return "a score of 0.95"
     return f"a return of {number(threshold)}"

@@ -105,7 +105,11 @@ def _print_ranking(
     else:
         rows = [Row(agent, environment) for agent in environment.agents]
         columns = [column for column in COLUMNS if column.terminal]
-        left_out = _print_fitting(console, _title(environment), columns, rows)
+        title = label
+        if environment.optimum is not None:
+            title += f": optimum {optimum_words(environment.optimum, environment.optimum_at_least)}"
+            title += f", best random or constant policy {number(environment.baseline)}"
+        left_out = _print_fitting(console, title, columns, rows)
         explained = _caption(analysis.study, environment, left_out)
     if left_out:
         explained.append(f"a wider terminal shows {enumeration(left_out)} too")
@@ -144,38 +148,22 @@ def _table(
     return table
 
 
-def _title(environment: EnvironmentAnalysis) -> str:
-    title = environment.environment
-    if environment.optimum is not None:
-        title += f": optimum {optimum_words(environment.optimum, environment.optimum_at_least)}"
-        title += f", best random or constant policy {number(environment.baseline)}"
-    return title
-
-
 def _caption(
     study: StudySpec, environment: EnvironmentAnalysis, left_out: Sequence[str]
 ) -> list[str]:
-    n_seeds = seeds_of(study, environment)
-    metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals over {n_seeds}"
     rows = [Row(agent, environment) for agent in environment.agents]
-    explained = [
-        column
-        for column in COLUMNS
-        if column.terminal and column.caption and column.terminal not in left_out
-    ]
     on_variant = any(agent.on_variant for agent in environment.agents)
     words = {
         "threshold": number(environment.threshold),
         "variants": " (*: on a variant of the environment)" if on_variant else "",
     }
     means = ", ".join(name for name in ("mean", "IQM") if name not in left_out)
-    return [
-        f"{means}: {metric}",
-        *(
-            f"{column.terminal}: {column.caption.format(**words)}"
-            for column, _ in filled(explained, rows)
-        ),
-    ]
+    metric = f"{METRIC_WORDS[study.metric]}, with 95 % intervals"
+    told = [f"{means}: {metric} over {seeds_of(study, environment)}"]
+    for column, _ in filled(COLUMNS, rows):
+        if column.terminal and column.caption and column.terminal not in left_out:
+            told.append(f"{column.terminal}: {column.caption.format(**words)}")
+    return told
 
 
 def _bandit_caption(study: StudySpec, left_out: Sequence[str]) -> list[str]:
@@ -194,14 +182,13 @@ def print_episodes_table(console: Console, table: pd.DataFrame, width: int) -> N
         title = f"{environment}: return per {width} episodes (average, min, max; all seeds)"
         left = list(dict.fromkeys(rows["agent"]))
         while left:
-            shown = len(left)
-            while shown > 1 and _width(console, _episodes(title, rows, left[:shown])) > (
-                console.width
-            ):
-                shown -= 1
+            for n in range(len(left), 0, -1):
+                printed = _episodes(title, rows, left[:n])
+                if _width(console, printed) <= console.width:
+                    break
             console.print()
-            console.print(_episodes(title, rows, left[:shown]))
-            left = left[shown:]
+            console.print(printed)
+            left = left[n:]
 
 
 def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
@@ -209,16 +196,14 @@ def _episodes(title: str, rows: pd.DataFrame, agents: Sequence[str]) -> Table:
     printed.add_column("episode", justify="right")
     for agent in agents:
         printed.add_column(str(agent), justify="right", overflow="fold")
-    by_episode = rows.set_index(["episode", "agent"])
+    cells = {
+        (row["episode"], row["agent"]): "  ".join(
+            number(row[name]) for name in ("average", "minimum", "maximum")
+        )
+        for _, row in rows.iterrows()
+    }
     for episode in sorted(set(rows["episode"])):
-        cells = []
-        for agent in agents:
-            if (episode, agent) not in by_episode.index:
-                cells.append("-")
-                continue
-            row = by_episode.loc[(episode, agent)]
-            cells.append("  ".join(number(row[c]) for c in ("average", "minimum", "maximum")))
-        printed.add_row(f"{episode:,}", *cells)
+        printed.add_row(f"{episode:,}", *(cells.get((episode, agent), "-") for agent in agents))
     return printed
 
 
@@ -268,7 +253,9 @@ def sentences(comparison: Comparison) -> list[str]:
     """
     given = [row for row in comparison.rows if row.is_given]
     alternatives = [row for row in comparison.rows if not row.is_given]
-    alternative, leader = max(alternatives, key=_value), max(given, key=_value)
+    alternative, leader = (
+        max(rows, key=lambda row: row.terms.doubly_robust.mean()) for rows in (alternatives, given)
+    )
     n_pairs = len(given) * len(alternatives) + math.comb(len(given), 2)
     pairs = [(row, alternative) for row in given]
     pairs += [(leader, row) for row in given if row is not leader]
@@ -315,7 +302,3 @@ def _decimals(estimate: Estimate) -> int:
     if not half > 0:
         return SHORT
     return min(max(1 - math.floor(math.log10(half)), 0), MOST_DECIMALS)
-
-
-def _value(row: Judged) -> float:
-    return float(row.terms.doubly_robust.mean())

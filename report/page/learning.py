@@ -6,7 +6,6 @@ import json
 import math
 import shutil
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Executor
 from dataclasses import replace
 from functools import cache, partial
 from hashlib import sha256
@@ -50,10 +49,6 @@ from report.page.frame import (
     templates,
 )
 from safe_files.files import NO_LIMIT, UnsafeFileError, hold, read_file
-
-# What the page says of itself: what it shows, and what it leaves out.
-
-NO_WORDS = {"kind": "", "extent": "", "note": ""}
 
 
 def page_words(spec: TrainSpec, data: Mapping[str, Any]) -> dict[str, str]:
@@ -210,15 +205,7 @@ def _layout_of(env: Any, n_states: int) -> GridLayout | None:
 # The page as one file: it needs nothing else and no network.
 
 MOST_BYTES = 2_900_000
-SCRIPTS = (
-    "learning_replay.js",
-    "learning_board.js",
-    "learning_readout.js",
-    "learning_curves.js",
-    "learning_steps.js",
-    "learning_maps.js",
-    "learning_player.js",
-)
+SCRIPTS = ("replay", "board", "readout", "curves", "steps", "maps", "player")
 
 
 def write_learning_page(
@@ -242,7 +229,8 @@ def write_learning_page(
 @cache
 def page_version() -> str:
     """A digest of all that a page is made of but the data."""
-    return sha256(_render({"title": "", "seed": 0, **NO_WORDS}, {}).encode()).hexdigest()
+    words = dict.fromkeys(("title", "seed", "kind", "extent", "note"), "")
+    return sha256(_render(words, {}).encode()).hexdigest()
 
 
 def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]]:
@@ -263,7 +251,7 @@ def _ever_less(recorder: TableRecorder | MapRecorder) -> Iterator[dict[str, Any]
 
 def _render(words: Mapping[str, Any], data: Mapping[str, Any]) -> str:
     early = template_file("theme.js")
-    own = "\n".join(template_file(f"learning/{name}") for name in SCRIPTS)
+    own = "\n".join(template_file(f"learning/learning_{name}.js") for name in SCRIPTS)
     style = f"{template_file('page.css')}\n{template_file('learning/learning.css')}"
     template = templates("learning").get_template("learning.html")
     return template.render(
@@ -340,7 +328,11 @@ def write_first_pages(
     if to_do:
         limits = RunLimits(study.run_timeout, study.run_memory)
         with local_executor(n_workers) as executor:
-            kept |= _trained_again(executor, root, to_do, limits, tell)
+            futures = [executor.submit(_watched, root, run, limits) for run in to_do]
+            for n, (run, future) in enumerate(zip(to_do, futures, strict=True), start=1):
+                what = f"{run.agent} on {run.environment}"
+                tell(f"training again to be watched, {n} of {len(to_do)}: {what}")
+                kept[run.path] = future.result()
     pages = [page for page in kept.values() if page is not None]
     there = {(page.agent, page.environment) for page in pages}
     batches = {(run.agent, run.environment) for run in analysis.results.finished if run.is_batch}
@@ -351,15 +343,6 @@ def write_first_pages(
             reason = BATCH if is_batch else "no run of it has finished"
             pages.append(LearningPage(agent, environment, 0, "", reason))
     return pages
-
-
-def _trained_again(
-    executor: Executor, root: Path, runs: list[PlannedRun], limits: RunLimits, tell: Tell
-) -> Iterator[tuple[Path, LearningPage]]:
-    futures = [executor.submit(_watched, root, run, limits) for run in runs]
-    for n, (run, future) in enumerate(zip(runs, futures, strict=True), start=1):
-        tell(f"training again to be watched, {n} of {len(runs)}: {run.agent} on {run.environment}")
-        yield run.path, future.result()
 
 
 def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
@@ -386,11 +369,7 @@ def _watched(root: Path, run: PlannedRun, limits: RunLimits) -> LearningPage:
 
 
 def _train_again(planned: PlannedRun, path: Path, folder: Path) -> str:
-    """Train in ``folder`` and write the page of it; what that shows, in words.
-
-    Raises:
-        UserError: if the agent cannot be watched, or has become another one than that of the run.
-    """
+    """Train in ``folder`` and write the page of it; what that shows, in words."""
     hold(path.parents[2])  # the study
     import_again(planned.spec.user_modules)
     spec = replace(planned.spec, log_folder=folder, tensorboard_log=None, watch_learning=path)
