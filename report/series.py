@@ -437,13 +437,10 @@ def run_series(results: StudyResults, environment: EnvironmentAnalysis) -> RunSe
 def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Sweep]:
     """By agent that was swept over one parameter, the means in the order of its values."""
     found: dict[str, Sweep] = {}
-    means = _means(environment)
+    means = {agent.agent: agent.metric.mean for agent in environment.agents}
     for (group, name), members in _groups(agents, environment, 1).items():
-        by_value = {
-            float(one.swept[name]): one.label
-            for one in members
-            if isinstance(one.swept[name], int | float)
-        }
+        numbers = [(one.swept[name], one.label) for one in members]
+        by_value = {float(x): label for x, label in numbers if isinstance(x, int | float)}
         if len(by_value) >= LEAST_VALUES:
             x, labels = zip(*sorted(by_value.items()), strict=True)
             rows = [(e.point, e.low, e.high) for e in map(means.__getitem__, labels)]
@@ -454,13 +451,11 @@ def sweeps(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dic
 def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict[str, Grid]:
     """By agent that was swept over two parameters, the means over the values of both."""
     found: dict[str, Grid] = {}
-    means = _means(environment)
+    means = {agent.agent: agent.metric.mean for agent in environment.agents}
     for (group, *names), members in _groups(agents, environment, 2).items():
         down, across = ([str(one.swept[name]) for one in members] for name in names)
         rows, columns = list(dict.fromkeys(down)), list(dict.fromkeys(across))
-        at = {
-            (row, column): one.label for row, column, one in zip(down, across, members, strict=True)
-        }
+        at = dict(zip(zip(down, across, strict=True), (one.label for one in members), strict=True))
         labels = [[at.get((row, column), "") for column in columns] for row in rows]
         if len(rows) > 1 and len(columns) > 1:
             points = [[means[at].point if at else np.nan for at in row] for row in labels]
@@ -471,15 +466,9 @@ def grids(agents: Sequence[AgentSpec], environment: EnvironmentAnalysis) -> dict
 
 def best_of(environment: EnvironmentAnalysis, labels: Sequence[str]) -> list[str]:
     """Those of these agents that have the best mean."""
-    found = [agent for agent in environment.agents if agent.agent in labels]
-    means = {agent.agent: agent.metric.mean.point for agent in found}
-    return [
-        label for label, mean in means.items() if math.isclose(mean, found[0].metric.mean.point)
-    ]
-
-
-def _means(environment: EnvironmentAnalysis) -> dict[str, Estimate]:
-    return {agent.agent: agent.metric.mean for agent in environment.agents}
+    means = {a.agent: a.metric.mean.point for a in environment.agents if a.agent in labels}
+    best = next(iter(means.values()), math.nan)
+    return [label for label, mean in means.items() if math.isclose(mean, best)]
 
 
 def _groups(
@@ -487,7 +476,7 @@ def _groups(
 ) -> dict[tuple[str, ...], list[AgentSpec]]:
     """By label and parameters of each sweep over so many, its agents that have a mean there."""
     groups: dict[tuple[str, ...], list[AgentSpec]] = {}
-    there = _means(environment)
+    there = {agent.agent for agent in environment.agents}
     for spec in agents:
         if len(spec.swept) == n_parameters and spec.label in there:
             groups.setdefault((spec.group, *spec.swept), []).append(spec)

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from importlib.resources import files
 from typing import Any
-from urllib.parse import quote
 
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
@@ -160,11 +159,6 @@ class LearningPage:
     words: str  # what it shows, or why there is none
     size: int = 0  # of the file, in bytes
 
-    @property
-    def link(self) -> str:
-        """The place as an address."""
-        return quote(self.place)
-
 
 @dataclass(frozen=True)
 class Report:
@@ -200,23 +194,15 @@ class Section:
 
 
 def first_runs(analysis: StudyAnalysis) -> list[list[PlannedRun]]:
-    """The first run of each agent that has finished, for each environment.
-
-    A batch leaves no agent.
-    """
+    """By environment, the first finished run of each agent; a batch leaves no agent."""
     first: dict[tuple[str, str], PlannedRun] = {}
     for run in analysis.results.finished:
-        is_new = (run.agent, run.environment) not in first
-        if is_new and not run.is_batch:
-            first[run.agent, run.environment] = run
-    return [
-        [
-            first[agent.agent, environment.environment]
-            for agent in environment.agents
-            if (agent.agent, environment.environment) in first
-        ]
-        for environment in analysis.environments
-    ]
+        if not run.is_batch:
+            first.setdefault((run.agent, run.environment), run)
+    ranked = (
+        [(agent.agent, one.environment) for agent in one.agents] for one in analysis.environments
+    )
+    return [[first[name] for name in names if name in first] for names in ranked]
 
 
 def layout_data(layout: GridLayout) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -36,8 +37,11 @@ class Trials:
     """What a tuning has tried."""
 
     record: Mapping[str, Any]  # what the tuning wrote down, see `tuning.retesting`
-    # The trials that have ended, in their order, as they stand there.
-    ended: tuple[Mapping[str, Any], ...]
+
+    @cached_property
+    def ended(self) -> list[Mapping[str, Any]]:
+        """The trials that have ended, in their order, as they stand there."""
+        return [t for t in self.record["trials"] if t["state"] in {"complete", "pruned", "fail"}]
 
     @property
     def is_cost(self) -> bool:
@@ -51,10 +55,10 @@ class Trials:
 
     @property
     def best_first(self) -> list[Mapping[str, Any]]:
-        """Those that have all their seeds, the best first, the earlier where they are equal."""
+        """Those that have all their seeds, the best first, and then the others."""
         whole = [trial for trial in self.judged if kind(trial) == COMPLETE]
-        sign = 1 if self.is_cost else -1
-        return sorted(whole, key=lambda trial: (sign * trial["value"], trial["number"]))
+        whole.sort(key=lambda trial: trial["value"], reverse=not self.is_cost)
+        return whole + [trial for trial in self.ended if trial not in whole]
 
     def distributions(self) -> dict[str, BaseDistribution]:
         """What each parameter was drawn from."""
@@ -62,12 +66,6 @@ class Trials:
 
         space = (self.record.get("asked") or {}).get("search_space", {})
         return {name: json_to_distribution(text) for name, text in space.items()}
-
-
-def trials_of(record: Mapping[str, Any]) -> Trials:
-    """The trials of a record that have ended."""
-    ended = tuple(t for t in record["trials"] if t["state"] in {"complete", "pruned", "fail"})
-    return Trials(record, ended)
 
 
 def kind(trial: Mapping[str, Any]) -> str:
@@ -217,7 +215,7 @@ def _said(value: Any) -> str:
     return number(value) if is_number else setting(value)
 
 
-# The tables: what changed, the cost, all trials.
+# The tables: what changed, and the cost.
 
 LEFT_OUT = "-"
 
@@ -276,24 +274,6 @@ def _duration(seconds: float | None) -> str:
     return f"{minutes:.0f} min" if minutes < 90 else f"{hours:.1f} h"
 
 
-def rows(trials: Trials) -> list[dict[str, Any]]:
-    """All trials, the best first, then those that have not all their seeds."""
-    ranked = trials.best_first
-    return [
-        {
-            "number": trial["number"],
-            "kind": kind(trial),
-            "is_whole": kind(trial) == COMPLETE,
-            "value": trial["value"] if trial["figures"] else None,
-            "n_seeds": len(trial["figures"]),
-            "seconds": trial["seconds"],
-            "failure": trial["failure"] or "",
-            "params": ", ".join(f"{name} {_said(at)}" for name, at in trial["params"].items()),
-        }
-        for trial in [*ranked, *(trial for trial in trials.ended if trial not in ranked)]
-    ]
-
-
 # The page as one file, in the frame of a study's page.
 
 
@@ -305,7 +285,7 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         path: the file, which is replaced.
         retest_page: the page of the re-test as seen from there; empty where there is none.
     """
-    trials = trials_of(record)
+    trials = Trials(record)
     shares = importances(trials)
     asked, retest = record["asked"] or {}, record["retest"]
     retested = {each["label"]: each for each in retest["settings"]} if retest else {}
@@ -325,7 +305,9 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         changes=[] if winner is None else changes(trials, winner["number"]),
         n_params=len(trials.distributions()),
         cost=cost(trials),
-        rows=rows(trials),
+        trials=trials.best_first,
+        kind=kind,
+        said=_said,
         shares=shares,
         data={name: packed(as_json(item)) for name, item in data.items()},
         **frame([*SHARED, "tuning/tuning.js", "paper.js"]),

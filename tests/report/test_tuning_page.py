@@ -7,19 +7,18 @@ import optuna
 import pytest
 
 from report.page.tuning import (
+    Trials,
     changes,
     cost,
     history,
     importances,
     parallel,
-    rows,
-    trials_of,
     write_tuning_page,
 )
 
 
 def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
-    shown = history(trials_of(tuning_record))
+    shown = history(Trials(tuning_record))
     assert shown["numbers"] == [0, 1, 2, 3, 4, 6]
     assert shown["best"] == [0.6, 0.6, 0.8, 0.8, 0.8, 0.8]
     assert shown["values"]["judged on all seeds"] == [0.6, None, 0.8, 0.7, None, None]
@@ -32,13 +31,13 @@ def test_the_history_has_the_best_of_those_with_all_seeds(tuning_record):
 
 def test_a_cost_is_the_better_the_lower(tuning_record):
     tuning_record["lower_is_better"] = True
-    trials = trials_of(tuning_record)
+    trials = Trials(tuning_record)
     assert history(trials)["best"] == [0.6, 0.6, 0.6, 0.6, 0.6, 0.6]
-    assert [each["number"] for each in trials.best_first] == [0, 3, 2]
+    assert [each["number"] for each in trials.best_first] == [0, 3, 2, 1, 4, 6]
 
 
 def test_lines_run_through_the_parameters_between_their_ends(tuning_record):
-    shown = parallel(trials_of(tuning_record), {"steps": 1.0})
+    shown = parallel(Trials(tuning_record), {"steps": 1.0})
     assert [axis["name"] for axis in shown["axes"]] == ["steps", "rate", "kind"]
     assert shown["axes"][2]["ticks"] == [(1 / 6, "a"), (0.5, "null"), (5 / 6, "true")]
     lines = {line["number"]: line for line in shown["lines"]}
@@ -51,20 +50,20 @@ def test_lines_run_through_the_parameters_between_their_ends(tuning_record):
     assert [line["number"] for line in shown["lines"]] == [1, 0, 3, 6, 2]
     assert [line["group"] for line in shown["lines"]] == [0, 1, 2, 3, 4]
     del tuning_record["trials"][0]["params"]["rate"]
-    (first,) = [x for x in parallel(trials_of(tuning_record), {})["lines"] if x["number"] == 0]
+    (first,) = [x for x in parallel(Trials(tuning_record), {})["lines"] if x["number"] == 0]
     assert (first["at"][0], first["said"][0]) == (None, "not there")
 
 
 def test_the_parameter_that_decides_matters_most(tuning_record, tuning_trial):
     rng = optuna.samplers.RandomSampler(0)
     study = optuna.create_study(sampler=rng)
-    space = trials_of(tuning_record).distributions()
+    space = Trials(tuning_record).distributions()
     drawn = [study.ask(space).params for _ in range(60)]
     tuning_record["trials"] = [
         tuning_trial(number, -abs(params["steps"] - 3), {"1": 0.0}, **params)
         for number, params in enumerate(drawn)
     ]
-    shares = importances(trials_of(tuning_record))
+    shares = importances(Trials(tuning_record))
     assert next(iter(shares)) == "steps"
     assert shares["steps"] > 0.7
     assert sum(shares.values()) == pytest.approx(1.0)
@@ -73,16 +72,16 @@ def test_the_parameter_that_decides_matters_most(tuning_record, tuning_trial):
 def test_a_parameter_that_one_trial_alone_has_is_no_reason_to_warn(tuning_record):
     for trial in tuning_record["trials"][1:]:
         trial["params"].pop("rate", None)
-    assert importances(trials_of(tuning_record)).keys() <= {"steps", "kind"}
+    assert importances(Trials(tuning_record)).keys() <= {"steps", "kind"}
 
 
 def test_where_all_are_alike_nothing_matters(tuning_record, tuning_trial):
     tuning_record["trials"] = [tuning_trial(n, 0.5, {"1": 0.5}) for n in range(5)]
-    assert importances(trials_of(tuning_record)) == {}
+    assert importances(Trials(tuning_record)) == {}
 
 
 def test_the_cost_is_counted(tuning_record):
-    assert cost(trials_of(tuning_record)) == [
+    assert cost(Trials(tuning_record)) == [
         ("Trials", "6 of 10"),
         ("Ended early", "2"),
         ("Failed", "1"),
@@ -96,15 +95,12 @@ def test_the_cost_is_counted(tuning_record):
 
 
 def test_tables_have_what_changed_and_all_trials(tuning_record):
-    trials = trials_of(tuning_record)
+    trials = Trials(tuning_record)
     assert [change._asdict() for change in changes(trials, 2)] == [
         {"name": "learning_rate", "shipped": "0", "found": "2"},
         {"name": "tau", "shipped": "-", "found": "1.0"},
     ]
-    table = rows(trials)
-    assert [row["number"] for row in table] == [2, 3, 0, 1, 4, 6]
-    assert table[0]["params"] == "rate 0.1, kind null, steps 3"
-    assert (table[4]["value"], table[4]["failure"]) == (None, "it broke")
+    assert [trial["number"] for trial in trials.best_first] == [2, 3, 0, 1, 4, 6]
 
 
 def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
@@ -118,6 +114,8 @@ def test_the_page_is_one_file_that_says_what_won(tuning_record, tmp_path):
     assert "and 1 of its 4 runs failed. Its settings are in" in text
     assert "looked better in the search than on other seeds, by 0.1" in text
     assert 'href="retest/report.html"' in text
+    assert ">rate 0.1, kind null, steps 3<" in text
+    assert "<small>it broke</small>" in text
     assert "python tune.py &lt;script&gt;" in text
     assert re.findall(r'(?:src|href)="(?!#|data:|retest/)[^"]*"', text) == []
 
