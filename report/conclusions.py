@@ -367,15 +367,11 @@ def _where_the_median_differs(study: StudySpec, environment: EnvironmentAnalysis
 def none_has_learnt(study: StudySpec, environment: EnvironmentAnalysis) -> bool:
     """Whether the typical run of every agent is no better than acting at random."""
     baseline, optimum = environment.baseline, environment.optimum
-    if (
-        study.metric not in ON_THE_SCALE
-        or baseline is None
-        or optimum is None
-        or optimum <= baseline
-    ):
+    if study.metric not in ON_THE_SCALE or baseline is None or optimum is None:
         return False
     reach = baseline + environment.margin
-    return all(agent.metric.median.point <= reach for agent in environment.agents)
+    medians = [agent.metric.median.point for agent in environment.agents]
+    return optimum > baseline and all(median <= reach for median in medians)
 
 
 def _on_other_tasks(environment: EnvironmentAnalysis) -> Iterable[str]:

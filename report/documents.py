@@ -20,7 +20,6 @@ from pipeline.errors import visible
 from pipeline.files import replacing, write_text
 from report.conclusions import conclusion, none_has_learnt, on_changes, pairs_both_ways
 from report.words import enumeration, interval, number, seed_sentence, seeds
-from verdicts import Verdict
 
 # The languages by the suffix of their files, which their templates have too.
 Markup = Literal["md", "tex"]
@@ -124,17 +123,7 @@ def _templates(markup: Markup) -> Environment:
 
 # A study as Markdown or LaTeX, to stand in a page or a paper: verdicts, failures and cost.
 
-# Against the agent whose median run is the highest: shown equivalent or itself, undecided, worse.
-Standing = Literal["best", "open", "behind"]
-
 NOTHING = "-"
-
-_SEEN_BY_THE_LEADER: dict[Verdict, Standing] = {
-    "equivalent": "best",
-    "worse": "best",
-    "undecided": "open",
-    "better": "behind",
-}
 
 
 class Cell(NamedTuple):
@@ -254,8 +243,8 @@ def _median_score(study: StudySpec, agent: AgentAnalysis) -> str:
     return "" if study.metric != "final" or score is None or math.isnan(score) else f"{score:.3f}"
 
 
-def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, Standing]:
-    """How each agent stands against the one whose median run is the best.
+def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, str]:
+    """Each agent against the one whose median run is the best: ``best``, ``open`` or ``behind``.
 
     Empty where no agent has learnt anything, or there is no figure.
     """
@@ -264,11 +253,12 @@ def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, S
     if not known or none_has_learnt(study, environment):
         return {}
     leader = max(known, key=lambda agent: sign * agent.metric.median.point).agent
-    found: dict[str, Standing] = {leader: "best"}
-    for (first, second), pair in pairs_both_ways(environment).items():
-        if first == leader:
-            found[second] = _SEEN_BY_THE_LEADER[pair.verdict]
-    return found
+    words = {"undecided": "open", "better": "behind"}
+    return {leader: "best"} | {
+        second: words.get(pair.verdict, "best")
+        for (first, second), pair in pairs_both_ways(environment).items()
+        if first == leader
+    }
 
 
 def _ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:

@@ -679,7 +679,8 @@ def _bandit_figures(files: FigureFiles, pulls: PullSeries, place: str, marks: Ma
     if len(pulls.pulls) <= MOST_LINES:
         with files.figure(f"{name}_pulls", n_rows=2) as (upper, lower):
             draw_rewards(upper, lower, pulls, place, marks)
-        with files.figure(f"{name}_regret", n_rows=1 + pulls.has_simple_regret) as (upper, *others):
+        has_simple = any(np.isfinite(p.simple_regret).any() for p in pulls.pulls.values())
+        with files.figure(f"{name}_regret", n_rows=1 + has_simple) as (upper, *others):
             draw_regret(upper, pulls, place, marks)
             for axes in others:
                 draw_simple_regret(axes, pulls, marks)

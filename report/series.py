@@ -297,11 +297,6 @@ class PullSeries:
         """How many runs the figures are over."""
         return len(next(iter(self.pulls.values())).total_reward)
 
-    @property
-    def has_simple_regret(self) -> bool:
-        """Whether some agent has a simple regret."""
-        return any(np.isfinite(found.simple_regret).any() for found in self.pulls.values())
-
 
 def pull_series(results: StudyResults, environment: EnvironmentAnalysis) -> PullSeries | None:
     """What there is to draw of an environment; None where it is no bandit."""

@@ -1,4 +1,4 @@
-"""How much of the promised error rate each look at a growing study may spend."""
+"""How much of the promised error rate each look may spend. Apart, for it is needed without SciPy."""
 
 from __future__ import annotations
 

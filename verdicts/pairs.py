@@ -160,8 +160,7 @@ def _verdict(
 def apart_beyond(first: Floats, second: Floats, margin: float, level: float) -> bool:
     """Whether one agent is ahead by more than the margin more often than the other is.
 
-    The sign test, on two sides, over runs in the order of their seeds, those within the margin left
-    out.
+    The sign test, on two sides, over runs in the order of their seeds.
     """
     n = min(len(first), len(second))
     apart = differences(first[:n], second[:n])

@@ -142,11 +142,7 @@ def equivalent_p_value(first: Floats, second: Floats, margin: float) -> float:
 
 
 def rank_sum_p_value(first: Floats, second: Floats) -> float:
-    """The chance of ranks as high as those of ``first`` if both have the same distribution.
-
-    Given the scores that there are, ties and all: every split of them between the two agents is
-    equally likely.
-    """
+    """The chance of ranks as high as those of ``first`` if every split of the scores is as likely."""
     ranks, ties = doubled_ranks(np.concatenate([first, second]))
     found = int(ranks[: len(first)].sum())
     if len(ranks) <= MOST_COUNTED:
@@ -187,10 +183,7 @@ def wins_of(values: Floats, others: Floats) -> Floats:
 
 
 def doubled_ranks(scores: Floats) -> tuple[Floats, tuple[int, ...]]:
-    """Twice the rank of each score, which is whole also for ties, and how many share each rank.
-
-    Scores that agree to twelve digits are equal.
-    """
+    """Twice the rank of each score, which is whole also for ties, and how many share each rank."""
     order = np.argsort(scores, kind="stable")
     ordered = scores[order]
     new = np.diff(ordered) > SAME * np.maximum(np.abs(ordered[1:]), np.abs(ordered[:-1]))
@@ -268,10 +261,7 @@ def typical_difference(first: Floats, second: Floats, level: float) -> Estimate:
 
 @lru_cache(maxsize=4096)
 def interval_places(n: int, m: int, level: float) -> tuple[int, int] | None:
-    """Where, among the n m ordered differences, the interval of the typical one begins and ends.
-
-    None where the seeds are too few for the level.
-    """
+    """Where the interval of the typical one of n m differences ends; None for too few seeds."""
     if 0.5 ** min(n, m) > level:
         return None
     if n + m <= MOST_COUNTED:

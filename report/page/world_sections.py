@@ -119,11 +119,17 @@ def policies(report: Report) -> Section | None:
 def _policy_data(
     analysis: StudyAnalysis, environment: EnvironmentAnalysis, room: int
 ) -> dict[str, Any] | None:
-    runs = _recorded_runs(analysis, environment)
+    order = [agent.agent for agent in environment.agents]
+    runs = [
+        run
+        for run in analysis.results.finished
+        if run.environment == environment.environment and run.run.value_maps_path.exists()
+    ]
     if not runs:
         return None
-    first = runs[0]
-    env = make_single_env(first.spec)
+    # Those of one seed together, and the best agent first.
+    runs.sort(key=lambda run: (run.seed, order.index(run.agent)))
+    env = make_single_env(runs[0].spec)
     try:
         layout, model = grid_layout(env), transition_model(env)
     finally:
@@ -155,17 +161,6 @@ def _policy_data(
     }
 
 
-def _recorded_runs(analysis: StudyAnalysis, environment: EnvironmentAnalysis) -> list[PlannedRun]:
-    """The runs with maps, those of one seed together and the best agent first."""
-    order = [agent.agent for agent in environment.agents]
-    runs = [
-        run
-        for run in analysis.results.finished
-        if run.environment == environment.environment and run.run.value_maps_path.exists()
-    ]
-    return sorted(runs, key=lambda run: (run.seed, order.index(run.agent)))
-
-
 def _read_maps(
     runs: Sequence[PlannedRun], layout: GridLayout, room: int
 ) -> dict[tuple[str, int], Arrays]:
@@ -176,7 +171,11 @@ def _read_maps(
     maps: dict[tuple[str, int], Arrays] = {}
     figures = 0
     for run in runs:
-        arrays = _read(run, n_maps)
+        arrays = read_value_maps(run.run)
+        n = len(arrays["timesteps"])
+        if n > n_maps:  # the first and the last among them
+            kept = np.linspace(0, n - 1, n_maps).round().astype(np.int64)
+            arrays |= {name: arrays[name][kept] for name in ("timesteps", "values", "actions")}
         if arrays["optimal_actions"].shape != (layout.n_states, len(layout.moves)):
             continue  # an agent that was given another map
         figures += 2 * arrays["values"].size
@@ -185,16 +184,6 @@ def _read_maps(
             return {key: found for key, found in maps.items() if key[1] != run.seed}
         maps[run.agent, run.seed] = arrays
     return maps
-
-
-def _read(run: PlannedRun, n_maps: int) -> Arrays:
-    """The maps of a run, at so many moments at most, the first and the last among them."""
-    arrays = read_value_maps(run.run)
-    n = len(arrays["timesteps"])
-    if n > n_maps:
-        kept = np.linspace(0, n - 1, n_maps).round().astype(np.int64)
-        arrays |= {name: arrays[name][kept] for name in ("timesteps", "values", "actions")}
-    return arrays
 
 
 def _digits(numbers: NDArray[Any]) -> str:
