@@ -1,4 +1,4 @@
-"""How much of the promised error rate each look may spend. Apart, for it is needed without SciPy."""
+"""How much of the promised error rate each look may spend: apart, so that SciPy is not loaded."""
 
 from __future__ import annotations
 
