@@ -409,7 +409,7 @@ def draw_learning_curves(
     for place, (kind, by) in zip(places, panels(curves), strict=True):
         found = curves[kind]
         # Before the lines: limits are chosen on the scale that there is.
-        _set_scale(place, found.linear_up_to)
+        words = _set_scale(place, found.linear_up_to)
         _draw_curves(place, found.by_axis[by], marks)
         for agent, curve in found.by_axis[by].items():
             if agent in found.on_variant:
@@ -424,7 +424,7 @@ def draw_learning_curves(
             n = len(found.on_variant)
             names = found.on_variant[0] if n == 1 else f"{n} agents"
             title += f" ({names}: on a variant of the environment)"
-        lettering(place, title=title, x=_AXES[by], y=f"return{_beyond(found.linear_up_to)}")
+        lettering(place, title=title, x=_AXES[by], y=f"return{words}")
         place.xaxis.set_major_formatter(EngFormatter(sep=""))
         title = ""
     if curves["training"].on_variant:
@@ -443,20 +443,17 @@ def _draw_curves(axes: Axes, curves: Mapping[str, Curve], marks: Marks) -> None:
             fill_band(axes, curve, marks[agent])
 
 
-def _beyond(linear_up_to: float | None) -> str:
-    """What the name of an axis says of its scale."""
-    return "" if linear_up_to is None else f" (log scale beyond ±{number(linear_up_to)})"
-
-
-def _set_scale(axes: Axes, linear_up_to: float | None) -> None:
-    """Make the upright axis logarithmic where early returns dwarf those that matter."""
-    if linear_up_to is not None:
-        axes.set_yscale("symlog", linthresh=linear_up_to)
-        axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
-        axes.yaxis.set_minor_locator(NullLocator())
-        # With the minus sign that Matplotlib's own axes have.
-        signed = FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
-        axes.yaxis.set_major_formatter(signed)
+def _set_scale(axes: Axes, linear_up_to: float | None) -> str:
+    """Make the upright axis logarithmic beyond a value, if any; what the axis's name says then."""
+    if linear_up_to is None:
+        return ""
+    axes.set_yscale("symlog", linthresh=linear_up_to)
+    axes.yaxis.set_major_locator(FixedLocator(symlog_ticks(linear_up_to)))
+    axes.yaxis.set_minor_locator(NullLocator())
+    # With the minus sign that Matplotlib's own axes have.
+    signed = FuncFormatter(lambda value, _: number(value).replace("-", "\N{MINUS SIGN}"))
+    axes.yaxis.set_major_formatter(signed)
+    return f" (log scale beyond ±{number(linear_up_to)})"
 
 
 def _draw_references(axes: Axes, environment: EnvironmentAnalysis) -> None:
@@ -584,11 +581,11 @@ def _brief(text: str) -> str:
 def draw_blocks(axes: Axes, rows: pd.DataFrame, mark: Mark) -> None:
     """Average, minimum and maximum of each block of an agent's episodes."""
     scale = linear_up_to([rows[column].to_numpy(float) for column in BLOCKS], None)
-    _set_scale(axes, scale)
+    words = _set_scale(axes, scale)
     colour = COLOURS[mark.colour]
     for column, style in BLOCKS.items():
         axes.plot(rows["episode"], rows[column], style, marker="o", markersize=3, color=colour)
-    lettering(axes, title=mark.label, x="episode", y=f"return{_beyond(scale)}")
+    lettering(axes, title=mark.label, x="episode", y=f"return{words}")
 
 
 def draw_profiles(axes: Axes, overall: OverallAnalysis, marks: Marks) -> None:

@@ -142,7 +142,7 @@ def equivalent_p_value(first: Floats, second: Floats, margin: float) -> float:
 
 
 def rank_sum_p_value(first: Floats, second: Floats) -> float:
-    """The chance of ranks as high as those of ``first`` if all splits of the scores are as likely."""
+    """The chance of ranks as high as those of ``first`` if all its splits are alike."""
     ranks, ties = doubled_ranks(np.concatenate([first, second]))
     found = int(ranks[: len(first)].sum())
     if len(ranks) <= MOST_COUNTED:
