@@ -31,6 +31,7 @@ from experiments.run_files import CURVE_COLUMNS
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.figures import write_figures
 from report.page import write_report
+from report.page.frame import Report
 from report.series import study_series
 
 N_STEPS = 100_000
@@ -168,7 +169,7 @@ def main() -> None:
         analysis = timed("judging", lambda: analyse(results))
         series = timed("working out the curves", lambda: study_series(analysis))
         timed("drawing the figures", lambda: write_figures(series, None))
-        timed("writing the page", lambda: write_report(series, page, "python compare.py"))
+        timed("writing the page", lambda: write_report(Report(series, "python compare.py"), page))
         print(f"{'size of the page':<28} {page.stat().st_size / 1e6:7.2f} MB")
         seconds = loading(page)
         if seconds is not None:

@@ -476,6 +476,7 @@ def _draw(
     activity.now("working out the curves")
     from report.figures import write_figures
     from report.page import write_report
+    from report.page.frame import Report
     from report.series import study_series
 
     page = analysis.results.root / "report.html"
@@ -489,7 +490,7 @@ def _draw(
 
         learning = write_first_pages(analysis, context.n_workers, activity.at)
     activity.now("writing the page")
-    write_report(series, page, context.command, activity.at, learning)
+    write_report(Report(series, context.command, activity.at, learning), page)
     pages = [analysis.results.root / one.place for one in learning if one.place]
     return [*files, *pages, page]
 

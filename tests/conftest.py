@@ -201,6 +201,7 @@ def report_study(tmp_path_factory):
     from experiments.run_in_child import do_run
     from report import films
     from report.page import world_sections, write_report
+    from report.page.frame import Report
     from report.series import study_series
 
     study, root = small_study(), tmp_path_factory.mktemp("study")
@@ -215,7 +216,7 @@ def report_study(tmp_path_factory):
         patch.setattr(films, "MAX_STEPS", 20)  # longer films take ten seconds to draw
         # In this process, where that holds, also if there is one that runs are forked from.
         patch.setattr(world_sections, "do_aside", lambda function, *args: function(*args))
-        write_report(study_series(analysis), page, "python compare.py 'a & b.yml'")
+        write_report(Report(study_series(analysis), "python compare.py 'a & b.yml'"), page)
     return SimpleNamespace(
         study=study, root=root, planned=planned, failed=failed, analysis=analysis, page=page
     )

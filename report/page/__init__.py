@@ -7,18 +7,16 @@ what makes it move, if anything does, in ``templates/<name>.js``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from markupsafe import Markup
 
 from pipeline.files import write_text
-from pipeline.signs_of_life import Tell, tell_nobody
 from report.page import result_sections, world_sections
 from report.page.frame import (
     SHARED,
-    LearningPage,
     Report,
     Section,
     as_json,
@@ -26,7 +24,6 @@ from report.page.frame import (
     packed,
     templates,
 )
-from report.series import StudySeries
 
 # A new kind of section is such a function, named here.
 SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
@@ -44,30 +41,15 @@ SECTIONS: tuple[Callable[[Report], Section | None], ...] = (
 )
 
 
-def write_report(
-    series: StudySeries,
-    path: Path,
-    command: str,
-    tell: Tell = tell_nobody,
-    learning: Sequence[LearningPage] = (),
-) -> None:
-    """Write the page of a study, one file that needs nothing else and no network.
-
-    Args:
-        series: the numbers that its figures show.
-        path: the file, which is replaced.
-        command: the command that reproduces the study.
-        tell: told how far the writing is.
-        learning: the pages that play trainings, where they were asked for.
-    """
-    report = Report(series, command, tell, learning)
+def write_report(report: Report, path: Path) -> None:
+    """Write the page of a study, one file that needs nothing else and no network."""
     sections = []
     for place, make in enumerate(SECTIONS, start=1):
-        tell(f"section {place} of {len(SECTIONS)}")
+        report.tell(f"section {place} of {len(SECTIONS)}")
         section = make(report)
         if section is not None:
             sections.append(section)
-    tell("all sections as one file")
+    report.tell("all sections as one file")
     write_text(path, render(report, sections))
 
 

@@ -40,7 +40,7 @@ def analysis(tmp_path_factory, do_study):
 @pytest.fixture(scope="module")
 def page(analysis):
     path = analysis.results.root / "report.html"
-    write_report(study_series(analysis), path, "compare.py s.yml")
+    write_report(Report(study_series(analysis), "compare.py s.yml"), path)
     return path.read_text(encoding="utf-8")
 
 
@@ -188,7 +188,7 @@ def test_a_study_of_both_kinds(tmp_path, do_study):
     study = StudySpec("s", "S", agents, (lake, coins), n_seeds=2)
     analysis = analyse(do_study(study, tmp_path))
     path = tmp_path / "report.html"
-    write_report(study_series(analysis), path, "")
+    write_report(Report(study_series(analysis), ""), path)
     page = path.read_text(encoding="utf-8")
     by_step, by_pull = data_of(page, "curves"), data_of(page, "bandits")
     assert [item is None for item in by_step] == [False, True]

@@ -12,7 +12,7 @@ from experiments.run_files import difference
 from pipeline.digests import DamagedFileError
 from pipeline.errors import UserError
 from report.page import learning, write_report
-from report.page.frame import LearningPage
+from report.page.frame import LearningPage, Report
 from report.page.learning import _train_again, write_first_pages
 from report.series import study_series
 
@@ -120,7 +120,7 @@ def test_agents_without_a_run_of_their_own_are_named(done, made_up, tmp_path):
 def test_the_section_links_what_there_is_and_escapes_what_it_says(report_study, tmp_path):
     series = study_series(report_study.analysis)
     plain = tmp_path / "plain.html"
-    write_report(series, plain, "c")
+    write_report(Report(series, "c"), plain)
     assert 'id="watching"' not in plain.read_text(encoding="utf-8")
     lake, warehouse = (one.environment for one in report_study.analysis.environments)
     pages = [
@@ -128,7 +128,7 @@ def test_the_section_links_what_there_is_and_escapes_what_it_says(report_study, 
         LearningPage("sarsa", warehouse, 3, "", "<b>reason</b>"),
     ]
     page = tmp_path / "page.html"
-    write_report(series, page, "c", learning=pages)
+    write_report(Report(series, "c", learning=pages), page)
     text = page.read_text(encoding="utf-8")
     section = text[text.index('<section id="watching"') :]
     section = section[: section.index("</section>")]

@@ -1,6 +1,7 @@
 """A study whose runs were done with different versions says so."""
 
 from report.page import write_report
+from report.page.frame import Report
 from report.series import study_series
 
 
@@ -11,7 +12,7 @@ def test_the_page_names_them(report_study, tmp_path):
     versions = run.read_info()["versions"]
     run.update_info(versions={**versions, "torch": "0.0<b>"})
     try:
-        write_report(study_series(report_study.analysis), page, "compare.py")
+        write_report(Report(study_series(report_study.analysis), "compare.py"), page)
         text = page.read_text()
     finally:
         run.info_path.write_bytes(before)

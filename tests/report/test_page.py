@@ -179,7 +179,7 @@ def test_settings_have_the_looks_and_of_old_runs_no_machine(report_study, tmp_pa
     monkeypatch.setattr(result_sections, "read_looks", lambda _: looks)
     infos = [{"versions": {"numpy": "2"}}]
     assert result_sections.recorded("machine", infos) == {}
-    write_report(study_series(report_study.analysis), tmp_path / "page.html", "compare.py")
+    write_report(Report(study_series(report_study.analysis), "compare.py"), tmp_path / "page.html")
     settings = Page((tmp_path / "page.html").read_text(encoding="utf-8")).all("section")[-1][1]
     assert "These runs have been looked at once." in settings
     assert "2026-11-22: seeds 5 to 8; claims at 4.5 %." in settings
@@ -187,7 +187,9 @@ def test_settings_have_the_looks_and_of_old_runs_no_machine(report_study, tmp_pa
 
 
 def test_a_study_on_one_environment_compares_nothing_over_environments(one_environment, tmp_path):
-    write_report(study_series(one_environment), tmp_path / "page.html", "python compare.py x.yml")
+    write_report(
+        Report(study_series(one_environment), "python compare.py x.yml"), tmp_path / "page.html"
+    )
     page = Page((tmp_path / "page.html").read_text(encoding="utf-8"))
     names = [attributes["id"] for attributes, _ in page.all("section")]
     assert names == [name for name in SECTION_NAMES if name not in {"overview", "overall"}]

@@ -15,7 +15,7 @@ from experiments.analysis import analyse
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from report.documents import MARKUPS, verdicts_as
 from report.page import write_report
-from report.page.frame import STYLES, template_file, templates
+from report.page.frame import STYLES, Report, template_file, templates
 from report.page.tuning import write_tuning_page
 from report.series import agent_marks, study_series
 from tests.report.browsing import (
@@ -62,7 +62,7 @@ def bandit_study(do_study, tmp_path_factory):
     root = tmp_path_factory.mktemp("bandits")
     study = StudySpec("b", "Bandits", agents, places, n_seeds=3, metric="regret")
     path = root / "report.html"
-    write_report(study_series(analyse(do_study(study, root))), path, "compare.py b.yml")
+    write_report(Report(study_series(analyse(do_study(study, root))), "compare.py b.yml"), path)
     return path
 
 
