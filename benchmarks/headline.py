@@ -24,7 +24,7 @@ from experiments.plan import plan
 from experiments.results import read_results
 from experiments.study import read_study
 from report.conclusions import conclusion
-from report.documents import headline, markdown_text, name_of
+from report.documents import headline, markdown_text, name_of, table_as
 from report.words import spans
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -136,7 +136,7 @@ def main() -> None:
         for name, root in (("tuned", args.tuned), ("held-out", args.held_out))
         if root is not None
     }
-    blocks = {name: headline(analysis) for name, analysis in studies.items()}
+    blocks = {name: table_as("md", headline(analysis)) for name, analysis in studies.items()}
     blocks |= {f"verdicts-{name}": verdicts(analysis) for name, analysis in studies.items()}
     if len(studies) == 2:
         blocks["what-fell"] = what_fell(studies["tuned"], studies["held-out"])

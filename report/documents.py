@@ -6,7 +6,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -116,8 +116,7 @@ def _templates(markup: Markup) -> Environment:
         trim_blocks=True,
         undefined=StrictUndefined,
     )
-    environment.filters.update(_FILTERS[markup])
-    environment.filters["table"] = lambda table: _table_as(table, markup)
+    environment.filters.update(_FILTERS[markup], table=partial(table_as, markup))
     return environment
 
 
@@ -158,11 +157,11 @@ def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
         title=study.title,
         command=visible(command),
         seeds=seed_sentence(study.seeds, tuning_seeds(study)),
-        headline=_headline(analysis),
+        headline=headline(analysis),
         environments=[
             {
                 "name": environment.environment,
-                "ranking": _ranking(analysis.results, environment),
+                "ranking": ranking(analysis.results, environment),
                 "sentences": conclusion(study, environment).everything,
             }
             for environment in analysis.environments
@@ -175,21 +174,13 @@ def verdicts_as(markup: Markup, analysis: StudyAnalysis, command: str) -> str:
     return "\n".join([*preamble, "", content])
 
 
-def headline(analysis: StudyAnalysis, markup: Markup = "md") -> str:
-    """A table of agents by environments, and what its marks mean."""
-    return _table_as(_headline(analysis), markup)
-
-
-def ranking(results: StudyResults, environment: EnvironmentAnalysis, markup: Markup = "md") -> str:
-    """The agents of an environment with their figures, the best first."""
-    return _table_as(_ranking(results, environment), markup)
-
-
-def _table_as(table: Table, markup: Markup) -> str:
+def table_as(markup: Markup, table: Table) -> str:
+    """A table with its caption."""
     return _templates(markup).get_template(f"table.{markup}").render(table=table)
 
 
-def _headline(analysis: StudyAnalysis) -> Table:
+def headline(analysis: StudyAnalysis) -> Table:
+    """Agents by environments, and what the marks in the table mean."""
     environments = analysis.environments
     changed = {a.agent for one in environments for a in one.agents if a.changes}
     found = [_cells(analysis, environment) for environment in environments]
@@ -261,7 +252,8 @@ def standings(study: StudySpec, environment: EnvironmentAnalysis) -> dict[str, s
     }
 
 
-def _ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
+def ranking(results: StudyResults, environment: EnvironmentAnalysis) -> Table:
+    """The agents of an environment with their figures, the best first."""
     costs = processor_seconds(results)
     rows = []
     for agent in environment.agents:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from report.documents import MARKUPS, headline, latex_text, verdicts_as
+from report.documents import MARKUPS, headline, latex_text, table_as, verdicts_as
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,8 @@ def test_nothing_of_a_text_is_a_command(text, latex):
 
 def test_a_table_has_the_rules_of_booktabs_and_no_others(made_up):
     agents = [made_up.agent(name, 50) for name in "ab"]
-    lines = headline(made_up.analysis([made_up.environment(agents)], "ab"), "tex").splitlines()
+    analysis = made_up.analysis([made_up.environment(agents)], "ab")
+    lines = table_as("tex", headline(analysis)).splitlines()
     assert lines[2].startswith(r"\caption{Score of the median run: ")
     assert lines[4:] == [
         r"\begin{tabular}{lr}",

@@ -15,6 +15,7 @@ from report.documents import (
     processor_seconds,
     ranking,
     standings,
+    table_as,
     write_verdicts,
 )
 from verdicts import FailureCount, PairComparison
@@ -56,7 +57,7 @@ CPU = (("first", (30.0, 50.0, 40.4)), ("same", (0.1249,)), ("low", (1.0, None)))
 
 
 def test_the_headline_marks_who_is_best_and_counts_failures_and_cost(made_up, place):
-    table, legend = headline(analysis_of(made_up, place, CPU)).split("\n\n")
+    table, legend = table_as("md", headline(analysis_of(made_up, place, CPU))).split("\n\n")
     assert table.splitlines() == [
         "|  | lake |",
         "| --- | --- |",
@@ -80,26 +81,26 @@ def test_agents_that_were_trained_on_a_changed_environment_have_a_mark_and_a_foo
     analysis = made_up.analysis([lake, other], names)
     what = "(random starts, rewards x 0.01)."
     told = f"†: trained on a changed environment: changed and too on lake {what}"
-    text = headline(analysis)
+    text = table_as("md", headline(analysis))
     assert [line.split(" | ")[0] for line in text.splitlines()[2:5]] == [
         "| `plain`",
         "| `changed` †",
         "| `too` †",
     ]
     assert text.endswith(told)
-    latex = headline(analysis, "tex")
+    latex = table_as("tex", headline(analysis))
     assert r"\texttt{changed} $\dagger$ &" in latex
     assert told.replace("†", r"$\dagger$") in latex
-    assert "| `too` † |" in ranking(analysis.results, lake)
+    assert "| `too` † |" in table_as("md", ranking(analysis.results, lake))
     note = f"†: trained on a changed environment: changed and too {what}"
     assert note in conclusion(analysis.study, lake).notes
     assert not any("†" in said for said in conclusion(analysis.study, other).everything)
-    assert "†" not in headline(made_up.analysis([other], names))
+    assert "†" not in table_as("md", headline(made_up.analysis([other], names)))
 
 
 def test_other_metrics_show_their_own_figures_and_of_costs_the_lowest_leads(made_up, place):
     analysis = analysis_of(made_up, place, metric="regret")
-    text = headline(analysis)
+    text = table_as("md", headline(analysis))
     assert "| `low` | **31** |" in text
     assert "| `open` | 81, 1 of 4 failed |" in text
     assert "Regret of a run: the median run. Bold: the lowest" in text
@@ -108,7 +109,7 @@ def test_other_metrics_show_their_own_figures_and_of_costs_the_lowest_leads(made
 
 def test_an_agent_without_a_run_has_a_dash_and_missing_runs_are_counted(made_up, place):
     some = made_up.agent("first", 90.0, n_missing=2)
-    text = headline(analysis_of(made_up, replace(place, agents=(some,), pairs=())))
+    text = table_as("md", headline(analysis_of(made_up, replace(place, agents=(some,), pairs=()))))
     assert "| `low` | - |" in text
     assert "| `first` | **1.800**, 2 missing |" in text
 
@@ -126,7 +127,7 @@ def test_cost_is_the_median_of_runs_that_were_all_measured(made_up, place):
 
 
 def test_the_ranking_of_an_environment(made_up, place):
-    text = ranking(analysis_of(made_up, place, CPU).results, place)
+    text = table_as("md", ranking(analysis_of(made_up, place, CPU).results, place))
     row = "| `first` | 91 [90.9, 91.2] | 90 [89.9, 90.2] | 1.8 | 0 of 4 | 100 | 40 s |"
     assert row in text.splitlines()
     assert text.splitlines()[0] == (

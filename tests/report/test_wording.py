@@ -76,9 +76,9 @@ def test_whose_scores_are_by_a_bracket_is_said_below_the_table(made_up):
         made_up.environment(agents),
         made_up.environment(agents, "hill", optimum_at_least=90.0),
     ]
-    text = headline(made_up.analysis(places, ["a"]))
+    text = headline(made_up.analysis(places, ["a"])).caption
     assert "policy. On hill the optimum is bracketed: 1 is the upper end. Bold" in text
-    assert "bracketed" not in headline(made_up.analysis(places[:1], ["a"]))
+    assert "bracketed" not in headline(made_up.analysis(places[:1], ["a"])).caption
 
 
 def test_episodes_stand_in_columns_that_end_on_one_line():
