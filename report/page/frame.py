@@ -71,16 +71,16 @@ def rounded(number: float) -> float | None:
 
 def plain(value: Any, of_float: Callable[[float], Any] = rounded) -> Any:
     """The value as JSON knows it, and what ``of_float`` makes of its floats."""
-    if is_dataclass(value):
-        value = vars(value)
-    if isinstance(value, np.ndarray | np.generic):
-        value = value.tolist()
     if isinstance(value, float):
         return of_float(value)
-    if isinstance(value, Mapping):
+    if isinstance(value, np.ndarray | np.generic):
+        return plain(value.tolist(), of_float)
+    if isinstance(value, dict):
         return {str(key): plain(item, of_float) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [plain(item, of_float) for item in value]
+    if is_dataclass(value):
+        return plain(vars(value), of_float)
     return value
 
 
