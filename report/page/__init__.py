@@ -20,8 +20,8 @@ from report.page.frame import (
     Report,
     Section,
     as_json,
-    frame,
     packed,
+    page_frame,
     templates,
 )
 
@@ -74,7 +74,7 @@ def render(report: Report, sections: list[Section]) -> str:
         bodies=bodies,
         is_sweep=any(one.sweeps or one.grids for one in report.series.environments),
         data={name: packed(as_json(item)) for name, item in _data(report, sections).items()},
-        **frame(scripts),
+        **page_frame(scripts),
     )
 
 

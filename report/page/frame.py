@@ -112,7 +112,7 @@ def script_hash(text: str) -> str:
     return f"'sha256-{base64.b64encode(digest).decode('ascii')}'"
 
 
-def frame(scripts: Sequence[str]) -> dict[str, str]:
+def page_frame(scripts: Sequence[str]) -> dict[str, str]:
     """What a page with figures has: styles, its own scripts and others, the policy for these."""
     from plotly.offline import get_plotlyjs
 

@@ -19,8 +19,8 @@ from report.page.frame import (
     SHARED,
     Section,
     as_json,
-    frame,
     packed,
+    page_frame,
     setting,
     templates,
 )
@@ -310,7 +310,7 @@ def write_tuning_page(record: Mapping[str, Any], path: Path, retest_page: str = 
         said=_said,
         shares=shares,
         data={name: packed(as_json(item)) for name, item in data.items()},
-        **frame([*SHARED, "tuning/tuning.js", "paper.js"]),
+        **page_frame([*SHARED, "tuning/tuning.js", "paper.js"]),
     )
     write_text(path, text)
 
