@@ -229,7 +229,7 @@ def write_learning_page(
 @cache
 def page_version() -> str:
     """A digest of all that a page is made of but the data."""
-    words = dict.fromkeys(("title", "seed", "kind", "extent", "note"), "")
+    words = {"title": "", "seed": 0, "kind": "", "extent": "", "note": ""}
     return sha256(_render(words, {}).encode()).hexdigest()
 
 
