@@ -1,9 +1,8 @@
-"""What an agent that has not learnt its task does instead, and what to try first.
+"""Says what an agent that has not learnt its task does instead, and what to try first.
 
-Two signals tell which of two remedies helps. Where the agent values its start about as low as
-standing still for ever, the discount hides the goal: it has to be nearer to 1. Where it has tried
-its actions too seldom, it needs more steps. Neither is advised before exact planning has shown that
-it can help.
+Where the agent values its start about as low as standing still for ever, the discount hides the
+goal: it has to be nearer to 1. Where it has tried its actions too seldom, it needs more steps.
+Neither is advised before exact planning has shown that it can help.
 """
 
 from __future__ import annotations
@@ -18,7 +17,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from agents.planning import PlanningAgent
 from agents.reference import RandomAgent
 from envs.known_models import observations_of_states, transition_model
-from envs.layout import GridLayout
 from mdp import TransitionModel, policy_return, state_visitation, value_iteration
 from mdp.array_types import Floats
 from pipeline.agent_settings import resolved_spec
@@ -57,18 +55,10 @@ class Advice:
 def advice(
     spec: TrainSpec, agent: BaseAlgorithm, evaluator: object, final: Evaluation, n_steps: int
 ) -> Advice | None:
-    """Say what a failed agent does instead, and what to try first.
+    """Say what an agent that failed after ``n_steps`` does instead, and what to try first.
 
-    Args:
-        spec: how the agent was trained.
-        agent: the agent.
-        evaluator: what has judged it; where it is no `ExactEvaluator`, little is known.
-        final: the last evaluation.
-        n_steps: environment steps of its training.
-
-    Returns:
-        The advice; None where the score is at least 0.05 and the greedy policy comes to an end, or
-        where that is not known.
+    None where the score is at least 0.05 and the greedy policy ends its episodes, or where nothing
+    exact is known.
     """
     if not isinstance(evaluator, ExactEvaluator) or isinstance(agent, RandomAgent):
         return None
@@ -82,15 +72,13 @@ def advice(
     near = yardstick.gap(final.mean_return) <= NEAR_OPTIMUM * abs(yardstick.optimum)
     failed = yardstick.score(final.mean_return) < FAILED and not near
     running = _still_running(evaluator, policy, 1)
-    if not failed and (running.sum() < NEARLY_ALL or not _can_end(evaluator)):
-        return None
+    if not failed:
+        if running.sum() < NEARLY_ALL:
+            return None
+        best = evaluator.optimum[1].argmax(axis=1)
+        if _still_running(evaluator, best, 1).sum() >= NEARLY_ALL:  # nobody can end an episode
+            return None
     return Advice(_instead(evaluator, policy, running), _try_first(spec, agent, evaluator, n_steps))
-
-
-def _can_end(evaluator: ExactEvaluator) -> bool:
-    """Whether the best policy ends its episodes."""
-    _, optimal = evaluator.optimum
-    return bool(_still_running(evaluator, optimal.argmax(axis=1), 1).sum() < NEARLY_ALL)
 
 
 def _still_running(evaluator: ExactEvaluator, policy: Any, n_last: int) -> Floats:
@@ -112,7 +100,10 @@ def _instead(evaluator: ExactEvaluator, policy: Any, running: Floats) -> str:
     late = _still_running(evaluator, policy, min(LAST_STEPS, max(evaluator.horizon // 2, 1)))
     order = np.argsort(-late, kind="stable")
     n_states = int(np.searchsorted(np.cumsum(late[order]), NEARLY_ALL * late.sum())) + 1
-    places = [_place(evaluator.layout, int(state)) for state in order[:MOST_STATES_NAMED]]
+    places = [f"state {state}" for state in order[:MOST_STATES_NAMED]]
+    if (layout := evaluator.layout) is not None:
+        cells = layout.cells[order[:MOST_STATES_NAMED]]
+        places = [layout.place_name(int(cell)) for cell in cells]
     if n_states == 1:
         where = f"it stays at {places[0]}"
     elif n_states <= MOST_STATES_NAMED:
@@ -121,10 +112,6 @@ def _instead(evaluator: ExactEvaluator, policy: Any, running: Floats) -> str:
         n_reachable = int(evaluator.model.reachable.sum())
         where = f"it never leaves {n_states} of {n_reachable} states, such as {places[0]}"
     return f"{share:.0%} of its episodes run out of time: {where}"
-
-
-def _place(layout: GridLayout | None, state: int) -> str:
-    return f"state {state}" if layout is None else layout.place_name(int(layout.cells[state]))
 
 
 def _try_first(
@@ -148,7 +135,9 @@ def _try_first(
         return None
     flags, now = [], []
     if needs_steps:
-        enough = _round_up(max(MANY_STEPS * n_pairs, 4 * n_steps))
+        enough = max(MANY_STEPS * n_pairs, 4 * n_steps)
+        unit: int = 10 ** max(len(str(enough)) - 2, 0)
+        enough = -(-enough // unit) * unit  # rounded up to two digits
         flags.append(f"-n {max(enough, _shipped_steps(spec))}")
         instead = ", instead of --n-episodes" if spec.hyperparams.n_episodes else ""
         now.append(f"{n_steps / n_pairs:.3g} for each state and action{instead}")
@@ -171,17 +160,8 @@ def _shipped_steps(spec: TrainSpec) -> int:
     return 0
 
 
-def _round_up(number: int) -> int:
-    """The next number with at most two digits before its zeros."""
-    unit: int = 10 ** max(len(str(number)) - 2, 0)
-    return -(-number // unit) * unit
-
-
 def _trained_on(spec: TrainSpec, evaluator: ExactEvaluator) -> tuple[TransitionModel, Any] | None:
-    """The model of the training's own environment and what is observed in its states.
-
-    None where that is not known, too large to plan on, or has other states than the evaluation's.
-    """
+    """The model of the training environment and what is observed in its states, or None."""
     env = make_single_env(spec, training=True)
     try:
         model, observations = transition_model(env), observations_of_states(env)
@@ -204,8 +184,7 @@ def _share_of_standing_still(
 ) -> float:
     """The agent's own value of its start, as a share of the value of standing still for ever.
 
-    0 where standing still costs nothing, where nobody can, and for agents without a table: of
-    networks it was not tested whether the share tells anything.
+    0 where standing still costs nothing or is not possible, and for agents without a table.
     """
     tables = getattr(agent.policy, "q_tables", None)
     stays = (model.next_state == np.arange(model.n_states)[:, None, None]) & ~model.terminated

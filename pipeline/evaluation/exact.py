@@ -90,9 +90,9 @@ class ExactEvaluator:
 
     @cached_property
     def _worth(self) -> OfLastPolicy[Evaluation]:
-        return OfLastPolicy(self._worked_out)
+        return OfLastPolicy(self._evaluate)
 
-    def _worked_out(self, policy: NDArray[Any]) -> Evaluation:
+    def _evaluate(self, policy: NDArray[Any]) -> Evaluation:
         result = policy_return(self.model, policy, self.horizon, success=self.success)
         rate = result.success_rate
         return Evaluation(
@@ -114,11 +114,7 @@ class ExactEvaluator:
         return optimal_choices(self.model, self.horizon)
 
     def policy(self, agent: BaseAlgorithm, deterministic: bool) -> NDArray[Any]:
-        """The agent's policy, in one of the forms of `mdp.evaluation`.
-
-        Probabilities of shape (S, A); or actions, of shape (S,), or (horizon, S) where they depend
-        on the time.
-        """
+        """Probabilities of shape (S, A), or actions of shape (S,) or, with time, (horizon, S)."""
         if isinstance(agent, PlanningAgent):
             n_steps = 1 if agent.policy.is_stationary else self.horizon
             return agent.policy.actions_after(self.observations[None], np.arange(n_steps)[:, None])
@@ -183,10 +179,7 @@ def _optimum(model: TransitionModel, horizon: int) -> float | None:
 
 
 def model_refusal(spec: TrainSpec) -> str | None:
-    """Why the model that the environment brings is not believed, in one line; None if it is.
-
-    None too where it brings none, or where it would not serve the evaluation of such a run.
-    """
+    """Why the model that the environment brings is not believed, in one line; None if it is."""
     if _is_wrapped_as_vector(spec):
         return None
     env = make_single_env(spec)
@@ -200,13 +193,8 @@ def model_refusal(spec: TrainSpec) -> str | None:
 def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> str | None:
     """What the discount that an agent learns under costs, in one line; None where that is little.
 
-    The best policy under the discount, planned exactly on what the agent is trained on, is judged
-    as agents are. No learner can be relied on to do better.
-
-    Args:
-        spec: the run.
-        exact: what judges it.
-        discount: the agent's.
+    The best policy under the discount, planned exactly on the training environment, is judged as
+    agents are. No learner can be relied on to do better.
     """
     env = make_single_env(spec, training=True)
     model = transition_model(env)
@@ -242,17 +230,12 @@ def evaluator_of(spec: TrainSpec) -> ExactEvaluator | None:
     """As `exact_evaluator`; that of plain runs on the same environment is the same object."""
     if not is_plain(spec):
         return exact_evaluator(spec)
-    key = _key(spec)
+    # All that the environment of a plain run's evaluation is made from.
+    masks = spec.hyperparams.algorithm.get("mask_actions", False)
+    key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
     evaluator = _kept.pop(key, None) or exact_evaluator(spec)
     if evaluator is not None and evaluator.model.n_states <= MOST_STATES_KEPT:
         _kept[key] = evaluator
         if len(_kept) > MOST_KEPT:
             _kept.popitem(last=False)
     return evaluator
-
-
-def _key(spec: TrainSpec) -> str:
-    """All that the environment of a plain run's evaluation is made from."""
-    masks = spec.hyperparams.algorithm.get("mask_actions", False)
-    kwargs = sorted(evaluation_kwargs(spec).items())
-    return repr((gym.registry[spec.env_id], kwargs, masks))

@@ -1,4 +1,4 @@
-"""What policies are, what they have to be told, and what they do in every state, as arrays."""
+"""Asks agents for their policies in every state at once, and says which agents cannot be asked."""
 
 from __future__ import annotations
 
@@ -69,12 +69,7 @@ def player(model: BaseAlgorithm, env: VecEnv) -> Any:
 
 
 class MaskTold:
-    """An agent, and the environments that tell it what may be done.
-
-    Args:
-        model: the agent.
-        env: the environments that it is played on.
-    """
+    """An agent, and the environments that tell it what may be done."""
 
     def __init__(self, model: Any, env: VecEnv) -> None:
         self.model = model
@@ -91,13 +86,7 @@ Result = TypeVar("Result")
 
 
 class OfLastPolicy(Generic[Result]):
-    """A function of a policy that remembers its last result.
-
-    An agent is evaluated many times, and mostly acts as it did the time before.
-
-    Args:
-        work: the function; its result is not to be changed.
-    """
+    """A function of a policy that caches its last result: agents often act as the time before."""
 
     def __init__(self, work: Callable[[NDArray[Any]], Result]) -> None:
         self._work = work
@@ -149,8 +138,8 @@ def obstacle(
 def why_not_exact(agent: BaseAlgorithm, observations: NDArray[Any]) -> str:
     """Say why an agent cannot be asked for all states at once; empty where it can.
 
-    Agents of this project and of Stable-Baselines3 can. Of others, what `predict` returns is looked
-    at: it has to be one action a state, the same when it is asked again, and nothing to remember.
+    Agents of this project and of Stable-Baselines3 can. The others are tried: `predict` has to
+    return one action a state, the same when it is asked again, and nothing to remember.
     """
     if type(agent).__module__.partition(".")[0] in KNOWN_LIBRARIES:
         return ""
@@ -172,16 +161,9 @@ def policy_matrix(
     deterministic: bool = True,
     masks: Bools | None = None,
 ) -> Floats:
-    """The agent's policy as probabilities of shape (S, A).
+    """The agent's policy as probabilities of shape (S, A); TypeError where they are not known.
 
-    Args:
-        agent: any agent with discrete actions whose policy depends on the observation alone.
-        observations: what it observes in each state, states along the first axis.
-        deterministic: its best actions rather than what it samples.
-        masks: what may be done in each state, bool of shape (S, A), for agents that are told.
-
-    Raises:
-        TypeError: if the probabilities that the agent acts with are not known.
+    ``observations`` has the states along its first axis, ``masks`` the shape (S, A).
     """
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
@@ -197,12 +179,13 @@ def policy_matrix(
     policy = getattr(agent, "policy", None)
     if hasattr(policy, "get_distribution"):
         return _in_parts(agent, observations, masks, partial(_actor_probabilities, policy))
-    if _is_epsilon_greedy(agent):
+    # DQN, and QR-DQN, which may not be installed and is no subclass of it.
+    homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
+    if any(base.__module__.startswith(homes) for base in type(agent).__mro__):
         epsilon = float(vars(agent)["exploration_rate"])
         greedy = policy_matrix(agent, observations, masks=masks)
         is_told = masks is not None and takes_masks(agent)
-        allowed = masks if is_told else np.ones(greedy.shape, dtype=np.bool_)
-        assert allowed is not None
+        allowed: Any = masks if is_told else np.ones(greedy.shape, dtype=np.bool_)
         random = epsilon * allowed / allowed.sum(axis=1, keepdims=True)
         return np.asarray(random + (1 - epsilon) * greedy)
     raise TypeError(f"the action probabilities of {type(agent).__name__} are not known")
@@ -211,25 +194,20 @@ def policy_matrix(
 def best_actions(
     agent: BaseAlgorithm, observations: NDArray[Any], masks: Bools | None = None
 ) -> Ints:
-    """What the agent does in each state, shape (S,); arguments as of `policy_matrix`."""
+    """What the agent does in each state, shape (S,)."""
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
 
-    table = _table_alone(agent)
-    if table is not None:  # sooner looked up than asked for, which is most of an evaluation
+    # A plain table is sooner looked up than asked for, which is most of an evaluation.
+    is_ours = type(agent).predict is TabularAlgorithm.predict and not takes_masks(agent)
+    table: object = agent.policy if is_ours else None
+    if isinstance(table, QTablePolicy) and type(table) is QTablePolicy:
         return np.asarray(table.allowed_values(observations).argmax(axis=1))
 
     def predicted(observations: NDArray[Any], **told: Any) -> NDArray[Any]:
         return np.asarray(agent.predict(observations, deterministic=True, **told)[0])
 
     return _in_parts(agent, observations, masks, predicted).astype(np.int64)
-
-
-def _table_alone(agent: BaseAlgorithm) -> QTablePolicy | None:
-    """The agent's table, where what it says is best is what `predict` would tell."""
-    is_ours = type(agent).predict is TabularAlgorithm.predict and not takes_masks(agent)
-    table: object = agent.policy if is_ours else None
-    return table if type(table) is QTablePolicy else None
 
 
 def _in_parts(
@@ -252,12 +230,6 @@ def _in_parts(
 def _n_inputs(agent: BaseAlgorithm) -> int:
     """Numbers that an observation becomes before a network is handed it."""
     return max(int(spaces.flatdim(agent.observation_space)), 1)
-
-
-def _is_epsilon_greedy(agent: BaseAlgorithm) -> bool:
-    """Whether it is DQN or QR-DQN, which may not be installed and is no subclass of it."""
-    homes = ("stable_baselines3.dqn.", "sb3_contrib.qrdqn.")
-    return any(base.__module__.startswith(homes) for base in type(agent).__mro__)
 
 
 def _cannot_be_asked(agent: BaseAlgorithm, masks: Bools | None) -> str:

@@ -1,8 +1,8 @@
-"""How good an agent is: played on the environment as it is, never on a training variant of it.
+"""Evaluates agents by playing episodes, on the environment as it is and not on a training variant.
 
-During training, for no more steps than it is worth beside the training. That goes by steps and
-never by the clock, so that the same seed gives the same files anywhere. Agents that were trained in
-compiled code are played in it too.
+How many steps evaluations may take follows from the steps of the training and never from the clock,
+so that the same seed gives the same files anywhere. Agents that were trained in compiled code are
+played in it too.
 """
 
 from __future__ import annotations
@@ -170,18 +170,7 @@ class Evaluation:
 def evaluate(
     model: BaseAlgorithm, env: VecEnv, n_episodes: int, seed: int | None, deterministic: bool = True
 ) -> Evaluation:
-    """Play ``n_episodes``, the same ones each time that ``seed`` is the same.
-
-    Args:
-        model: the agent.
-        env: environments to play on, with a time limit.
-        n_episodes: how many episodes, shared evenly between the environments.
-        seed: of the environments; None to go on with the episodes that come next.
-        deterministic: play the policy's best action rather than sample one.
-
-    Raises:
-        NotFiniteError: if an observation or a return is not finite.
-    """
+    """Play ``n_episodes``, the same ones for the same seed; for None, those that come next."""
     successes: list[bool] = []
 
     def note_success(local: dict[str, Any], _: dict[str, Any]) -> None:
@@ -227,12 +216,7 @@ def takes_batches(model: BaseAlgorithm) -> bool:
 
 
 def evaluation_seed(seed: int, purpose: int) -> int:
-    """A seed for evaluations that lies apart from training's and from other purposes'.
-
-    Args:
-        seed: the run's seed.
-        purpose: 1 during training, 2 at its end, 3 when playing.
-    """
+    """A seed apart from training's; purpose 1 is during training, 2 at its end, 3 playing."""
     stream = np.random.SeedSequence(seed, spawn_key=(purpose,))
     return int(stream.generate_state(1)[0] % 2**31)
 
@@ -240,8 +224,7 @@ def evaluation_seed(seed: int, purpose: int) -> int:
 def bracketed_yardstick(spec: TrainSpec) -> Yardstick | None:
     """The bracket of the environment that a run is evaluated on, or None where none holds for it.
 
-    Normalised and stacked observations make no difference. What a wrapper around all copies does,
-    nobody knows.
+    Normalised and stacked observations make no difference; any other wrapper around all copies may.
     """
     if spec.hyperparams.vec_env_wrapper or not may_have_bracket(spec.env_id):
         return None
@@ -313,15 +296,7 @@ PRECISION_AT_THE_END = 0.01
 
 
 class SampledEvaluator:
-    """Plays episodes: as many as are asked for, or as few as will do.
-
-    Args:
-        spec: the run.
-        env: environments to play on, with a time limit.
-
-    Attributes:
-        n_steps: environment steps that it has taken, in all evaluations.
-    """
+    """Plays episodes: as many as are asked for, or as few as will do."""
 
     def __init__(self, spec: TrainSpec, env: VecEnv) -> None:
         self.env = env
@@ -332,7 +307,7 @@ class SampledEvaluator:
         self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
         self.training_steps = spec.hyperparams.n_timesteps
         self.training_episodes = spec.hyperparams.n_episodes
-        self.n_steps = 0
+        self.n_steps = 0  # of all evaluations
         self._left = math.inf
         self._last_length: float | None = None
 
@@ -359,7 +334,8 @@ class SampledEvaluator:
         allowed = self._allowed(model, n_trained)
         left = max(allowed - self.n_steps, allowed * (1 - PART_DURING_TRAINING))
         stages = STAGES_AT_THE_END if self.n_final is None else (self.n_final,)
-        if self.n_final is None and not self._is_known_to_fit(stages[0], left):
+        length = math.inf if self._last_length is None else self._last_length
+        if self.n_final is None and stages[0] * length > left:
             stages = (STAGES[0], *stages)
         return self._evaluate(model, stages, PRECISION_AT_THE_END, left, purpose=2)
 
@@ -374,13 +350,19 @@ class SampledEvaluator:
         """Play episodes, until the mean is sure enough or more of them would be too many steps."""
         seed = evaluation_seed(self.seed, purpose)
         copy = self._compiled_copy(model)
-        found = self._play(model, copy, stages[0], seed)
+
+        def play(n_episodes: int, seed: int | None) -> Evaluation:
+            if copy is None:
+                return evaluate(model, self.env, n_episodes, seed)
+            return evaluate_compiled(model, copy, n_episodes, seed)
+
+        found = play(stages[0], seed)
         for n_episodes in stages[1:]:
             n_more = n_episodes - len(found.returns)
             if is_sure(found, precision) or found.lengths.sum() + n_more * found.mean_length > most:
                 break
             # Not seeded again, the environments go on to other episodes.
-            found = found.joined(self._play(model, copy, n_more, None))
+            found = found.joined(play(n_more, None))
         self.n_steps += int(found.lengths.sum())
         self._last_length = found.mean_length
         return found.measured_by(self.yardstick)
@@ -389,22 +371,12 @@ class SampledEvaluator:
         is_compiled = self._compiled_copy(model) is not None
         return allowed_steps(n_trained, shares_of(model, plays_compiled=is_compiled))
 
-    def _is_known_to_fit(self, n_episodes: int, left: float) -> bool:
-        return self._last_length is not None and n_episodes * self._last_length <= left
-
     def _usual_length(self, model: BaseAlgorithm) -> float:
         """Steps of an episode: of those evaluated last, or else of training's last ones."""
         if self._last_length is not None:
             return self._last_length
         lengths = [episode["l"] for episode in getattr(model, "ep_info_buffer", None) or ()]
         return float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
-
-    def _play(
-        self, model: BaseAlgorithm, copy: CompiledCopy | None, n_episodes: int, seed: int | None
-    ) -> Evaluation:
-        if copy is None:
-            return evaluate(model, self.env, n_episodes, seed)
-        return evaluate_compiled(model, copy, n_episodes, seed)
 
     def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
         """The environments in compiled code, if it is that what the agent was trained on."""
@@ -438,11 +410,7 @@ class CompiledCopy:
 
 
 def compiled_copy(env: VecEnv) -> CompiledCopy | None:
-    """What can be evaluated on in compiled code; None where that is not possible.
-
-    Environments whose states can be counted are left out: there, evaluation is exact, or there are
-    so many states that to look at all of them takes longer than to play.
-    """
+    """What can be evaluated on in compiled code: CartPole and MountainCar, plain or in Monitor."""
     from gymnasium.envs.classic_control import CartPoleEnv, MountainCarEnv
 
     from agents.compiled.worlds import NotCompilable, monitor_of
@@ -463,8 +431,8 @@ def evaluate_compiled(
 ) -> Evaluation:
     """Play the episodes that `evaluate` would: the same seeds, starts and order.
 
-    Tables and tiles act by the same bits; networks by the compiled forward pass, and by the
-    library's `predict` where two actions are so close that rounding could decide.
+    Networks act by the library's `predict` where two actions are so close that rounding could
+    decide.
     """
     from agents.compiled.greedy_play import play_episodes
     from agents.compiled.records import DECIMALS

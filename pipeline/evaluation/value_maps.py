@@ -70,7 +70,7 @@ def value_map(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> ValueMap | Non
         The map, or None where there is none: on what is no grid world or has more than 2500
         states, and of agents that have no one action in each state.
     """
-    policy = _deterministic_policy(evaluator, agent)
+    policy = best_actions_of(evaluator, agent) if _can_be_drawn(evaluator) else None
     if policy is None or evaluator.layout is None:
         return None
     model = evaluator.model
@@ -96,11 +96,8 @@ def map_refusal(evaluator: ExactEvaluator) -> str | None:
     return f"no value map: {n_states:,} states are too many to see, it has up to {MAX_STATES:,}"
 
 
-def _deterministic_policy(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
-    """What the agent does at each step in each state, shape (1 or horizon, S)."""
-    if evaluator.layout is None or evaluator.model.n_states > MAX_STATES:
-        return None
-    return best_actions_of(evaluator, agent)
+def _can_be_drawn(evaluator: ExactEvaluator) -> bool:
+    return evaluator.layout is not None and evaluator.model.n_states <= MAX_STATES
 
 
 def best_actions_of(evaluator: ExactEvaluator, agent: BaseAlgorithm) -> Ints | None:
@@ -150,7 +147,7 @@ class ValueMapRecorder:
         self._write()
 
     def _append(self, agent: BaseAlgorithm, timesteps: int) -> None:
-        policy = _deterministic_policy(self.evaluator, agent)
+        policy = best_actions_of(self.evaluator, agent) if _can_be_drawn(self.evaluator) else None
         if policy is not None:
             values = self.evaluator.values(policy)
             self._maps.append((timesteps, values, policy[0]))

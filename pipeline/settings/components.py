@@ -1,4 +1,4 @@
-"""From what a file names to objects: classes, wrappers, callbacks, schedules, agents' arguments.
+"""Builds what a file names: classes, wrappers, callbacks, schedules, arguments of agents.
 
 A name in a file can choose among classes of a fixed kind from a fixed set of packages; it cannot
 make anything else be imported or called. A module is imported only if it is one of ours, if its
@@ -88,7 +88,8 @@ def wrapper_factory(
     """What wraps an environment as ``spec`` says, the first wrapper innermost."""
     from gymnasium import Wrapper
 
-    return _chain(spec, Wrapper, extra_packages, where, folder)
+    components = _components(spec, Wrapper, extra_packages, where, 1, folder)
+    return _Chain(components) if components else None
 
 
 def vec_wrapper_factory(
@@ -100,7 +101,8 @@ def vec_wrapper_factory(
     """As `wrapper_factory`, for wrappers of a vectorised environment."""
     from stable_baselines3.common.vec_env import VecEnvWrapper
 
-    return _chain(spec, VecEnvWrapper, extra_packages, where, folder)
+    components = _components(spec, VecEnvWrapper, extra_packages, where, 1, folder)
+    return _Chain(components) if components else None
 
 
 def callbacks(
@@ -111,7 +113,7 @@ def callbacks(
 
     folder = None if save_path is None else Path(save_path)
     defaults = {} if folder is None else {"save_path": str(folder)}
-    components = _components(spec, BaseCallback, extra_packages, "callback", 0, folder, defaults)
+    components = _components(spec, BaseCallback, extra_packages, "callback", 0, folder, **defaults)
     return [component.build() for component in components]
 
 
@@ -126,34 +128,20 @@ def build_value(
     if isinstance(raw, list | tuple):
         return type(raw)(build_value(value, extra_packages, where) for value in raw)
     if isinstance(raw, ScheduleSpec):
-        return _build_schedule(raw)
-    if isinstance(raw, DottedName):
-        return find_class(raw.name, _value_bases(), where, extra_packages)
-    return raw
-
-
-def _build_schedule(spec: ScheduleSpec) -> Callable[[float], float]:
-    if spec.kind == "linear":
         from stable_baselines3.common.utils import LinearSchedule
 
-        return LinearSchedule(spec.start, spec.end, 1.0)
-    from agents.common.schedules import ExponentialSchedule
+        from agents.common.schedules import ExponentialSchedule
 
-    return ExponentialSchedule(spec.start, spec.end)
+        if raw.kind == "linear":
+            return LinearSchedule(raw.start, raw.end, 1.0)
+        return ExponentialSchedule(raw.start, raw.end)
+    if isinstance(raw, DottedName):
+        from stable_baselines3.common.buffers import BaseBuffer
+        from torch import nn, optim
 
-
-def _value_bases() -> tuple[type, ...]:
-    from stable_baselines3.common.buffers import BaseBuffer
-    from torch import nn, optim
-
-    return nn.Module, optim.Optimizer, BaseBuffer
-
-
-def _chain(
-    spec: Any, base: type, extra_packages: Sequence[str], where: str, folder: Path | None
-) -> _Chain | None:
-    components = _components(spec, base, extra_packages, where, 1, folder, {})
-    return _Chain(components) if components else None
+        bases = (nn.Module, optim.Optimizer, BaseBuffer)
+        return find_class(raw.name, bases, where, extra_packages)
+    return raw
 
 
 def _components(
@@ -163,18 +151,11 @@ def _components(
     where: str,
     n_inner: int,
     folder: Path | None,
-    defaults: Mapping[str, Any],
+    **defaults: str,
 ) -> tuple[_Component, ...]:
-    """Look up and check what ``spec`` names.
+    """Look up and check classes derived from ``base`` whose first ``n_inner`` arguments are given.
 
-    Args:
-        spec: in one of rl_zoo3's forms.
-        base: what every class must derive from.
-        extra_packages: packages that the user allows.
-        where: begins every error message.
-        n_inner: how many leading arguments a class is given when it is built.
-        folder: that they may write to, or None for a temporary one.
-        defaults: arguments for those classes that know them and are not told others.
+    They may write to ``folder``, or where that is None, to a temporary one.
     """
     components = []
     for item in component_specs(spec, where):
@@ -235,18 +216,9 @@ _CLASS_ALIASES = {
 def find_class(
     name: str, bases: tuple[type, ...], where: str, extra_packages: Sequence[str] = ()
 ) -> type:
-    """Import a class.
-
-    Args:
-        name: such as ``nn.Tanh`` or ``stable_baselines3.common.monitor.Monitor``.
-        bases: it must be a subclass of one of these.
-        where: begins every error message.
-        extra_packages: packages that the user allows besides the usual ones.
-
-    Raises:
-        UserError: if the name is not admitted, does not exist, or is no such class.
-    """
-    module_name, _, class_name = _full_name(name).rpartition(".")
+    """Import a subclass of ``bases``, such as ``nn.Tanh``, if its name is admitted."""
+    first, dot, rest = _CLASS_ALIASES.get(name, name).partition(".")
+    module_name, _, class_name = f"{_MODULE_ALIASES.get(first, first)}{dot}{rest}".rpartition(".")
     parts = [*module_name.split("."), class_name]
     if not all(part.isidentifier() and not part.startswith("_") for part in parts):
         raise UserError(f"{where}: {name!r} is not the dotted name of a class")
@@ -262,13 +234,10 @@ def find_class(
         return found
     wanted = " or ".join(base.__name__ for base in bases)
     fault = "does not exist" if found is None else f"is no {wanted}"
-    hint = did_you_mean(class_name, _classes(module, bases))
+    classes = {name: value for name, value in vars(module).items() if isinstance(value, type)}
+    known = [n for n, cls in classes.items() if issubclass(cls, bases) and cls not in bases]
+    hint = did_you_mean(class_name, known)
     raise UserError(f"{where}: {name} {fault}{': ' + hint if hint else ''}")
-
-
-def _full_name(name: str) -> str:
-    first, dot, rest = _CLASS_ALIASES.get(name, name).partition(".")
-    return _MODULE_ALIASES.get(first, first) + dot + rest
 
 
 def _import(module_name: str, what: str, typed: Sequence[str]) -> ModuleType:
@@ -309,16 +278,13 @@ def _is_installed(name: str) -> bool:
         return False
     if spec is None:
         raise ModuleNotFoundError(name=name)
-    folder = next((each for each in _folders() if _is_below(spec.origin, each)), None)
-    if spec.origin is None or folder is None:
+    if spec.origin is None:
         return False
-    return Path(spec.origin).relative_to(folder).as_posix() in _record(
-        name.partition(".")[0], folder
-    )
-
-
-def _is_below(origin: str | None, folder: Path) -> bool:
-    return origin is not None and Path(origin).is_relative_to(folder)
+    path = Path(spec.origin)
+    folder = next((each for each in _folders() if path.is_relative_to(each)), None)
+    if folder is None:
+        return False
+    return path.relative_to(folder).as_posix() in _record(name.partition(".")[0], folder)
 
 
 @cache
@@ -341,14 +307,6 @@ def _record(distribution: str, folder: Path) -> frozenset[str]:
     found = importlib.metadata.distributions(name=distribution, path=[str(folder)])
     texts = [one.read_text("RECORD") or "" for one in found]
     return frozenset(line.rsplit(",", 2)[0] for text in texts for line in text.splitlines())
-
-
-def _classes(module: ModuleType, bases: tuple[type, ...]) -> list[str]:
-    return [
-        name
-        for name, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, bases) and value not in bases
-    ]
 
 
 _NAME_OF_A_PLACE = re.compile(
@@ -378,26 +336,18 @@ def _confined(name: str, value: Any, folder: Path | None, where: str) -> Any:
         return type(value)(_confined(name, item, folder, where) for item in value)
     if not (isinstance(value, str | Path) and names_a_place(name)):
         return value
+    path = PureWindowsPath(value)  # both slashes part folders, and a drive's letter leads out too
     if "prefix" in name.lower():
-        return _plain_prefix(str(value), where)
-    return _inside(_scratch_folder() if folder is None else folder, str(value), where)
-
-
-def _plain_prefix(value: str, where: str) -> str:
-    if PureWindowsPath(value).name != value or value == "..":
-        raise UserError(
-            f"{where} begins the names of files and holds no path, unlike {shown(value)}"
-        )
-    return value
-
-
-def _inside(folder: Path, value: str, where: str) -> str:
-    # Read as on Windows, where both slashes part folders and a drive's letter leads out as well.
-    pure = PureWindowsPath(value)
-    leads_out = bool(pure.anchor) or ".." in pure.parts or "\0" in value
+        if path.name != str(value) or str(value) == "..":
+            raise UserError(
+                f"{where} begins the names of files and holds no path, unlike {shown(str(value))}"
+            )
+        return str(value)
+    folder = Path(_scratch().name) if folder is None else folder
+    leads_out = bool(path.anchor) or ".." in path.parts or "\0" in str(value)
     # Where it leads by way of links.
     if leads_out or not (folder / value).resolve().is_relative_to(folder.resolve()):
-        raise UserError(f"{where} must lie inside the run folder, unlike {shown(value)}")
+        raise UserError(f"{where} must lie inside the run folder, unlike {shown(str(value))}")
     return str(folder / value)
 
 
@@ -406,21 +356,16 @@ def _scratch() -> tempfile.TemporaryDirectory[str]:
     return tempfile.TemporaryDirectory(prefix="yardstick-", ignore_cleanup_errors=True)
 
 
-def _scratch_folder() -> Path:
-    return Path(_scratch().name)
-
-
 def build_algorithm_kwargs(
     algorithm: type[BaseAlgorithm],
     kwargs: Mapping[str, Any],
     where: str,
     extra_packages: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """An agent's constructor arguments, checked to the last one and built.
+    """An agent's constructor arguments, checked to the last one and built, the policy's too."""
+    from agents.common.model_files import JsonAlgorithm
+    from agents.common.schedules import ExponentialSchedule, library_schedule
 
-    Beyond `check_algorithm_kwargs` and `build_value`, the policy must exist and know what
-    ``policy_kwargs`` says, where the class tells by ``policy_aliases`` which policies it has.
-    """
     parameters = algorithm_parameters(algorithm)
     checked = check_algorithm_kwargs(kwargs, parameters, where)
     policy = _policy_class(algorithm, checked, parameters, where, extra_packages)
@@ -433,22 +378,12 @@ def build_algorithm_kwargs(
     if isinstance(checked.get("policy"), DottedName):
         checked["policy"] = policy
     built = _build(checked, parameters, where, extra_packages)
-    return built if _is_hand_written(algorithm) else _as_library_schedules(built)
-
-
-def _is_hand_written(algorithm: type[BaseAlgorithm]) -> bool:
-    from agents.common.model_files import JsonAlgorithm
-
-    return issubclass(algorithm, JsonAlgorithm)
-
-
-def _as_library_schedules(kwargs: Mapping[str, Any]) -> dict[str, Any]:
-    """Schedules of classes that a library agent's zip finds wherever that agent is installed."""
-    from agents.common.schedules import ExponentialSchedule, library_schedule
-
+    if issubclass(algorithm, JsonAlgorithm):
+        return built
+    # Schedules of classes that a library agent's zip finds wherever that agent is installed.
     return {
         name: library_schedule(value) if isinstance(value, ExponentialSchedule) else value
-        for name, value in kwargs.items()
+        for name, value in built.items()
     }
 
 
@@ -523,10 +458,8 @@ def check_action_noise(hyperparams: Hyperparams, algorithm: type[BaseAlgorithm],
 def action_noise(hyperparams: Hyperparams, actions: spaces.Space[Any]) -> dict[str, Any]:
     """The constructor argument ``action_noise``, as a mapping; empty where none is asked for.
 
-    Args:
-        hyperparams: of the run; the noise has mean 0 and the same standard deviation
-            ``noise_std`` in each component of an action, after actions are scaled to [-1, 1].
-        actions: what the agent acts in, a Box.
+    The noise has mean 0 and standard deviation ``noise_std`` in each component of an action, after
+    actions are scaled to [-1, 1].
     """
     if hyperparams.noise_type is None:
         return {}

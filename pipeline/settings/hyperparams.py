@@ -2,8 +2,7 @@
 
 One YAML file per algorithm maps environment ids to entries. An entry holds arguments of the
 algorithm's constructor, and the special keys that `Hyperparams` lists. Beside the entries, under
-``tuned_on``, a file may say which seeds they were tuned on: that is no hyperparameter, no part of
-what a run is, and tools that look entries up by environment pass it by.
+``tuned_on``, a file may say which seeds they were tuned on.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ from typing import Any, Literal, get_type_hints
 
 from pipeline.errors import UserError, did_you_mean, shown
 from pipeline.settings.values import check_arguments, check_range, coerce, contains_name
-from pipeline.settings.yaml import read_settings_text, read_yaml
+from pipeline.settings.yaml import read_yaml, settings_bytes
 
 # Constructor arguments that are set elsewhere, and how.
 _SET_ELSEWHERE = {
@@ -104,15 +103,11 @@ def _special_key_types() -> Mapping[str, Any]:
 def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperparams:
     """Tell the special keys of an entry from the algorithm's arguments, and check them.
 
-    Args:
-        entry: as `read_hyperparams` returns it. A special key
-            that is null counts as left out.
-        where: begins every error message.
-
-    Raises:
-        UserError: if a special key has a wrong type or range, or contradicts another.
+    A special key that is null counts as left out.
     """
-    special_keys = _special_keys(entry)
+    # Some agents have a noise_std of their own, on what they learn rather than on actions.
+    is_action_noise = entry.get("noise_type") is not None
+    special_keys = [key for key in SPECIAL_KEYS if key != "noise_std" or is_action_noise]
     algorithm = {key: value for key, value in entry.items() if key not in special_keys}
     special = {key: value for key in special_keys if (value := entry.get(key)) is not None}
     if isinstance(special.get("normalize"), bool):
@@ -135,12 +130,6 @@ def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperpara
         gamma = coerce(algorithm["gamma"], float, f"{where}: gamma")
         special["normalize"].setdefault("gamma", gamma)
     return Hyperparams(**special, algorithm=algorithm)
-
-
-def _special_keys(entry: Mapping[str, Any]) -> list[str]:
-    # Some agents have a noise_std of their own, on what they learn rather than on actions.
-    is_action_noise = entry.get("noise_type") is not None
-    return [key for key in SPECIAL_KEYS if key != "noise_std" or is_action_noise]
 
 
 def component_specs(spec: Any, where: str) -> tuple[ComponentSpec, ...]:
@@ -180,21 +169,7 @@ def _checked_keywords(key: str, keywords: dict[str, Any], where: str) -> dict[st
 def check_algorithm_kwargs(
     kwargs: Mapping[str, Any], parameters: Mapping[str, inspect.Parameter], where: str
 ) -> dict[str, Any]:
-    """Check constructor arguments by name, type and range.
-
-    Args:
-        kwargs: the arguments as they stand in a file, such as `Hyperparams.algorithm`.
-        parameters: those of the constructor, see
-            `pipeline.settings.values.constructor_parameters`.
-        where: begins every error message.
-
-    Returns:
-        The arguments as their annotations ask for; classes as `DottedName` and schedules as
-        `ScheduleSpec`, which `pipeline.settings.components.build_value` turns into objects.
-
-    Raises:
-        UserError: naming the argument, and what it must be.
-    """
+    """Check constructor arguments by name, type and range; see `coerce` for what is returned."""
     for name in kwargs:
         if name in _SET_ELSEWHERE and name in parameters:
             raise UserError(f"{where}: {name} is set by {_SET_ELSEWHERE[name]}, not here")
@@ -215,6 +190,7 @@ _FOLDER = Path(__file__).resolve().parents[2] / "hyperparams"
 _ATARI_ID = re.compile(r"ALE/.*|.*NoFrameskip-v\d+")
 _TOP_LEVEL_KEY = re.compile(r"^([\w./-]+):", re.MULTILINE)
 _STAND_INS = ("default", "atari")
+TUNED_ON = "tuned_on"
 
 
 class NoEntryError(UserError):
@@ -227,24 +203,12 @@ def read_hyperparams(
     path: Path | str | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """Read the entry of an environment.
+    """Read the entry of an environment in ``hyperparams/<algo>.yml``, or in another file.
 
-    Args:
-        algo: the algorithm, whose file is ``hyperparams/<algo>.yml``.
-        env_id: the environment; of ``envs:Warehouse-v0`` the part after the colon counts. The entry
-            ``atari`` stands in for Atari games without their own, ``default`` for all others.
-        path: another file to read.
-        env_kwargs: arguments of the environment. Where they make it the one that another id stands
-            for, and the file has an entry for that id, it is this: for CliffWalking-v1 with
-            ``is_slippery: True`` that of CliffWalkingSlippery-v1.
-
-    Returns:
-        The entry as it stands there, see `split`; an empty one for an algorithm that
-        has no file here, such as one of the user's own.
-
-    Raises:
-        UserError: if the file cannot be read or is not of this format.
-        NoEntryError: if it has no entry that fits.
+    The entry ``atari`` stands in for Atari games without their own, ``default`` for all others. An
+    algorithm without a file here, such as one of the user's own, has an empty entry. Where
+    ``env_kwargs`` make the environment the one that another id stands for, that id's entry counts:
+    for CliffWalking-v1 with ``is_slippery: True`` that of CliffWalkingSlippery-v1.
     """
     if path is None and not _path(algo, None).is_file():
         return {}
@@ -266,20 +230,7 @@ def read_hyperparams(
 def seeds_tuned_on(
     algo: str, env_id: str, path: Path | str | None = None
 ) -> tuple[range, ...] | None:
-    """The seeds that the entry of an environment was tuned on, as its file says.
-
-    Args:
-        algo: the algorithm.
-        env_id: the environment.
-        path: another file than the algorithm's own.
-
-    Returns:
-        Ranges of seeds, none for an entry that was chosen without; None where nobody says: in a
-        file without ``tuned_on``, and for an algorithm that has no file here.
-
-    Raises:
-        UserError: as `read_hyperparams` does.
-    """
+    """The seeds that the entry of an environment was tuned on; None where its file does not say."""
     if path is None and not _path(algo, None).is_file():
         return None
     entries, tuned_on = _read(_path(algo, path))
@@ -295,7 +246,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, tuple[range, ...]] | No
     entries = read_yaml(path)
     if not (isinstance(entries, dict) and all(isinstance(key, str) for key in entries)):
         raise UserError(f"{path}: must map environment ids to hyperparameters")
-    tuned_on = read_tuned_on(entries, str(path))
+    tuned_on = _read_tuned_on(entries, f"{path}: {TUNED_ON}") if TUNED_ON in entries else None
     return {key: entry for key, entry in entries.items() if key != TUNED_ON}, tuned_on
 
 
@@ -329,14 +280,11 @@ def _find_entry(entries: Mapping[str, Any], env_id: str) -> str | None:
 
 
 def entry_names(algo: str, path: Path | str | None = None) -> list[str]:
-    """Ids of the environments that an algorithm's file has an entry for, in its order.
-
-    Empty where there is no such file. The stand-ins ``default`` and ``atari`` are left out.
-    """
+    """Ids of the environments that an algorithm's file has an entry for, in its order."""
     path = _path(algo, path)
     # The keys alone, by their place in the line: parsing all files would slow listing them down.
-    names = _TOP_LEVEL_KEY.findall(read_settings_text(path)) if path.is_file() else []
-    return [name for name in names if name not in (*_STAND_INS, TUNED_ON)]
+    text = settings_bytes(path).decode() if path.is_file() else ""
+    return [name for name in _TOP_LEVEL_KEY.findall(text) if name not in (*_STAND_INS, TUNED_ON)]
 
 
 def _path(algo: str, path: Path | str | None) -> Path:
@@ -352,40 +300,21 @@ def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, 
     return {**kept, **changes}
 
 
-TUNED_ON = "tuned_on"
-
-
-def read_tuned_on(entries: Mapping[str, Any], where: str) -> dict[str, tuple[range, ...]] | None:
-    """The seeds on which entries were tried while they were chosen, by the entry's name.
-
-    Args:
-        entries: a file of hyperparameters. Under ``tuned_on`` it maps names of entries to
-            ``{first: 0, count: 10}``, or to a list of such; an entry that is not named there was
-            chosen without trying it on any seed.
-        where: the file, for error messages.
-
-    Returns:
-        None where the file has no such key, and so does not say.
-
-    Raises:
-        UserError: if the key holds anything else, or names an entry that is not there.
-    """
-    if TUNED_ON not in entries:
-        return None
+def _read_tuned_on(entries: Mapping[str, Any], where: str) -> dict[str, tuple[range, ...]]:
+    """The seeds that each entry was tuned on: ``{first: 0, count: 10}``, or a list of such."""
     said = entries[TUNED_ON]
     if not isinstance(said, dict):
-        raise UserError(f"{where}: {TUNED_ON} must map entries to seeds, not be {shown(said)}")
+        raise UserError(f"{where} must map entries to seeds, not be {shown(said)}")
     missing = next((name for name in said if name not in entries or name == TUNED_ON), None)
     if missing is not None:
-        raise UserError(f"{where}: {TUNED_ON} names {shown(missing)}, which has no entry there")
+        raise UserError(f"{where} names {shown(missing)}, which has no entry there")
     return {
-        name: tuple(_seeds(item, f"{where}: {TUNED_ON}: {name}") for item in _listed(seeds))
+        name: tuple(
+            _seeds(item, f"{where}: {name}")
+            for item in (seeds if isinstance(seeds, list) else [seeds])
+        )
         for name, seeds in said.items()
     }
-
-
-def _listed(seeds: Any) -> list[Any]:
-    return seeds if isinstance(seeds, list) else [seeds]
 
 
 def _seeds(given: Any, where: str) -> range:

@@ -27,7 +27,6 @@ from typing import Any, Literal, Union, get_args, get_origin
 from pipeline.errors import UserError, did_you_mean, one_line, shown, unknown
 from pipeline.settings.yaml import parse_yaml
 
-# A deeper or longer expression than this is no hyperparameter, and could exhaust the parser.
 _MAX_CHARACTERS = 10_000
 
 
@@ -42,28 +41,11 @@ class DottedName:
 
 
 class _RefusedError(Exception):
-    """A part of the syntax tree that is not a literal."""
-
-    def __init__(self, what: str, node: ast.AST) -> None:
-        super().__init__(what)
-        self.what = what
-        self.node = node
+    """Arguments: what is wrong with a part of the syntax tree, and the part."""
 
 
 def parse_literal(text: str, where: str = "") -> Any:
-    """Read a literal: ``"[64, 64]"``, ``"{'a': 1}"``, ``"dict(net_arch=[64], act=nn.Tanh)"``.
-
-    Args:
-        text: a number, text, True, False, None, list, tuple or dictionary, in Python's spelling;
-            ``dict(...)``, ``list(...)`` and ``tuple(...)`` stand for their contents.
-        where: what the text belongs to, for error messages.
-
-    Returns:
-        The value; names of classes in it are `DottedName`.
-
-    Raises:
-        UserError: if the text is anything else, saying at which column.
-    """
+    """Read a literal: ``"[64, 64]"``, ``"{'a': 1}"``, ``"dict(net_arch=[64], act=nn.Tanh)"``."""
     text = text.strip()
     try:
         return _convert(_parse(text))
@@ -71,7 +53,8 @@ def parse_literal(text: str, where: str = "") -> Any:
         line, column = error.lineno or 1, error.offset or 1
         what = f"invalid syntax ({error.msg})"
     except _RefusedError as error:
-        line, column, what = *_position(text, error.node), error.what
+        what, node = error.args
+        line, column = _position(text, node)
     except (ValueError, RecursionError, MemoryError) as error:
         line, column, what = 1, 1, f"cannot be read ({one_line(error)})"
     place = f"line {line}, column {column}" if "\n" in text else f"column {column}"
@@ -90,17 +73,8 @@ def contains_name(value: object) -> bool:
 def parse_assignments(assignments: Iterable[str], where: str = "") -> dict[str, Any]:
     """Read what ``-params`` and ``--env-kwargs`` take: a list of ``key:value``.
 
-    Args:
-        assignments: such as ``learning_rate:0.01``, ``policy_kwargs:"dict(net_arch=[64])"``,
-            ``desc:map.txt`` or ``is_slippery:false``.
-        where: the option that they belong to, for error messages.
-
-    Returns:
-        The values by key. A value is a literal in Python's or YAML's spelling, or else text; text
-        also where the names of classes stand in it, since it goes into the run folder as it is.
-
-    Raises:
-        UserError: if one has no key, no value, or a key that came before.
+    A value is a literal in Python's or YAML's spelling, or else text; text also where the names of
+    classes stand in it, since it goes into the run folder as it is.
     """
     prefix = f"{where}: " if where else ""
     result: dict[str, Any] = {}
@@ -143,6 +117,7 @@ def _value_or_text(text: str) -> Any:
 
 
 def _parse(text: str) -> ast.expr:
+    # A deeper or longer expression is no hyperparameter, and could exhaust the parser.
     if len(text) > _MAX_CHARACTERS:
         raise ValueError(f"longer than {_MAX_CHARACTERS} characters")
     with warnings.catch_warnings():
@@ -168,13 +143,19 @@ def _convert(node: ast.expr) -> Any:
             return tuple(_convert(item) for item in node.elts)
         case ast.Dict():
             return _convert_dict(node, node.keys, node.values)
-        case ast.UnaryOp(op=ast.USub() | ast.UAdd()):
-            return _convert_signed(node)
+        case ast.UnaryOp(op=ast.USub() | ast.UAdd(), operand=operand):
+            number = _convert(operand)
+            if isinstance(number, bool) or not isinstance(number, int | float):
+                raise _RefusedError("a sign needs a number", node)
+            return -number if isinstance(node.op, ast.USub) else number
         case ast.Call(func=ast.Name(id="dict"), args=[]):
             keys = [keyword.arg and ast.Constant(keyword.arg) for keyword in node.keywords]
             return _convert_dict(node, keys, [keyword.value for keyword in node.keywords])
         case ast.Call(func=ast.Name(id="list" | "tuple" as name), args=[argument], keywords=[]):
-            return _convert_sequence(argument, list if name == "list" else tuple)
+            items = _convert(argument)
+            if not isinstance(items, list | tuple):
+                raise _RefusedError(f"{name}(...) needs a list or tuple", argument)
+            return list(items) if name == "list" else tuple(items)
         case ast.Name() | ast.Attribute():
             return _convert_name(node)
     raise _RefusedError("is not a literal, dict(...) or the name of a class; nothing is run", node)
@@ -194,20 +175,6 @@ def _convert_dict(
             raise _RefusedError(f"key {shown(key)} appears twice", value)
         result[key] = _convert(value)
     return result
-
-
-def _convert_signed(node: ast.UnaryOp) -> int | float:
-    number = _convert(node.operand)
-    if isinstance(number, bool) or not isinstance(number, int | float):
-        raise _RefusedError("a sign needs a number", node)
-    return -number if isinstance(node.op, ast.USub) else number
-
-
-def _convert_sequence(node: ast.expr, kind: type[list[Any]] | type[tuple[Any, ...]]) -> Any:
-    items = _convert(node)
-    if not isinstance(items, list | tuple):
-        raise _RefusedError(f"{kind.__name__}(...) needs a list or tuple", node)
-    return kind(items)
 
 
 def _convert_name(node: ast.expr) -> DottedName:
@@ -243,19 +210,10 @@ class _MisfitError(Exception):
 
 
 def coerce(value: Any, annotation: Any, where: str) -> Any:
-    """Read ``value`` as ``annotation`` asks.
+    """Read a plain value as an annotation asks; of a union the first reading that fits.
 
-    Args:
-        value: a plain value, as it stands in a file or on the command line.
-        annotation: a type; of a union the first reading that fits, numbers before texts.
-        where: names the value in error messages.
-
-    Returns:
-        The value; classes as `DottedName`, schedules as `ScheduleSpec`. Where the annotation allows
-        a type not known here, what fits no other is left as it was.
-
-    Raises:
-        UserError: if no reading fits.
+    Classes become a `DottedName`, schedules a `ScheduleSpec`. Where the annotation allows a type
+    not known here, what fits no other is left as it was.
     """
     options = _options(annotation)
     for kind, read in _READERS:
@@ -275,12 +233,10 @@ def coerce(value: Any, annotation: Any, where: str) -> Any:
 
 def parse_schedule(text: str, where: str) -> ScheduleSpec:
     """Read ``lin_0.001`` (to 0), ``lin_0.001_0.0001`` or ``exp_0.001_0.0001``."""
-    match = _SCHEDULE.fullmatch(text)
-    try:
-        start, end = (_finite(part or "0") for part in match.group(2, 3)) if match else (0.0, 0.0)
-    except _MisfitError:
-        match = None
-    if not match or match[1] not in {"lin", "exp"}:
+    match, start, end = _SCHEDULE.fullmatch(text), math.nan, math.nan
+    with contextlib.suppress(ValueError):
+        start, end = (float(part or "0") for part in match.group(2, 3)) if match else (start, end)
+    if not match or match[1] not in {"lin", "exp"} or not all(map(math.isfinite, (start, end))):
         raise UserError(f"{where}: unknown schedule {shown(text)}: there are {_SCHEDULE_FORMS}")
     if match[1] == "lin":
         return ScheduleSpec("linear", start, end)
@@ -316,9 +272,10 @@ def _describe_option(option: Any) -> str:
     return _DESCRIPTIONS.get(kind, "a value")
 
 
-def _read_none(value: Any, option: Any, where: str) -> None:
-    if value is not None:
+def _read_as_it_is(value: Any, option: Any, where: str) -> Any:
+    if not isinstance(value, _kind(option)):
         raise _MisfitError
+    return value
 
 
 def _read_choice(value: Any, option: Any, where: str) -> Any:
@@ -326,12 +283,6 @@ def _read_choice(value: Any, option: Any, where: str) -> Any:
         if type(choice) is type(value) and choice == value:
             return choice
     raise _MisfitError
-
-
-def _read_bool(value: Any, option: Any, where: str) -> bool:
-    if not isinstance(value, bool):
-        raise _MisfitError
-    return value
 
 
 def _read_int(value: Any, option: Any, where: str) -> int:
@@ -359,13 +310,6 @@ def _read_float(value: Any, option: Any, where: str) -> float:
     return number
 
 
-def _finite(text: str) -> float:
-    number = _read_float(text, float, "")
-    if math.isinf(number):
-        raise _MisfitError
-    return number
-
-
 def _read_schedule(value: Any, option: Any, where: str) -> ScheduleSpec:
     if isinstance(value, ScheduleSpec):
         return value
@@ -384,12 +328,6 @@ def _read_class(value: Any, option: Any, where: str) -> DottedName:
     if isinstance(value, str) and _CLASS_NAME.fullmatch(value):
         return DottedName(value)
     if not isinstance(value, DottedName):
-        raise _MisfitError
-    return value
-
-
-def _read_text(value: Any, option: Any, where: str) -> str:
-    if not isinstance(value, str):
         raise _MisfitError
     return value
 
@@ -429,14 +367,14 @@ def _items(value: Any, where: str) -> Sequence[Any]:
 
 # In this order: a text is what remains when it is no number, schedule or dotted name.
 _READERS: tuple[tuple[Any, Callable[[Any, Any, str], Any]], ...] = (
-    (types.NoneType, _read_none),
+    (types.NoneType, _read_as_it_is),
     (Literal, _read_choice),
-    (bool, _read_bool),
+    (bool, _read_as_it_is),
     (int, _read_int),
     (float, _read_float),
     (Callable, _read_schedule),
     (type, _read_dotted_class),
-    (str, _read_text),
+    (str, _read_as_it_is),
     (type, _read_class),
     (dict, _read_mapping),
     (list, _read_list),
