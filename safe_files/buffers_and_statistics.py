@@ -23,7 +23,7 @@ from safe_files.files import (
     UnsafeFileError,
     content_of,
 )
-from safe_files.known_objects import MAX_ROWS, full_name, read_pickle
+from safe_files.known_objects import MAX_ROWS, by_name, read_pickle
 from safe_files.pickles import Build, Made, fields, wrong
 
 # --- replay buffers -------------------------------------------------------------------------------
@@ -64,7 +64,7 @@ def load_replay_buffer(
         OSError: if it cannot be read.
     """
     known: tuple[type[ReplayBuffer], ...] = (*_CLASSES, *classes)
-    makers = {full_name(cls): partial(_stored, cls) for cls in known}
+    makers = {name: partial(_stored, cls) for name, cls in by_name(known).items()}
     found = read_pickle(content_of(path, MAX_BUFFER_BYTES), makers=makers)
     if not isinstance(found, _Stored):
         raise UnsafeFileError("holds no replay buffer")

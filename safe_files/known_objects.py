@@ -1,8 +1,4 @@
-"""All that may stand in files of models, and what makes it from what a file says.
-
-Each object is made by its constructor and from checked values. No class that a file names is called
-with anything but a model's settings.
-"""
+"""The objects that may stand in files of models, each made by its constructor of checked values."""
 
 from __future__ import annotations
 
@@ -82,8 +78,6 @@ def _of_state(make: Callable[..., Any], /, **kinds: tuple[type, ...]) -> Maker:
 _NUMBERS = (int, float, np.number, np.ndarray)
 # Booleans, whole numbers, floats; no texts, records, dates, and no Python objects.
 _TYPES = frozenset(["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8"])
-_OBJECT = "O8"
-_ORDERS = "<>=|"
 _MAX_POOL = 64
 
 
@@ -91,9 +85,9 @@ def _dtype(made: Made, build: Build) -> np.dtype[Any]:
     code = made.args[0] if made.args else None
     state = made.state
     order = state[1] if isinstance(state, tuple) and len(state) > 1 else "="
-    if code == _OBJECT:
+    if code == "O8":
         return np.dtype(object)
-    if code not in _TYPES or not isinstance(order, str) or order not in _ORDERS:
+    if code not in _TYPES or not isinstance(order, str) or order not in "<>=|":
         raise UnsafeFileError("holds an array of a type other than numbers")
     return np.dtype(str(code)).newbyteorder(order)  # type: ignore[arg-type]
 
@@ -144,10 +138,6 @@ def _reconstructed(made: Made, build: Build) -> NDArray[Any]:
     return _array(data, dtype, shape, "F" if is_fortran else "C")
 
 
-def _scalar(dtype: np.dtype[Any], data: bytes) -> Any:
-    return _array(data, dtype, (), "C")[()]
-
-
 def _seed_sequence(made: Made, build: Build) -> np.random.SeedSequence:
     entropy, n_children, _, pool_size, spawn_key = _state_of_five(made, build)
     if not (isinstance(pool_size, int) and pool_size <= _MAX_POOL):
@@ -181,7 +171,9 @@ _OF_NUMPY: Mapping[str, Maker] = {
     "numpy.dtype": _dtype,
     "numpy._core.numeric._frombuffer": _from_buffer,
     "numpy._core.multiarray._reconstruct": _reconstructed,
-    "numpy._core.multiarray.scalar": _called(_scalar, np.dtype, bytes),
+    "numpy._core.multiarray.scalar": _called(
+        lambda dtype, data: _array(data, dtype, (), "C")[()], np.dtype, bytes
+    ),
     "numpy.random.bit_generator.__pyx_unpickle_SeedSequence": _seed_sequence,
     "numpy.random._pickle.__bit_generator_ctor": _bit_generator,
     "numpy.random._pickle.__generator_ctor": _generator,
@@ -198,6 +190,7 @@ _CLASSES_OF_NUMPY: Mapping[str, type] = {
 
 
 # --- tensors --------------------------------------------------------------------------------------
+
 # PyTorch's own reader believes what a file says of its tensors: a few bytes can stand for any
 # number of elements. Here a tensor is made of the bytes of its storage, and shows each of them at
 # most once.
@@ -349,72 +342,62 @@ def tensors_in(content: Any, path: str = "") -> Iterator[tuple[str, th.Tensor]]:
 
 # Beyond this no table or network has an input.
 _MAX_SIZE = 10_000_000
-_Space = spaces.Space[Any]
 
 
-def _box(state: Mapping[str, Any]) -> _Space:
-    low, high = np.asarray(state["low"]), np.asarray(state["high"])
-    return spaces.Box(low, high, dtype=state["dtype"].type)
-
-
-def _discrete(state: Mapping[str, Any]) -> _Space:
-    n, start = int(state["n"]), int(state.get("start", 0))
-    if not 0 < n <= _MAX_SIZE:
-        raise ValueError("too many values")
-    dtype = state.get("dtype")
-    return spaces.Discrete(n, start=start, **({} if dtype is None else {"dtype": dtype.type}))
-
-
-def _multi_discrete(state: Mapping[str, Any]) -> _Space:
-    counts = np.asarray(state["nvec"])
-    if counts.sum() > _MAX_SIZE:
-        raise ValueError("too many values")
-    start = state.get("start")
-    return spaces.MultiDiscrete(counts, dtype=state["dtype"].type, start=start)
-
-
-def _multi_binary(state: Mapping[str, Any]) -> _Space:
-    n = state["n"]
-    shape = n if isinstance(n, tuple) else (int(n),)
-    if np.prod(shape, dtype=float) > _MAX_SIZE:
-        raise ValueError("too many values")
-    return spaces.MultiBinary(n)
-
-
-def _space(make: Callable[[Mapping[str, Any]], _Space]) -> Maker:
-    def maker(made: Made, build: Build) -> _Space:
-        state = fields(made, build)
-        space = make(state)
-        generator = state.get("_np_random")
-        if isinstance(generator, np.random.Generator):
-            # Whoever goes on with the model draws on from where it was.
-            space._np_random = generator
-        return space
-
-    return maker
+def _space(made: Made, build: Build) -> spaces.Space[Any]:
+    state = fields(made, build)
+    kind = made.name.rpartition(".")[2]
+    space: spaces.Space[Any]
+    if kind == "Box":
+        low, high = np.asarray(state["low"]), np.asarray(state["high"])
+        space = spaces.Box(low, high, dtype=state["dtype"].type)
+    elif kind in {"Tuple", "Dict"}:
+        parts = state["spaces"]
+        space = spaces.Tuple(tuple(parts)) if kind == "Tuple" else spaces.Dict(dict(parts))
+    elif kind == "Discrete":
+        n, start = int(state["n"]), int(state.get("start", 0))
+        if not 0 < n <= _MAX_SIZE:
+            raise wrong(made)
+        dtype = {} if state.get("dtype") is None else {"dtype": state["dtype"].type}
+        space = spaces.Discrete(n, start=start, **dtype)
+    elif kind == "MultiDiscrete":
+        counts = np.asarray(state["nvec"])
+        if counts.sum() > _MAX_SIZE:
+            raise wrong(made)
+        first = state.get("start")
+        space = spaces.MultiDiscrete(counts, dtype=state["dtype"].type, start=first)
+    else:
+        n = state["n"]
+        if np.prod(n if isinstance(n, tuple) else int(n), dtype=float) > _MAX_SIZE:
+            raise wrong(made)
+        space = spaces.MultiBinary(n)
+    generator = state.get("_np_random")
+    if isinstance(generator, np.random.Generator):
+        # Whoever goes on with the model draws on from where it was.
+        space._np_random = generator
+    return space
 
 
 _SPACES: Mapping[str, Maker] = {
-    "gymnasium.spaces.box.Box": _space(_box),
-    "gymnasium.spaces.discrete.Discrete": _space(_discrete),
-    "gymnasium.spaces.multi_discrete.MultiDiscrete": _space(_multi_discrete),
-    "gymnasium.spaces.multi_binary.MultiBinary": _space(_multi_binary),
-    "gymnasium.spaces.tuple.Tuple": _space(lambda state: spaces.Tuple(tuple(state["spaces"]))),
-    "gymnasium.spaces.dict.Dict": _space(lambda state: spaces.Dict(dict(state["spaces"]))),
+    f"gymnasium.spaces.{name}": _space
+    for name in (
+        "box.Box",
+        "discrete.Discrete",
+        "multi_discrete.MultiDiscrete",
+        "multi_binary.MultiBinary",
+        "tuple.Tuple",
+        "dict.Dict",
+    )
 }
 
 
 # --- schedules: the library's, rl_zoo3's, and ours of PyTorch's parts -----------------------------
 
 _NUMBER = (int, float)
-_TRANSFORM = {"_cache_size": (int,), "_inv": (type(None),)}
 
 
 def proportional(initial_value: float) -> Callable[[float], float]:
-    """What falls from ``initial_value`` to 0 in proportion to the progress remaining.
-
-    It is made of Python's own parts, so that a zip that holds it opens wherever Python does.
-    """
+    """A linear schedule to 0 that a zip holds without any class of ours."""
     return partial(operator.mul, initial_value)
 
 
@@ -434,7 +417,7 @@ def _transform(make: Callable[..., Any], /, **kinds: tuple[type, ...]) -> Maker:
             raise ValueError("it keeps values")
         return make(*values)
 
-    return _of_state(made_of, **_TRANSFORM, **kinds)
+    return _of_state(made_of, _cache_size=(int,), _inv=(type(None),), **kinds)
 
 
 def _affine(loc: Any, scale: Any, event_dim: int) -> AffineTransform:
@@ -561,13 +544,9 @@ _OF_LIBRARIES: Mapping[str, Maker] = {
 # --- classes, and the tables as a whole -----------------------------------------------------------
 
 
-def full_name(cls: type) -> str:
-    """The class's module and qualified name."""
-    return f"{cls.__module__}.{cls.__qualname__}"
-
-
-def _by_name(classes: Iterable[type]) -> dict[str, type]:
-    return {full_name(cls): cls for cls in classes}
+def by_name(classes: Iterable[type]) -> dict[str, type]:
+    """Classes by their module and qualified name."""
+    return {f"{cls.__module__}.{cls.__qualname__}": cls for cls in classes}
 
 
 def _subclasses_in(module: object, base: type) -> Iterable[Any]:
@@ -583,7 +562,7 @@ def _library_classes() -> Mapping[str, type]:
         from sb3_contrib.common.recurrent import buffers as recurrent
 
         modules += [maskable, recurrent]
-    found = _by_name(
+    found = by_name(
         [
             *(cls for module in modules for cls in _subclasses_in(module, buffers.BaseBuffer)),
             *(HerReplayBuffer, RMSpropTFLike, nn.Identity),
@@ -610,7 +589,7 @@ def all_policy_classes() -> Mapping[str, type]:
 
 def policy_classes(algorithm: type[BaseAlgorithm]) -> Mapping[str, type]:
     """The policies that the algorithm knows, by their full names."""
-    return _by_name(algorithm.policy_aliases.values())
+    return by_name(algorithm.policy_aliases.values())
 
 
 _MAKERS: Mapping[str, Maker] = {**_OF_NUMPY, **_SPACES, **_SCHEDULES, **_OF_LIBRARIES}
@@ -622,10 +601,7 @@ def read_pickle(
     makers: Mapping[str, Maker] | None = None,
     budget: Budget | None = None,
 ) -> Any:
-    """What a pickle stands for, made without unpickling.
-
-    It may also name further classes, and objects for which there are further makers.
-    """
+    """What a pickle stands for, made without unpickling; it may hold further objects by name."""
     budget = budget or Budget(len(pickled))
     build = Build({**_MAKERS, **(makers or {})}, {**_library_classes(), **(classes or {})}, budget)
     return build.whole(read_tree(pickled, budget))

@@ -1,24 +1,22 @@
-"""Choosing the model to play or to train further, and what it is played on.
+"""Chooses the model to play or to train further, and makes the spec of its environments.
 
-What the environment is made of comes from, the first first:
+Agent, environment and settings come from the first of these that says them:
 
-1. the request: agent, environment, arguments of the environment, statistics;
+1. the request;
 2. for hand-written agents, the zip, which says what agent it holds;
 3. what the model's folder says, see `pipeline.models.find`;
 4. the entry of ``hyperparams/<algo>.yml``, apart from ``normalize``, where the folder says nothing.
 
-Statistics of VecNormalize are used wherever there are some that belong to the model, since they lie
-there for no other reason than that it was trained on them.
-
-Further training begins a new run, in a folder of its own. As in rl_zoo3, the agent's networks or
-tables, its statistics and its replay buffer go on, and hyperparameters are those of the new run's
-entry. Other than there, the agent's steps are counted on, and schedules are where so many of all
-steps put them, rather than at their beginning.
+Statistics of VecNormalize are used wherever there are some that belong to the model. Further
+training begins a new run, in a folder of its own, with the hyperparameters of that run's entry. As
+in rl_zoo3, the agent's networks or tables, its statistics and its replay buffer go on. Other than
+there, the agent's steps are counted on, and schedules go by all steps, rather than begin anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -110,22 +108,31 @@ def find_model(request: ModelRequest) -> ChosenModel:
     if request.statistics is not None and not request.statistics.is_file():
         raise UserError(f"no such file of statistics: {request.statistics}")
     if request.path is None:
-        chosen = _newest(request)
+        algo, env_id = request.algo or "ppo", request.env_id or "CartPole-v1"
+        found = _find_run(algo, env_id, request)
+        run: Run | None = found
+        file = read_model(model_of(found, request.which), run)
+        recorded = recorded_run(run)
     else:
-        chosen = _model_at(model_at(request.path, request.which), request)
-    return replace(chosen, spec=telling_masks(chosen.spec, chosen.file))
+        path = model_at(request.path, request.which)
+        run = run_around(path)
+        file = read_model(path, run)
+        _check_modules(run, request.zipped_in)
+        recorded = recorded_run(run)
+        named = request.algo or hand_written_algorithm(file) or recorded.algo
+        algo, env_id = named or "", request.env_id or recorded.env_id or ""
+        if not (algo and env_id):
+            missing = "--env" if algo else "--algo"
+            raise UserError(f"{path} is in no run folder: say what it is with {missing}")
+        check_algorithm(algo)
+        check_env_id(env_id)
+    spec = telling_masks(_spec(algo, env_id, recorded, request), file)
+    return ChosenModel(file, spec, run)
 
 
 def model_of_run(path: Path, spec: TrainSpec, run: Run) -> ChosenModel:
     """A model of a run whose spec is known, ready to be played."""
     return with_statistics(ChosenModel(read_model(path, run), spec, run))
-
-
-def _newest(request: ModelRequest) -> ChosenModel:
-    algo, env_id = request.algo or "ppo", request.env_id or "CartPole-v1"
-    run = _find_run(algo, env_id, request)
-    file = read_model(model_of(run, request.which), run)
-    return ChosenModel(file, _spec(algo, env_id, recorded_run(run), request), run)
 
 
 def _find_run(algo: str, env_id: str, request: ModelRequest) -> Run:
@@ -150,27 +157,15 @@ def _check_modules(run: Run | None, zipped_in: Path | None = None) -> None:
         check_recorded({"gym_packages": packages, **run.recorded_spec()}, run.path, zipped_in)
 
 
-def _model_at(path: Path, request: ModelRequest) -> ChosenModel:
-    run = run_around(path)
-    file = read_model(path, run)
-    _check_modules(run, request.zipped_in)
-    recorded = recorded_run(run)
-    hand_written = hand_written_algorithm(file)
-    algo = request.algo or hand_written or recorded.algo
-    env_id = request.env_id or recorded.env_id
-    if algo is None or env_id is None:
-        missing = "--algo" if algo is None else "--env"
-        raise UserError(f"{path} is in no run folder: say what it is with {missing}")
-    check_algorithm(algo)
-    check_env_id(env_id)
-    return ChosenModel(file, _spec(algo, env_id, recorded, request), run)
-
-
 def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) -> TrainSpec:
     """How the environments are made, by the order at the head of this module."""
     raw = recorded.hyperparams
     if raw is None:
-        raw = _without_normalize(algo, env_id)
+        # Whether a model was trained on normalised observations is its own.
+        entry: dict[str, Any] = {}
+        with suppress(NoEntryError):
+            entry = without_auto(read_hyperparams(algo, env_id))
+        raw = {key: value for key, value in entry.items() if key != "normalize"}
     hyperparams = split(raw)
     # Where episodes are judged, these win over all others.
     env_kwargs = {**hyperparams.eval_env_kwargs, **request.env_kwargs}
@@ -186,20 +181,10 @@ def _spec(algo: str, env_id: str, recorded: RecordedRun, request: ModelRequest) 
     )
 
 
-def _without_normalize(algo: str, env_id: str) -> dict[str, Any]:
-    """The default settings; whether a model was trained on normalised observations is its own."""
-    try:
-        entry = read_hyperparams(algo, env_id)
-    except NoEntryError:
-        return {}
-    return {key: value for key, value in without_auto(entry).items() if key != "normalize"}
-
-
 def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenModel:
     """The model with the statistics that it is played with, which are there and may be read."""
-    params_path = None if chosen.run is None else chosen.run.params_path
     path, normalize = (
-        named or statistics_of(chosen.path, params_path),
+        named or statistics_of(chosen.path, chosen.run),
         chosen.spec.hyperparams.normalize,
     )
     if path is None:
@@ -215,14 +200,11 @@ def with_statistics(chosen: ChosenModel, named: Path | None = None) -> ChosenMod
 
 
 def agent_to_continue(path: Path) -> Path:
-    """The zip that a path means, with or without its suffix, or of a run folder.
-
-    What goes with it is looked at too, before a run begins that could not.
-    """
+    """The zip that a path means, once it and what goes with it were checked."""
     model = model_at(path)
     run = run_around(model)
     read_model(model, run)
-    for file in (_statistics_path(model), replay_buffer_of(model)):
+    for file in (statistics_of(model, run), replay_buffer_of(model)):
         if file is not None:
             check_digest(run, file)
     return model
@@ -239,8 +221,9 @@ def statistics_to_continue(spec: TrainSpec) -> Statistics | None:
     """The statistics that go on with the agent; None where there are none, or none are wanted."""
     if spec.trained_agent is None or spec.saved_hyperparams.get("normalize") is False:
         return None
-    path = _statistics_path(spec.trained_agent)
-    return None if path is None else read_statistics(path, run_around(spec.trained_agent))
+    run = run_around(spec.trained_agent)
+    path = statistics_of(spec.trained_agent, run)
+    return None if path is None else read_statistics(path, run)
 
 
 def continuing(spec: TrainSpec, statistics: Statistics) -> TrainSpec:
@@ -262,8 +245,3 @@ def load_to_continue(spec: TrainSpec, file: ModelFile, env: VecEnv, **kwargs: An
     if replay_buffer is not None:
         load_replay_buffer(model, replay_buffer, run_around(file.path))
     return model
-
-
-def _statistics_path(model: Path) -> Path | None:
-    run = run_around(model)
-    return statistics_of(model, None if run is None else run.params_path)

@@ -1,4 +1,4 @@
-"""Which files are a model and what belongs to it, and what their folder says of the agent.
+"""Finds the files that belong to a model, and reads what their folder says of the agent.
 
 A folder is a run of ours, one of rl_zoo3, or a model hub's download:
 
@@ -43,7 +43,6 @@ class RecordedRun:
     hyperparams: dict[str, Any] | None = None
     # modules that were imported for the environments that they register
     gym_packages: tuple[str, ...] = ()
-    is_own: bool = False  # whether this project recorded it
 
 
 def run_of(path: Path) -> Run | None:
@@ -100,11 +99,11 @@ def recorded_run(run: Run | None) -> RecordedRun:
             _text(spec.get("env_id")),
             entry if isinstance(entry, dict) else None,
             _texts(spec.get("gym_packages")),
-            is_own=True,
         )
     if not _has_settings(run.params_path):
         return RecordedRun()
-    args, config = _read(run.params_path / "args.yml"), _read(run.params_path / "config.yml")
+    paths = [run.params_path / name for name in _SETTINGS_FILES]
+    args, config = (read_saved_settings(path) if path.is_file() else {} for path in paths)
     if args.get("env_kwargs") is not None:
         config = {**config, "env_kwargs": args["env_kwargs"]}
     return RecordedRun(
@@ -123,18 +122,7 @@ def check_digest(run: Run | None, path: Path) -> None:
 
 
 def read_recorded(run: Run | None, path: Path, limit: int) -> bytes:
-    """All of a file; where a run recorded what it was, it is as the run left it.
-
-    Args:
-        run: the run that the file belongs to, or None.
-        path: the file.
-        limit: the most bytes that it may have.
-
-    Raises:
-        UserError: if it is not so.
-        UnsafeFileError: if a file of no run is no regular file, or too large.
-        OSError: if such a file cannot be read.
-    """
+    """All of a file of at most so many bytes; that of a run has to be as the run left it."""
     if run is None:
         return read_file(path, limit)
     try:
@@ -145,10 +133,6 @@ def read_recorded(run: Run | None, path: Path, limit: int) -> bytes:
 
 def _with_way_out(error: DamagedFileError) -> UserError:
     return UserError(f"{error}: train again, or name another copy of it")
-
-
-def _read(path: Path) -> dict[str, Any]:
-    return read_saved_settings(path) if path.is_file() else {}
 
 
 def _has_settings(folder: Path) -> bool:
@@ -175,16 +159,12 @@ _REPLAY_BUFFER = "replay_buffer.pkl"
 
 
 def statistics_path(model: Path) -> Path:
-    """Where the statistics of a model's own moment lie.
-
-    ``best_model_vecnormalize.pkl`` for ``best_model.zip``, ``rl_model_vecnormalize_<n>_steps.pkl``
-    for ``rl_model_<n>_steps.zip``.
-    """
+    """Where a checkpoint's statistics lie, such as ``rl_model_vecnormalize_<n>_steps.pkl``."""
     return _companion(model, "vecnormalize")
 
 
 def replay_buffer_path(model: Path) -> Path:
-    """Where the replay buffer of a checkpoint's moment lies, named likewise."""
+    """Where a checkpoint's replay buffer lies, named likewise."""
     return _companion(model, "replay_buffer")
 
 
@@ -193,24 +173,15 @@ def final_replay_buffer_path(folder: Path) -> Path:
     return folder / _REPLAY_BUFFER
 
 
-def statistics_of(model: Path, params_path: Path | None) -> Path | None:
-    """The statistics that belong to a model, or None where there are none.
-
-    Args:
-        model: the zip.
-        params_path: the folder of its run's settings, if it has one.
-
-    Returns:
-        The first that there is of: those of its own moment; ``vecnormalize.pkl`` of its run's end;
-        ``vec_normalize.pkl`` or ``vecnormalize.pkl`` beside it, as model hubs have them.
-    """
-    settings = [] if params_path is None else [params_path / "vecnormalize.pkl"]
+def statistics_of(model: Path, run: Run | None) -> Path | None:
+    """The statistics that belong to a model: the checkpoint's, its run's last, or a model hub's."""
+    settings = [] if run is None else [run.vecnormalize_path]
     beside = [model.with_name(name) for name in ("vec_normalize.pkl", "vecnormalize.pkl")]
     return _first(statistics_path(model), *settings, *beside)
 
 
 def replay_buffer_of(model: Path) -> Path | None:
-    """The replay buffer that belongs to a model: of its own moment, or else its run's last one."""
+    """The replay buffer that belongs to a model: the checkpoint's, or else its run's last one."""
     return _first(replay_buffer_path(model), model.with_name(_REPLAY_BUFFER))
 
 
@@ -250,7 +221,19 @@ def model_at(path: Path, which: Which = "final") -> Path:
 
 def model_of(run: Run, which: Which = "final") -> Path:
     """The zip of a run."""
-    path = _path_in(run, which)
+    if not run.path.is_dir():
+        raise UserError(f"{run.path} is no run folder")
+    if isinstance(which, int):
+        path = run.checkpoint_path(which)
+    elif which == "best":
+        path = run.best_model_path
+    elif which == "last checkpoint":
+        checkpoints = run.checkpoints()
+        if not checkpoints:
+            raise UserError(f"{run.path} holds no checkpoint: train with --save-freq")
+        path = checkpoints[-1]
+    else:
+        path = run.model_path if run.env_name else _only_model(run)
     if not path.exists():
         known = ", ".join(path.stem.split("_")[-2] for path in run.checkpoints())
         reason = "its training may not have ended"
@@ -260,21 +243,6 @@ def model_of(run: Run, which: Which = "final") -> Path:
             reason = f"there are checkpoints after {known} steps"
         raise UserError(f"{run.path} holds no {path.name}: {reason}")
     return path
-
-
-def _path_in(run: Run, which: Which) -> Path:
-    if not run.path.is_dir():
-        raise UserError(f"{run.path} is no run folder")
-    if isinstance(which, int):
-        return run.checkpoint_path(which)
-    if which == "best":
-        return run.best_model_path
-    if which == "last checkpoint":
-        checkpoints = run.checkpoints()
-        if not checkpoints:
-            raise UserError(f"{run.path} holds no checkpoint: train with --save-freq")
-        return checkpoints[-1]
-    return run.model_path if run.env_name else _only_model(run)
 
 
 def _only_model(run: Run) -> Path:

@@ -1,4 +1,4 @@
-"""Agents and their statistics, from files and into them; nothing in a file is run.
+"""Loads and saves agents and their statistics; nothing in a file is run.
 
 What a zip says of its agent is plain JSON, and read without making an agent. What else it may hold
 are classes of the libraries and ours, and networks, optimizers and buffers of the user's: those of
@@ -72,14 +72,10 @@ def read_model(path: Path, run: Run | None = None) -> ModelFile:
         raise UserError(f"{path} is no whole zip of an agent: {one_line(error)}") from error
 
 
-def saved_observation(model: ModelFile) -> str | None:
-    """What a library's zip says of the space that its agent observes; None if nothing plain."""
-    space = model.data.get("observation_space")
-    return shown_space(space) if isinstance(space, dict) else None
-
-
-def shown_space(attributes: Mapping[str, Any]) -> str | None:
+def _shown_space(attributes: Any) -> str | None:
     """A space in words, by its attributes; None where they say nothing plain."""
+    if not isinstance(attributes, dict):
+        return None
     if "n" in attributes:
         return f"{attributes['n']} kinds"
     shape = attributes.get("_shape")
@@ -137,17 +133,17 @@ def own_classes(
     # No others: what a file names as a part of a network is called with what it says.
     kinds = (nn.Module, optim.Optimizer, BaseBuffer)
     homes = {module.name for module in modules} | {algorithm.__module__}
+
+    def lies_in(name: str) -> bool:
+        return any(f"{name}.".startswith(f"{home}.") for home in homes)
+
     found: dict[str, type] = {}
     for name, module in list(sys.modules.items()):
-        if any(f"{name}.".startswith(f"{home}.") for home in homes):
+        if lies_in(name):
             for value in list(vars(module).values()):
                 if isinstance(value, type) and issubclass(value, kinds):
                     found |= {f"{value.__module__}.{value.__qualname__}": value}
-    return {name: cls for name, cls in found.items() if _lies_in(cls, homes)}
-
-
-def _lies_in(cls: type, homes: Iterable[str]) -> bool:
-    return any(f"{cls.__module__}.".startswith(f"{home}.") for home in homes)
+    return {name: cls for name, cls in found.items() if lies_in(cls.__module__)}
 
 
 # What a class of the user's may stand for in a zip.
@@ -171,17 +167,9 @@ def load_model(
 ) -> BaseAlgorithm:
     """Load an agent from its zip, as data: nothing in it is run, whoever wrote it.
 
-    Args:
-        algo: name of the agent.
-        model: the zip, or where it lies.
-        env: environment to go on with, or None.
-        modules: those that the user typed: the zip may name classes of theirs.
-        kwargs: attributes to change.
-
-    Raises:
-        UserError: if the file is not a zip of such an agent, or does not fit ``env``.
+    It may name classes of the modules that the user typed. ``kwargs`` are attributes to change.
     """
-    file = _read(model)
+    file = model if isinstance(model, ModelFile) else read_model(model)
     algorithm = agent_class(algo)
     try:
         with warnings.catch_warnings():
@@ -226,10 +214,6 @@ def _loaded(
     )
 
 
-def _read(model: ModelFile | Path) -> ModelFile:
-    return model if isinstance(model, ModelFile) else read_model(model)
-
-
 def _is_load_of(owner: type, algorithm: type[BaseAlgorithm]) -> bool:
     """Whether the class loads as ``owner`` does."""
     return getattr(algorithm.load, "__func__", None) is vars(owner)["load"].__func__
@@ -270,18 +254,20 @@ def load_to_play(
     device: str = "auto",
     modules: Iterable[UserModule] = (),
 ) -> BaseAlgorithm:
-    """As `load_model`, for an agent that is not to learn any more.
+    """As `load_model`, without what only learning needs: buffers, action noise, schedules.
 
-    What only learning needs is left out: buffers, action noise, and schedules, which zips
-    of older versions hold as functions. Observations may have other bounds.
+    Observations may have other bounds.
     """
-    file = _read(model)
+    file = model if isinstance(model, ModelFile) else read_model(model)
     if _is_hand_written(algo):
         return load_model(algo, file, env, device=device)
     from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
     from stable_baselines3.common.utils import ConstantSchedule
 
-    saved, given = saved_observation(file), shown_space(vars(env.observation_space))
+    saved, given = (
+        _shown_space(file.data.get("observation_space")),
+        _shown_space(vars(env.observation_space)),
+    )
     if saved != given and saved is not None:
         raise UserError(
             f"{file.path} was trained on observations of {saved}, and the environment as it is "
@@ -330,18 +316,6 @@ def load_replay_buffer(model: BaseAlgorithm, path: Path, run: Run | None = None)
         raise UserError(f"{path} holds a {found}; these hyperparameters need a {needed}")
 
 
-# What a VecNormalize is told when it is made, beside whether it goes on learning.
-_SETTINGS = (
-    "norm_obs",
-    "norm_reward",
-    "clip_obs",
-    "clip_reward",
-    "gamma",
-    "epsilon",
-    "norm_obs_keys",
-)
-
-
 @dataclass(frozen=True)
 class Statistics:
     """What a VecNormalize has seen, and how it normalises by it."""
@@ -362,13 +336,14 @@ def read_statistics(path: Path, run: Run | None = None) -> Statistics:
         saved = read_normalization(read_recorded(run, path, MAX_STATISTICS_BYTES))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read: {one_line(error)}") from error
-    settings = {key: saved.settings[key] for key in _SETTINGS if saved.settings[key] is not None}
-    return Statistics(
-        path,
-        {key: _plain(value) for key, value in settings.items()},
-        saved.obs_rms if saved.settings["norm_obs"] else None,
-        saved.ret_rms,
-    )
+    # NumPy's numbers become Python's, which a settings file can hold.
+    settings = {
+        key: value.item() if hasattr(value, "item") else value
+        for key, value in saved.settings.items()
+        if key != "training" and value is not None
+    }
+    observations = saved.obs_rms if saved.settings["norm_obs"] else None
+    return Statistics(path, settings, observations, saved.ret_rms)
 
 
 def normalising(spec: TrainSpec, settings: Mapping[str, Any]) -> TrainSpec:
@@ -387,7 +362,12 @@ def take_over(env: VecEnv, statistics: Statistics) -> None:
     normalization = unwrap_vec_normalize(env)
     assert normalization is not None, "see `normalising`"
     if normalization.norm_obs and statistics.observations is not None:
-        wanted, found = _shapes(normalization.obs_rms), _shapes(statistics.observations)
+        wanted, found = (
+            {key: value.mean.shape for key, value in rms.items()}
+            if isinstance(rms, dict)
+            else rms.mean.shape
+            for rms in (normalization.obs_rms, statistics.observations)
+        )
         if wanted != found:
             raise UserError(
                 f"{statistics.path} holds statistics of observations of shape {found}; the "
@@ -409,17 +389,6 @@ def with_normalised_rewards(env: VecEnv) -> VecEnv:
         # That the statistics of the Monitor inside are overwritten is what is wanted.
         warnings.filterwarnings("ignore", "The environment is already wrapped with a `Monitor`")
         return VecMonitor(env)
-
-
-def _plain(value: Any) -> Any:
-    """NumPy's numbers as Python's, which a settings file can hold."""
-    return value.item() if hasattr(value, "item") else value
-
-
-def _shapes(statistics: Any) -> Any:
-    if isinstance(statistics, dict):
-        return {key: value.mean.shape for key, value in statistics.items()}
-    return statistics.mean.shape
 
 
 def save_model(model: BaseAlgorithm, path: Path) -> None:

@@ -11,6 +11,7 @@ from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.models.find import model_at, replay_buffer_of, statistics_of
 from pipeline.models.load import load_to_play
 from pipeline.playing import playing_env
+from pipeline.runs import Run
 from pipeline.settings.hyperparams import split
 from pipeline.train_spec import TrainSpec
 from pipeline.training import train
@@ -82,15 +83,15 @@ def test_a_model_is_played_on_its_own_statistics(normalised, which, name):
 
 def test_old_folders_have_those_of_the_end_alone(tmp_path):
     for name in ("best_model.zip", "rl_model_60_steps.zip", "other_60_steps.zip", "X-v0.zip"):
-        assert statistics_of(tmp_path / name, tmp_path / "X-v0") is None
+        assert statistics_of(tmp_path / name, Run(tmp_path, "X-v0")) is None
     (tmp_path / "X-v0").mkdir()
     end = tmp_path / "X-v0" / "vecnormalize.pkl"
     end.touch()
     for name in ("best_model.zip", "rl_model_60_steps.zip", "X-v0.zip"):
-        assert statistics_of(tmp_path / name, tmp_path / "X-v0") == end
+        assert statistics_of(tmp_path / name, Run(tmp_path, "X-v0")) == end
     own = tmp_path / "other_vecnormalize_60_steps.pkl"
     own.touch()
-    assert statistics_of(tmp_path / "other_60_steps.zip", tmp_path / "X-v0") == own
+    assert statistics_of(tmp_path / "other_60_steps.zip", Run(tmp_path, "X-v0")) == own
 
 
 @pytest.mark.parametrize(("model", "before"), [("", 202), ("rl_model_60_steps", 62)])
