@@ -17,27 +17,14 @@ from mdp.array_types import Floats
 
 
 class ActionFigures(NamedTuple):
-    """A number for each action.
+    """A number for each action."""
 
-    Attributes:
-        word: what the numbers are: ``"value"``, ``"score"`` or ``"probability"``.
-        numbers: shape (A,).
-    """
-
-    word: str
-    numbers: Floats
+    word: str  # what the numbers are: "value", "score" or "probability"
+    numbers: Floats  # shape (A,)
 
 
 def action_figures(agent: BaseAlgorithm, observations: Any) -> ActionFigures | None:
-    """What an agent knows about its actions at an observation, by itself and for itself.
-
-    Args:
-        agent: any agent.
-        observations: as one environment of a VecEnv shows them, the first axis of length 1.
-
-    Returns:
-        The figures; None where actions are no choice among a few, or the agent keeps no figures.
-    """
+    """What an agent knows about its actions at the observation of one environment, or None."""
     policy: Any = agent.policy
     if not isinstance(agent.action_space, spaces.Discrete):
         return None

@@ -24,9 +24,6 @@ if TYPE_CHECKING:
     from pipeline.evaluation.sampled import Yardstick
 
 
-# Figures with a constrained layout, written as PNG and drawn once.
-
-
 def fix_layout(figure: Figure) -> None:
     """Work the layout out now, by what is there: what is drawn later gets no room of its own."""
     engine = figure.get_layout_engine()
@@ -47,8 +44,6 @@ def write_png(figure: Figure, path: Path) -> None:
         canvas.print_png(file)
 
 
-# Pictures of a run.
-
 # Okabe and Ito's colours, told apart by colour-blind readers too.
 BLUE = "#0072B2"
 ORANGE = "#D55E00"
@@ -61,15 +56,7 @@ MOST_POWERS = 12  # of ten, that an axis goes over
 
 
 def read_monitors(folder: Path) -> tuple[Floats, Floats]:
-    """Training episodes of a run in the order in which they ended.
-
-    Args:
-        folder: the run folder, with one ``*.monitor.csv`` for each environment.
-
-    Returns:
-        Environment steps done by the end of each episode, counted over all environments, and its
-        return, both of shape (n_episodes,).
-    """
+    """Steps done over all environments by the end of each training episode, and its return."""
     contents = [read_file(path, NO_LIMIT) for path in sorted(folder.glob("*.monitor.csv"))]
     rows = [
         np.loadtxt(BytesIO(content), delimiter=",", skiprows=2, usecols=(0, 1), ndmin=2)
@@ -95,11 +82,7 @@ def moving_average(values: Floats, width: int) -> Floats:
 
 
 def symlog_ticks(linear_up_to: float) -> list[float]:
-    """Where a symmetric logarithmic axis has its ticks.
-
-    At 0, at one place within the linear part, and at two for each power of ten beyond, on both
-    sides.
-    """
+    """Ticks of a symmetric logarithmic axis: 0, one within the linear part, two for each power."""
     power = math.floor(math.log10(linear_up_to))
     within = max(m for m in (1, 2, 5) if m * 10.0**power <= linear_up_to) * 10.0**power
     beyond = [m * 10.0**k for k in range(power, power + MOST_POWERS) for m in (1, 3)]
@@ -149,12 +132,6 @@ def _evaluations(run: Run) -> tuple[Floats, Floats]:
         return evaluations["timesteps"], evaluations["results"].mean(axis=1)
 
 
-def _draw_evaluations(axes: Axes, steps: Floats, means: Floats) -> None:
-    if len(steps):
-        label = "evaluation, mean return"
-        axes.plot(steps, means, "o-", color=BLUE, markersize=4, label=label)
-
-
 def _draw_yardstick(axes: Axes, yardstick: Yardstick) -> None:
     least = yardstick.at_least
     lines = [("optimum" if least is None else "optimum, at most", yardstick.optimum, "-")]
@@ -198,16 +175,10 @@ def draw_learning_curve(
 ) -> None:
     """Draw training and evaluation returns by environment steps into the run folder.
 
-    Args:
-        run: the run.
-        title: what stands above the picture.
-        first_step: environment steps that the agent had behind it when the run began.
-        yardstick: the returns to measure against, where they are known.
-        on_variant: whether training was on a variant of the environment, so that its returns are
-            not drawn on the scale of evaluations and yardstick.
+    ``first_step`` is the number of steps that the agent had behind it when the run began. Training
+    on a variant of the environment has a scale of its own.
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter
 
     figure = Figure(figsize=(8, 4.5), dpi=120, layout="constrained")
     steps, returns = read_monitors(run.path)
@@ -217,7 +188,9 @@ def draw_learning_curve(
     judged, trained = _places(figure, apart=apart)
     what = "training on a variant" if on_variant and not apart else "training"
     _draw_training(trained, steps + first_step, returns, what)
-    _draw_evaluations(judged, evaluated_at, means)
+    if len(means):
+        label = "evaluation, mean return"
+        judged.plot(evaluated_at, means, "o-", color=BLUE, markersize=4, label=label)
     if yardstick is not None:
         _draw_yardstick(judged, yardstick)
     _compress_outliers(trained, returns)
@@ -225,29 +198,28 @@ def draw_learning_curve(
         _compress_outliers(judged, means)
     judged.set_title(title, loc="left")
     for axes in dict.fromkeys((judged, trained)):
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        _style(axes)
     if any(axes.get_legend_handles_labels()[0] for axes in (judged, trained)):
         _add_legend(figure)
     fix_layout(figure)
     write_png(figure, run.curve_path)
 
 
-# The picture of a training on a bandit.
+def _style(axes: Axes) -> None:
+    from matplotlib.ticker import EngFormatter
+
+    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes.grid(alpha=0.3)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> None:
-    """Draw average reward, share of a best arm and cumulative regret by pull.
+    """Draw average reward, share of a best arm and cumulative regret by pull, as a PNG.
 
-    Args:
-        path: the picture, as PNG.
-        title: what stands above it.
-        pulls: arrays as `agents.bandits.runs.PullLog.arrays` gives them, of shape
-            (n_envs, pulls); drawn in the order in which they were pulled.
+    ``pulls`` are the arrays of `agents.bandits.runs.PullLog`, of shape (n_envs, pulls).
     """
     from matplotlib.figure import Figure
-    from matplotlib.ticker import EngFormatter, PercentFormatter
+    from matplotlib.ticker import PercentFormatter
 
     # A pull that a log does not hold has no reward.
     kept = pulls["matched"].T.ravel()
@@ -268,9 +240,7 @@ def draw_pulls(path: Path, title: str, pulls: Mapping[str, NDArray[Any]]) -> Non
         panels[2].set(ylabel="cumulative regret")
     for axes in panels:
         axes.set_xlabel("pulls" if kept.all() else "pulls that the log holds")
-        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
+        _style(axes)
     figure.suptitle(title, x=0.01, ha="left")
     fix_layout(figure)
     write_png(figure, path)

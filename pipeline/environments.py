@@ -5,8 +5,8 @@ from __future__ import annotations
 import inspect
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -104,9 +104,8 @@ def evaluation_kwargs(spec: TrainSpec) -> dict[str, Any]:
 def trains_on_variant(spec: TrainSpec) -> bool:
     """Whether the returns of training are of another environment than those of evaluation.
 
-    They are where its arguments differ. Wrappers make no difference: Monitor lies below them, so
-    that what they do to rewards is not in its returns, and what they do to actions is a matter of
-    behaviour. A time limit that evaluation has for want of any does not count either.
+    Wrappers make no difference: Monitor lies below them. A time limit that evaluation has for want
+    of any does not count either.
     """
     special = spec.hyperparams
     changes = special.train_env_kwargs, special.eval_env_kwargs
@@ -118,11 +117,7 @@ def trains_on_variant(spec: TrainSpec) -> bool:
 
 
 def training_changes(spec: TrainSpec) -> tuple[str, ...]:
-    """What the settings change in the environment for training alone, in words; empty for nothing.
-
-    Beside the arguments these are the wrappers of training, which change rewards for the most part.
-    `normalize` is not among them: it is told of as a setting of the agent.
-    """
+    """What the settings change in the environment for training alone, in words."""
     special = spec.hyperparams
     usual = {**usual_kwargs(spec.env_id), **special.env_kwargs}
     told = []
@@ -146,9 +141,7 @@ def training_changes(spec: TrainSpec) -> tuple[str, ...]:
 
 def usual_kwargs(env_id: str) -> dict[str, Any]:
     """The arguments that an environment has where none are given, as far as they are known."""
-    registered = gym.spec(env_id.rpartition(":")[2])
-    entry = registered.entry_point
-    make = load_env_creator(entry) if isinstance(entry, str) else entry
+    registered, make = gym.spec(env_id.rpartition(":")[2]), _creator(env_id)
     parameters = {} if make is None else inspect.signature(make).parameters
     defaults = {p.name: p.default for p in parameters.values() if p.default is not p.empty}
     return {**defaults, **registered.kwargs, "max_episode_steps": registered.max_episode_steps}
@@ -157,8 +150,7 @@ def usual_kwargs(env_id: str) -> dict[str, Any]:
 def env_wrapper(spec: TrainSpec, training: bool, folder: Path | None = None) -> Wrap | None:
     """The wrappers that the hyperparameters name, as one function, or None for none.
 
-    Where the agent goes by action masks, the outermost tells them. What wrappers write goes into
-    the folder, or where there is none, into a temporary one.
+    Where the agent goes by action masks, the outermost tells them.
     """
     from pipeline.settings.components import wrapper_factory
 
@@ -196,10 +188,7 @@ def make_single_env(spec: TrainSpec, training: bool = False, **extra: Any) -> gy
 
 
 def make_training_env(spec: TrainSpec, monitor_folder: Path | None) -> Any:
-    """The environments of the training, each under a Monitor that writes into the folder.
-
-    What wrappers write goes there too; where it is None, into a temporary folder.
-    """
+    """The environments of the training, each under a Monitor that writes into the folder."""
     return _make_vec_env(spec, spec.hyperparams.n_envs, spec.seed, True, monitor_folder)
 
 
@@ -210,18 +199,7 @@ def make_evaluation_env(
     monitor_folder: Path | None = None,
     **extra: Any,
 ) -> Any:
-    """Environments to evaluate on, without what is meant for training alone.
-
-    Args:
-        spec: the run.
-        n_envs: how many.
-        wrap_innermost: a wrapper to put around each environment before all others.
-        monitor_folder: where each writes the returns of its episodes, or None.
-        extra: further arguments of the environment, such as ``render_mode``.
-
-    Returns:
-        A VecEnv.
-    """
+    """A VecEnv to evaluate on; ``extra`` are further arguments of the environments."""
     return _make_vec_env(spec, n_envs, None, False, monitor_folder, extra, wrap_innermost)
 
 
@@ -268,23 +246,13 @@ def _make_vec_env(
     wrappers = spec.hyperparams.vec_env_wrapper
     wrap = vec_wrapper_factory(wrappers, spec.gym_packages, folder=monitor_folder)
     env = env if wrap is None else wrap(env)
-    env = _normalize(env, spec, training)
+    if (normalize := spec.hyperparams.normalize) is not None:
+        # Statistics come from training, and returns of evaluation are reported as they are.
+        fixed = {} if training else {"norm_reward": False, "training": False}
+        env = vec_env.VecNormalize(env, **{**normalize, **fixed})
     if spec.hyperparams.frame_stack is not None:
         env = vec_env.VecFrameStack(env, spec.hyperparams.frame_stack)
     return BaseAlgorithm._wrap_env(env)
-
-
-def _normalize(env: Any, spec: TrainSpec, training: bool) -> Any:
-    """Put VecNormalize around ``env`` where the hyperparameters ask for it."""
-    from stable_baselines3.common.vec_env import VecNormalize
-
-    kwargs = spec.hyperparams.normalize
-    if kwargs is None:
-        return env
-    if not training:
-        # Statistics come from training, and returns are reported as they are.
-        kwargs = {**kwargs, "norm_reward": False, "training": False}
-    return VecNormalize(env, **kwargs)
 
 
 # What `gymnasium.make` takes itself.
@@ -295,14 +263,28 @@ _ADDED = " was raised from the environment creator"
 
 def environment_mistake(env_id: str, kwargs: Mapping[str, Any], error: Exception) -> UserError:
     """The line for an environment that raised ``error`` when it was made with ``kwargs``."""
-    parameters, module = _creator(env_id)
+    parameters: Mapping[str, inspect.Parameter] = {}
+    creator: Any = None
+    with suppress(ImportError, AttributeError, TypeError, ValueError):
+        creator = _creator(env_id)
+        parameters = inspect.signature(creator).parameters
     takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
     foreign = next((name for name in kwargs if name not in (*parameters, *_OF_MAKE)), None)
     if foreign is not None and parameters and not takes_any:
         known = [name for name in (*parameters, *_OF_MAKE) if name != "render_mode"]
         return unknown(f"{env_id}: unknown argument", foreign, known)
     if isinstance(error, KeyError):
-        return _missing_key(env_id, kwargs, error, parameters, module)
+        # It looked something up that is not there: an argument, as a rule.
+        key = error.args[0] if error.args else None
+        name = next((name for name, value in kwargs.items() if value is key or value == key), None)
+        if name is None:
+            return UserError(f"{env_id}: it looks for {shown(key)}, which is not there")
+        # Known are the keys of a table in its module that has the argument's default among them.
+        default = parameters[name].default if name in parameters else None
+        module = sys.modules.get(getattr(creator, "__module__", ""), object)
+        tables = (table for table in vars(module).values() if isinstance(table, dict))
+        known = next(([*t] for t in tables if isinstance(default, str) and default in t), [])
+        return unknown(f"{env_id}: unknown {name}", str(key), map(str, known))
     what = one_line(error).partition(_ADDED)[0]
     if kwargs and not any(name in what for name in kwargs):
         what += f" (with {', '.join(f'{name}={shown(value)}' for name, value in kwargs.items())})"
@@ -318,59 +300,18 @@ def lacking_packages_told(env_id: str) -> Iterator[None]:
         raise UserError(f"{env_id}: {one_line(error)}") from error
 
 
-def _creator(env_id: str) -> tuple[Mapping[str, inspect.Parameter], str]:
-    """The parameters of what makes the environment, and its module; empty where not known."""
+def _creator(env_id: str) -> Any:
+    """The class or function that makes the environment."""
     entry_point = gym.spec(env_id.rpartition(":")[2]).entry_point
-    try:
-        creator: Any = (
-            gym.envs.registration.load_env_creator(entry_point)
-            if isinstance(entry_point, str)
-            else entry_point
-        )
-        return inspect.signature(creator).parameters, creator.__module__
-    except (ImportError, AttributeError, TypeError, ValueError):
-        return {}, ""
-
-
-def _missing_key(
-    env_id: str,
-    kwargs: Mapping[str, Any],
-    error: KeyError,
-    parameters: Mapping[str, inspect.Parameter],
-    module: str,
-) -> UserError:
-    """The environment looked something up that is not there: an argument, as a rule."""
-    key = error.args[0] if error.args else None
-    name = next((name for name, value in kwargs.items() if value is key or value == key), None)
-    if name is None:
-        return UserError(f"{env_id}: it looks for {shown(key)}, which is not there")
-    default = parameters[name].default if name in parameters else None
-    return unknown(f"{env_id}: unknown {name}", str(key), _keys_beside(default, module))
-
-
-def _keys_beside(default: Any, module: str) -> Iterable[str]:
-    """The keys of a table in the module that has the default of an argument among its own."""
-    tables = [v for v in vars(sys.modules.get(module, object)).values() if isinstance(v, dict)]
-    found = next((t for t in tables if isinstance(default, str) and default in t), {})
-    return map(str, found)
+    return load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
 
 
 _ENV_KWARGS = ("env_kwargs", "train_env_kwargs", "eval_env_kwargs")
 
 
 def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The hyperparameters with the rows of each map in place of the path to its file.
-
-    Args:
-        env_id: a registered environment; others than grid worlds are left as they are.
-        settings: an entry of hyperparameters.
-
-    Raises:
-        UserError: if a map's file cannot be read.
-    """
-    named = _naming(settings, "desc")
-    if not (named and _is_kind_of(GridWorld, env_id)):
-        return dict(settings)
+    """The hyperparameters of a grid world with the rows of each map in place of its file's path."""
+    named = _naming(settings, "desc", env_id, GridWorld)
     try:
         read = {
             key: {**settings[key], "desc": list(read_rows(settings[key]["desc"]))} for key in named
@@ -381,30 +322,21 @@ def with_maps_read(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def with_logs_located(env_id: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The hyperparameters with the full path to each log of pulls.
-
-    Args:
-        env_id: a registered environment; others than ReplayBandit are left as they are.
-        settings: an entry of hyperparameters.
-    """
-    named = _naming(settings, "log")
-    if not (named and _is_kind_of(ReplayBandit, env_id)):
-        return dict(settings)
+    """The hyperparameters of a ReplayBandit with the full path to each log of pulls."""
+    named = _naming(settings, "log", env_id, ReplayBandit)
     paths = {key: str(Path(settings[key]["log"]).absolute()) for key in named}
     return {**settings, **{key: {**settings[key], "log": path} for key, path in paths.items()}}
 
 
-def _naming(settings: Mapping[str, Any], argument: str) -> list[str]:
-    """The keys of the settings that give the environment a text as that argument."""
+def _naming(
+    settings: Mapping[str, Any], argument: str, env_id: str, kind: type[gym.Env[Any, Any]]
+) -> list[str]:
+    """The keys that give an environment of that kind a text as that argument."""
     given = {key: settings.get(key) for key in _ENV_KWARGS}
-    return [
+    named = [
         key
         for key, env_kwargs in given.items()
         if isinstance(env_kwargs, dict) and isinstance(env_kwargs.get(argument), str)
     ]
-
-
-def _is_kind_of(kind: type[gym.Env[Any, Any]], env_id: str) -> bool:
-    entry_point = gym.spec(env_id.rpartition(":")[2]).entry_point
-    creator: object = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
-    return isinstance(creator, type) and issubclass(creator, kind)
+    creator = _creator(env_id) if named else None
+    return named if isinstance(creator, type) and issubclass(creator, kind) else []

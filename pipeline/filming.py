@@ -1,4 +1,4 @@
-"""Films of trained agents: taking the pictures, and writing them to a file."""
+"""Films of trained agents."""
 
 from __future__ import annotations
 
@@ -22,11 +22,7 @@ FRAMES_PER_SECOND = 10
 
 
 def check_film_path(path: Path) -> None:
-    """Make sure that a film can be written before anything is played.
-
-    Raises:
-        UserError: otherwise.
-    """
+    """Make sure that a film can be written before anything is played."""
     if path.suffix not in FILM_SUFFIXES:
         raise UserError(f"--record writes {' or '.join(FILM_SUFFIXES)} files, not {path.name!r}")
     if not path.absolute().parent.is_dir():
@@ -40,42 +36,27 @@ def check_film_path(path: Path) -> None:
 def film_episode(
     model: BaseAlgorithm, env: VecEnv, max_steps: int, *, deterministic: bool
 ) -> tuple[list[Any], tuple[float, int] | None]:
-    """Play one episode and keep what is drawn.
-
-    Args:
-        model: the agent.
-        env: from `pipeline.playing.playing_env`, drawn as ``"rgb_array"``.
-        max_steps: after how many steps to stop, where the episode has not ended before.
-        deterministic: the policy's best actions rather than samples of them.
-
-    Returns:
-        Pictures, uint8 of shape (height, width, 3); and return and length of the episode, None
-        where it did not end.
-    """
+    """Play an episode, and return its frames; and its return and length, None if it did not end."""
     taker = FrameTaker(env)
     frames: list[Any] = []
-    ended = list(
-        play_episodes(
-            model,
-            env,
-            1,
-            max_steps,
-            deterministic=deterministic,
-            after_step=lambda done: frames.extend(taker.take(done)),
-        )
-    )
+
+    def keep(done: bool) -> None:
+        frames.extend(taker.take(done))
+
+    played = play_episodes(model, env, 1, max_steps, deterministic=deterministic, after_step=keep)
+    ended = list(played)
     return frames, ended[0] if ended else None
 
 
 def write_film(path: Path, frames: list[Any]) -> None:
-    """Write pictures, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
+    """Write frames, uint8 of shape (height, width, 3), as a film: .mp4, and else GIF."""
     film = _as_mp4(frames) if path.suffix == ".mp4" else as_gif(frames)
     with replacing(path) as file:
         file.write(film)
 
 
 def as_gif(frames: list[Any]) -> bytes:
-    """Pictures, uint8 of shape (height, width, 3), as the content of a GIF file."""
+    """The content of a GIF file of frames, uint8 of shape (height, width, 3)."""
     from PIL import Image
 
     first, *others = [Image.fromarray(frame) for frame in frames]

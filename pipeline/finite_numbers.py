@@ -25,12 +25,7 @@ _WHOLE = frozenset("?bBhHiIlLqQ")
 
 
 class NotFiniteError(UserError):
-    """A number that has to be finite is not.
-
-    Args:
-        place: what it is, and when: "reward of environment 2 at step 1,234".
-        value: the number.
-    """
+    """A number that has to be finite is not."""
 
     def __init__(self, place: str, value: float) -> None:
         super().__init__(f"{place} is {value}")
@@ -51,16 +46,7 @@ def is_finite(values: Any) -> bool:
 
 
 def check_numbers(values: Any, what: str, when: str) -> None:
-    """Make sure that numbers are finite.
-
-    Args:
-        values: an array, a mapping of names to arrays, or None.
-        what: what they are.
-        when: when they were met.
-
-    Raises:
-        NotFiniteError: naming the first that is not.
-    """
+    """Make sure that the numbers of an array, of a mapping's arrays, or of None are finite."""
     for name, array in _parts(values):
         if not is_finite(array):
             raise NotFiniteError(f"{what}{name} {when}", _culprit(array))
@@ -90,7 +76,12 @@ def check_model(model: Any) -> None:
     normalization = model.get_vec_normalize_env()
     if normalization is not None:
         for name in ("obs_rms", "ret_rms"):
-            _check_statistics(getattr(normalization, name, None), f"{name} of VecNormalize", when)
+            statistics = getattr(normalization, name, None)
+            parts = statistics if isinstance(statistics, dict) else {"": statistics}
+            for key, part in parts.items():
+                if part is not None:
+                    what = f"{name} of VecNormalize{f' ({key})' if key else ''}"
+                    check_numbers({"mean": part.mean, "variance": part.var}, what, when)
 
 
 def _is_finite_tensor(tensor: th.Tensor) -> bool:
@@ -100,12 +91,7 @@ def _is_finite_tensor(tensor: th.Tensor) -> bool:
 
 
 class FinitePlayer:
-    """An agent that refuses to act on observations that are not finite.
-
-    Args:
-        player: anything with the library's ``predict``.
-        when: it is asked, for the message.
-    """
+    """An agent that refuses to act on observations that are not finite."""
 
     def __init__(self, player: Any, when: str) -> None:
         self._player = player
@@ -116,14 +102,6 @@ class FinitePlayer:
         check_rows(observation, "observation", self._when)
         actions, state = self._player.predict(observation, **kwargs)
         return actions, state
-
-
-def _check_statistics(statistics: Any, what: str, when: str) -> None:
-    parts = statistics if isinstance(statistics, dict) else {"": statistics}
-    for name, part in parts.items():
-        if part is not None:
-            own = f"{what} ({name})" if name else what
-            check_numbers({"mean": part.mean, "variance": part.var}, own, when)
 
 
 def _parts(values: Any) -> Iterator[tuple[str, NDArray[Any]]]:

@@ -1,4 +1,8 @@
-"""A policy and its values drawn on the map of a grid world."""
+"""Draws a policy and its values on the map of a grid world.
+
+Columns count along the horizontal axis, rows down the vertical one, and a cell's middle lies at
+whole numbers. ``cell`` is the width of a cell in points.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +27,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# A policy drawn on the map of a grid world: colours, numbers and arrows in its cells.
-#
-# Columns count along the horizontal axis, rows down the vertical one, and a cell's middle lies at
-# whole numbers. ``cell`` is the width of a cell in points.
-
 BELOW: Colour = (222, 222, 222)
 BELOW_HATCH: Colour = (196, 196, 196)
 GROUND = {WALL: SHELF, GOAL: PALE_GREEN, TRAP: PALE_RED}
@@ -40,25 +39,15 @@ SMALLEST_GRID = 8.0
 
 @dataclass(frozen=True, eq=False)
 class Policy:
-    """A policy in one layer of the map; arrays have an entry for each cell, row by row.
-
-    Attributes:
-        layout: the map.
-        layer: which prizes are collected.
-        matters: where the agent may have to act, bool.
-        visited: where the policy comes to from the start, bool.
-        differs: where agent and optimum part, bool.
-        values: expected return from there on.
-        actions: the actions to draw, bool of shape (cells, A).
-    """
+    """A policy in one layer of the map; arrays have an entry for each cell, row by row."""
 
     layout: GridLayout
-    layer: int
-    matters: Bools
-    visited: Bools
-    differs: Bools
-    values: Floats
-    actions: Bools
+    layer: int  # which prizes are collected
+    matters: Bools  # where the agent may have to act
+    visited: Bools  # where the policy comes to from the start
+    differs: Bools  # where agent and optimum part
+    values: Floats  # expected return from there on
+    actions: Bools  # the actions to draw, shape (cells, A)
 
     def places(self, chosen: Bools) -> tuple[Ints, Ints]:
         """Columns and rows of the chosen cells."""
@@ -70,17 +59,14 @@ def policies_in(found: ValueMap, layer: int) -> tuple[Policy, Policy]:
     """The agent's policy and the optimal ones in one layer."""
     here = found.layout.layers == layer
     taken = np.eye(len(found.layout.moves), dtype=np.bool_)[found.actions]
-    common = (found.layout, layer, found.matters[here])
-    differs = found.differs[here]
+
+    def policy(visited: Bools, values: Floats, actions: Bools) -> Policy:
+        common = found.matters[here], visited[here], found.differs[here]
+        return Policy(found.layout, layer, *common, values[here], actions[here])
+
     return (
-        Policy(*common, found.visited[here], differs, found.values[here], taken[here]),
-        Policy(
-            *common,
-            found.optimal_visited[here],
-            differs,
-            found.optimal_values[here],
-            found.optimal_actions[here],
-        ),
+        policy(found.visited, found.values, taken),
+        policy(found.optimal_visited, found.optimal_values, found.optimal_actions),
     )
 
 
@@ -153,12 +139,14 @@ def draw_marks(axes: Axes, policy: Policy, cell: float) -> None:
 
 
 def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) -> None:
-    """An arrow for each action, dark where the policy comes to from the start.
+    """An arrow for each action, or a ring for one that stays; dark where the policy comes to.
 
-    One that stays has a ring. A single action has its arrow in the middle of the cell, several set
-    out from there; both are shorter, and higher up, where a number stands below. ``width`` is a
-    share of the cell.
+    A single action has its arrow in the middle of the cell, several set out from there; both are
+    shorter, and higher up, where a number stands below. ``width`` is a share of the cell.
     """
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Annulus
+
     moves = np.array(policy.layout.moves)
     lift, reach = (0.1, 0.25) if with_numbers else (0.0, 0.33)
     for visited, weight, strength in ((False, 0.75, 0.45), (True, 1.0, 1.0)):
@@ -187,18 +175,11 @@ def draw_arrows(axes: Axes, policy: Policy, width: float, with_numbers: bool) ->
         )
         still = (moves[actions] == 0).all(axis=1)
         if still.any():
-            _draw_rings(axes, columns[still], rows[still] - lift, weight * width, strength)
-
-
-def _draw_rings(axes: Axes, columns: Ints, rows: Ints, width: float, strength: float) -> None:
-    """A ring for each action that stays where it is; ``width`` is a share of the cell."""
-    from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Annulus
-
-    rings = [Annulus((x, y), 0.12, width) for x, y in zip(columns, rows, strict=True)]
-    axes.add_collection(
-        PatchCollection(rings, facecolor=shade(INK), linewidth=0, alpha=strength, zorder=3)
-    )
+            centres = zip(columns[still], rows[still] - lift, strict=True)
+            rings = [Annulus(centre, 0.12, weight * width) for centre in centres]
+            axes.add_collection(
+                PatchCollection(rings, facecolor=shade(INK), linewidth=0, alpha=strength, zorder=3)
+            )
 
 
 def draw_numbers(axes: Axes, policy: Policy, font: float, decimals: int) -> None:
@@ -235,10 +216,7 @@ def mark_differing(axes: Axes, policy: Policy, cell: float) -> None:
 
 
 def short_number(value: float, decimals: int) -> str:
-    """A value in few characters: no decimals from 100 on, thousands as ``k``, millions as ``M``.
-
-    The minus is the sign of that name, and a value that rounds to zero has none.
-    """
+    """A value in few characters: no decimals from 100 on, thousands as ``k``, millions as ``M``."""
     size = abs(value)
     if size >= 999_500:
         text = f"{size / 1e6:.1f}M"
@@ -255,7 +233,7 @@ def shade(colour: Colour) -> tuple[float, float, float]:
     return red / 255, green / 255, blue / 255
 
 
-# The picture of a value map: the agent's policy, and beside it the optimal ones.
+# --- the whole picture: the agent's policy, and beside it the optimal ones ------------------------
 
 # Pale enough for dark arrows and numbers; in print and to colour-blind readers, darker is better.
 VALUE_COLOURS = ("#FFFBD6", "#D3ECC0", "#8FD0C0", "#55B0CC", "#4A97CF")
@@ -266,16 +244,7 @@ MARGIN = 1.3  # inches, for title, legend and colour bar
 
 
 def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
-    """Draw a map into a file.
-
-    Colours are exact values on the scale of the optimal ones. Of a map with prizes, those layers
-    are drawn that the agent or an optimal policy comes to, up to four.
-
-    Args:
-        path: of the PNG file.
-        title: what stands above the picture.
-        found: the map.
-    """
+    """Draw a map into a PNG file; colours are exact values on the scale of the optimal ones."""
     layers, cell = shown_layers(found), cell_inches(found.layout)
     scale, colours = _value_scale(found)
     decimals = decimals_for(found)
@@ -294,7 +263,7 @@ def draw_value_map(path: Path, title: str, found: ValueMap) -> None:
 
 
 def shown_layers(found: ValueMap) -> list[int]:
-    """The layers to draw, those with the fewest prizes collected first."""
+    """The layers that a policy comes to, up to four, those with the fewest prizes first."""
     come_to = found.matters & (found.visited | found.optimal_visited)
     layers = np.unique(found.layout.layers[come_to]).tolist()
     return sorted(layers, key=lambda layer: (layer.bit_count(), layer))[:MAX_LAYERS]

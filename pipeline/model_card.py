@@ -24,12 +24,7 @@ _OF_THE_LIBRARY = {"dqn": "DQN", "ppo": "PPO", "a2c": "A2C"}
 
 
 def card(record: Mapping[str, Any], files: Collection[str]) -> str:
-    """The README.md of a pack.
-
-    Args:
-        record: its ``run.json``.
-        files: names of its other files.
-    """
+    """The README.md of a pack, from its ``run.json`` and the names of its other files."""
     spec = record["spec"]
     algo, env_id = spec["algo"], spec["env_id"]
     pictures = [name for name in ("value_map.png", "learning_curve.png") if name in files]
@@ -75,6 +70,8 @@ def _front_matter(record: Mapping[str, Any]) -> str:
         for name, label, value in _metrics(final)
     ]
     env = str(spec["env_id"])
+    is_deep = spec["algo"] in _DEEP or _plain_class(spec) is not None
+    kind = ["deep-reinforcement-learning"] if is_deep else []
     place = {
         "task": {"type": "reinforcement-learning", "name": "reinforcement-learning"},
         "dataset": {"name": env, "type": env},
@@ -84,18 +81,12 @@ def _front_matter(record: Mapping[str, Any]) -> str:
         yaml.safe_dump(
             {
                 "library_name": "stable-baselines3",
-                "tags": [env, *_kind(spec), "reinforcement-learning", "stable-baselines3"],
+                "tags": [env, *kind, "reinforcement-learning", "stable-baselines3"],
                 "model-index": [{"name": spec["algo"], "results": [place]}],
             },
             sort_keys=False,
         )
     )
-
-
-def _kind(spec: Mapping[str, Any]) -> list[str]:
-    """What hubs call agents with networks."""
-    is_deep = spec["algo"] in _DEEP or plain_class(spec) is not None
-    return ["deep-reinforcement-learning"] if is_deep else []
 
 
 def _metrics(final: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
@@ -111,7 +102,8 @@ def _metrics(final: Mapping[str, Any]) -> list[tuple[str, str, Any]]:
 def _figures(record: Mapping[str, Any]) -> str:
     final = record.get("final")
     if not final:
-        return _bandit_figures(record)
+        pulls = record.get("pulls") or {}
+        return _table([(name.replace("_", " "), value) for name, value in pulls.items()])
     if final["exact"]:
         how = "computed exactly, from the model of the environment; no episode was sampled"
     else:
@@ -145,11 +137,6 @@ def _measured(final: Mapping[str, Any]) -> dict[str, str]:
     }
 
 
-def _bandit_figures(record: Mapping[str, Any]) -> str:
-    pulls = record.get("pulls") or {}
-    return _table([(name.replace("_", " "), value) for name, value in pulls.items()])
-
-
 def _table(rows: list[tuple[str, Any]]) -> str:
     told = [
         f"| {plain_text(name)} | {plain_text(value)} |\n"
@@ -168,10 +155,10 @@ def _playing(record: Mapping[str, Any], files: Collection[str]) -> str:
         else "With Yardstick, from this folder or its zip (nothing in it is run):\n",
         fenced("sh", f"yardstick enjoy .{_flag(modules)}\n"),
     ]
-    text = script(record, files)
+    text = _script(record, files)
     if text is not None:
         parts += ["In Python:\n", fenced("python", text)]
-    if plain_class(spec) is not None:
+    if _plain_class(spec) is not None:
         place = shlex.quote(f"{spec['algo']}/{record['env_name']}_1")
         packages = [*(spec.get("gym_packages") or []), *([] if _is_known(spec) else ["envs"])]
         words = (
@@ -203,7 +190,7 @@ def to_type(spec: Mapping[str, Any], files: Collection[str]) -> list[str]:
     ]
 
 
-def plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:
+def _plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:
     """Library and class that load an agent's zip without this project; None where none does."""
     algo = spec["algo"]
     if spec["hyperparams"].get("mask_actions"):
@@ -216,13 +203,8 @@ def plain_class(spec: Mapping[str, Any]) -> tuple[str, str] | None:
     return (library, name) if library in _LIBRARIES else None
 
 
-def script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
-    """A script that plays the agent without its commands; None where that takes more than a script.
-
-    Args:
-        record: the pack's ``run.json``.
-        files: names of its other files.
-    """
+def _script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
+    """A script that plays the agent without any command; None where that takes more."""
     spec, env_name = record["spec"], record["env_name"]
     settings = spec["hyperparams"]
     if any(settings.get(name) for name in _WRAPPERS) or spec.get("gym_packages"):
@@ -230,8 +212,12 @@ def script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
     env_id = spec["env_id"]
     given = {**(settings.get("env_kwargs") or {}), **(settings.get("eval_env_kwargs") or {})}
     statistics = f"{env_name}/vecnormalize.pkl"
+    plain = _plain_class(spec)
+    library, name = plain or ("", f"load_algorithm({spec['algo']!r})")
+    agents = "from agents import load_algorithm  # Yardstick's agents"
     lines = [
-        *_imports(spec),
+        *([] if _is_known(spec) else ["import envs  # Yardstick's environments"]),
+        f"from {library} import {name}" if plain else agents,
         "from stable_baselines3.common.env_util import make_vec_env",
         "from stable_baselines3.common.evaluation import evaluate_policy",
         *(
@@ -248,24 +234,11 @@ def script(record: Mapping[str, Any], files: Collection[str]) -> str | None:
             "env.training = env.norm_reward = False",
         ]
     lines += [
-        f"model = {_loading(spec)}.load({env_name + '.zip'!r})",
+        f"model = {name}.load({env_name + '.zip'!r})",
         "mean, std = evaluate_policy(model, env, n_eval_episodes=10)",
         'print(f"return {mean:.2f} +/- {std:.2f}")',
     ]
     return "\n".join(lines) + "\n"
-
-
-def _imports(spec: Mapping[str, Any]) -> list[str]:
-    lines = [] if _is_known(spec) else ["import envs  # Yardstick's environments"]
-    plain = plain_class(spec)
-    if plain is None:
-        return [*lines, "from agents import load_algorithm  # Yardstick's agents"]
-    return [*lines, f"from {plain[0]} import {plain[1]}"]
-
-
-def _loading(spec: Mapping[str, Any]) -> str:
-    plain = plain_class(spec)
-    return f"load_algorithm({spec['algo']!r})" if plain is None else plain[1]
 
 
 def fenced(language: str, text: str) -> str:

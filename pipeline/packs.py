@@ -52,8 +52,6 @@ from pipeline.user_modules import COPIES
 from safe_files.archives import opened_zip, read_member, read_members
 from safe_files.files import MAX_ARCHIVE_BYTES, Budget, UnsafeFileError, hold, read_file
 
-# What a pack holds: the files of a finished run that others need, each checked and scrubbed.
-
 CARD = "README.md"
 STUDY_RECORD = "study.json"  # of the pack of a study, with the digests of its files
 FILMS = (".mp4", ".gif")
@@ -61,14 +59,7 @@ MOST_FILM_BYTES = 64 << 20
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """The files of a pack of a run, by name.
-
-    Args:
-        folder: the run folder.
-
-    Raises:
-        UserError: if the run is not finished or damaged, or a file names a place on this machine.
-    """
+    """The files of a pack of a finished run, by name, each checked and scrubbed."""
     run = run_in(folder)
     if not run.recorded_spec():
         raise UserError(f"{folder} does not say what was trained: it is no run of ours")
@@ -130,7 +121,7 @@ def _digest(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-# Packs on disk: written whole, and read as data, whoever made them.
+# --- packs on disk --------------------------------------------------------------------------------
 
 _DEEPEST = 2  # folders of a name, the file itself counted
 _DEEPEST_MODULE = 8
@@ -141,20 +132,8 @@ _DAMAGE = (OSError, ValueError, LookupError, RuntimeError, EOFError, zipfile.Bad
 
 
 def pack(run_folder: Path, target: Path) -> Path:
-    """Write a finished run as a pack that can be given to others.
-
-    Args:
-        run_folder: the run.
-        target: a folder that is not there yet, or a file ``.zip``, which is replaced.
-
-    Returns:
-        The target.
-
-    Raises:
-        UserError: if the run cannot be packed, or the target cannot be written.
-    """
-    if not target.absolute().parent.is_dir():
-        raise UserError(f"there is no folder {target.parent} to write the pack in")
+    """Write a finished run as a pack: a new folder, or a zip, which is replaced."""
+    _check_parent(target)
     is_zip = target.suffix == ".zip"
     if target.is_dir() if is_zip else (target.exists() or target.is_symlink()):
         raise UserError(f"{target} is there already: name another place for the pack")
@@ -179,17 +158,7 @@ def pack(run_folder: Path, target: Path) -> Path:
 
 
 def check_pack(path: Path) -> int:
-    """Hold every file of a pack against its digest.
-
-    Args:
-        path: its folder or zip.
-
-    Returns:
-        How many files there are.
-
-    Raises:
-        UserError: if one is missing or changed, or it is no pack.
-    """
+    """Hold every file of a pack against its digest, and return how many there are."""
     if is_packed(path, STUDY_RECORD):
         return _check_study(path)
     with unpacked(path) as (folder, _):
@@ -199,13 +168,7 @@ def check_pack(path: Path) -> int:
 
 
 def _check_files(folder: Path, shown_as: Path, names: Collection[str] = ()) -> int:
-    """Hold the files of a pack against their digests; the number of them.
-
-    Args:
-        folder: where they lie.
-        shown_as: what the pack is called in a message.
-        names: those that there may be, where there may be no others.
-    """
+    """Hold the files of a pack against their digests; ``names`` are those that there are."""
     try:
         digests = read_record(folder / RECORD).get(FIELD)
         if not isinstance(digests, dict):
@@ -222,7 +185,6 @@ def _check_files(folder: Path, shown_as: Path, names: Collection[str] = ()) -> i
 
 
 def _check_study(path: Path) -> int:
-    """The same for the pack of a study."""
     try:
         with _opened_study(path) as (read, names):
             record = json.loads(read(STUDY_RECORD))
@@ -230,7 +192,7 @@ def _check_study(path: Path) -> int:
             if not isinstance(digests, dict) or digests.keys() != names - {STUDY_RECORD}:
                 raise UnsafeFileError(f"{STUDY_RECORD} does not list its files, and no others")
             for name, digest in digests.items():
-                if hashlib.sha256(read(name)).hexdigest() != digest:
+                if _digest(read(name)) != digest:
                     raise UnsafeFileError(f"{shown(name)} is not as the record says")
     except _DAMAGE as error:
         raise UserError(f"{path} is not as it was packed: {one_line(error)}") from error
@@ -258,19 +220,10 @@ def _opened_study(path: Path) -> Iterator[tuple[Callable[[str], bytes], set[str]
 
 @contextmanager
 def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
-    """The folder of a pack; of a zip a temporary one, with nothing in it but what its record lists.
+    """The folder of a pack, and the zip that it was unpacked from, or None.
 
-    Any other path is given as it is.
-
-    Args:
-        path: of anything; of a zip, its suffix may be missing. In the pack of a study, a run is
-            ``study.zip/runs/<agent>/<run>.zip``.
-
-    Yields:
-        The folder, and the zip that it was unpacked from, or None.
-
-    Raises:
-        UserError: if the zip holds anything that a pack may not, or not what its record says.
+    Of a zip it is a temporary one, with nothing in it but what its record lists. Any other path is
+    given as it is. In the pack of a study, a run is ``study.zip/runs/<agent>/<run>.zip``.
     """
     beside = path.with_name(f"{path.name}.zip") if path.name else path
     path = beside if not path.exists() and is_packed(beside) else path
@@ -285,7 +238,9 @@ def unpacked(path: Path) -> Iterator[tuple[Path, Path | None]]:
             content = read_file(path, MAX_ARCHIVE_BYTES)
         else:
             content = _run_of(study, path.relative_to(study).as_posix())
-        files = _members(content)
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            _check_members(archive.infolist())
+        files = read_members(content, most=_MOST)
     except _DAMAGE as error:
         raise UserError(f"{path} is no pack that may be opened: {one_line(error)}") from error
     with tempfile.TemporaryDirectory(prefix="yardstick-pack-") as name:
@@ -325,23 +280,8 @@ def is_packed(path: Path, record: str = RECORD) -> bool:
         return False
 
 
-def _members(content: bytes) -> Mapping[str, bytes]:
-    """The files in a zip, whose names lie inside of it.
-
-    Raises:
-        UnsafeFileError: if there is a link, a name that leads elsewhere, or too much.
-    """
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        _check_members(archive.infolist())
-    return read_members(content, most=_MOST)
-
-
 def _check_members(infos: Collection[zipfile.ZipInfo], deepest: int = _DEEPEST) -> None:
-    """Refuse members that would not be files of their own, inside of the folder.
-
-    Raises:
-        UnsafeFileError: naming one.
-    """
+    """Refuse members that would not be files of their own, inside of the folder."""
     for info in infos:
         kind = stat.S_IFMT(info.external_attr >> 16)
         if kind not in (0, stat.S_IFREG):
@@ -356,11 +296,7 @@ def _check_members(infos: Collection[zipfile.ZipInfo], deepest: int = _DEEPEST) 
 
 
 def check_name(name: str, deepest: int = _DEEPEST) -> None:
-    """Refuse a name that leads elsewhere, or that some file system does not take.
-
-    Raises:
-        UnsafeFileError: naming it.
-    """
+    """Refuse a name that leads elsewhere, or that some file system does not take."""
     parts = name.split("/")
     deepest = _DEEPEST_MODULE if parts[0] == COPIES else deepest
     good = all(
@@ -368,6 +304,11 @@ def check_name(name: str, deepest: int = _DEEPEST) -> None:
     )
     if len(parts) > deepest or not good:
         raise UnsafeFileError(f"holds {shown(name)}, which would lie elsewhere")
+
+
+def _check_parent(target: Path) -> None:
+    if not target.absolute().parent.is_dir():
+        raise UserError(f"there is no folder {target.parent} to write the pack in")
 
 
 def _write(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -386,7 +327,7 @@ def default_target(run_folder: Path) -> Path:
     return Path(portable_name(name.replace("/", "-").replace(":", "-")))
 
 
-# The pack of a study: its page, tables and settings, the packs of its runs, the user's modules.
+# --- the pack of a study: page, tables and settings, packs of its runs, the user's modules --------
 
 RUNS = "runs"
 SETTINGS = "study.yml"  # written beside the page, see `experiments.study`
@@ -401,18 +342,12 @@ _LARGEST_FILE = 64 << 20  # bytes
 
 @dataclass
 class StudyPack:
-    """What has come into the pack of a study.
+    """What has come into the pack of a study."""
 
-    Attributes:
-        digests: of its files, by name.
-        agents: by agent and environment, as their folders are called: the first run's record and
-            pack, and how many runs there are.
-        modules: what to type for the modules of all runs.
-    """
-
-    digests: dict[str, str] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)  # of its files, by name
+    # by agent and environment: record and pack of the first run, and how many runs there are
     agents: dict[tuple[str, str], tuple[dict[str, Any], str, int]] = field(default_factory=dict)
-    modules: list[str] = field(default_factory=list)
+    modules: list[str] = field(default_factory=list)  # what to type for the modules of all runs
 
     @property
     def n_runs(self) -> int:
@@ -432,22 +367,11 @@ def is_study(folder: Path) -> bool:
 
 
 def pack_study(root: Path, target: Path, say: Callable[[str], object]) -> StudyPack:
-    """Write a study as a pack that can be given to others.
-
-    Args:
-        root: the study's folder. No other command may be at work on it.
-        target: a file ``.zip``, which is replaced.
-        say: told in a line why it takes long, where it does.
-
-    Raises:
-        UserError: if a run cannot be packed, a file names a place on this machine, a command is at
-            work on the study, or the target cannot be written.
-    """
+    """Write a study, on which no other command may be at work, as a zip, which is replaced."""
     hold(root)
     if target.suffix != ".zip" or target.is_dir():
         raise UserError(f"{target}: a study is packed as a file: name it {target.name}.zip")
-    if not target.absolute().parent.is_dir():
-        raise UserError(f"there is no folder {target.parent} to write the pack in")
+    _check_parent(target)
     is_mine = os.access(root, os.W_OK)
     with folder_lock(root, lambda: None, say) if is_mine else contextlib.nullcontext():
         folders = sorted(path for path in root.glob(f"{RUNS}/*/*") if _RUN.fullmatch(path.name))
@@ -469,7 +393,7 @@ def _write_study(draft: IO[bytes], root: Path, folders: list[Path]) -> StudyPack
             if name in made.digests:
                 continue
             check_name(name, 3)
-            made.digests[name] = hashlib.sha256(content).hexdigest()
+            made.digests[name] = _digest(content)
             archive.writestr(member_of(name), content, zipfile.ZIP_DEFLATED)
             if draft.tell() > MAX_ARCHIVE_BYTES:
                 raise UserError(f"{root}: its pack would be larger than 1 GB: pack single runs")
@@ -484,7 +408,7 @@ def _study_files(root: Path, folders: list[Path], made: StudyPack) -> Iterator[t
         record = json.loads(files[RECORD])
         for name in [name for name in files if name.startswith(f"{COPIES}/")]:
             content = files[name]
-            if made.digests.get(name, digest := hashlib.sha256(content).hexdigest()) != digest:
+            if made.digests.get(name, digest := _digest(content)) != digest:
                 raise UserError(
                     f"{folder} was trained with another {name} than the runs before it: pack runs "
                     "one by one, or do the study again with --replace"

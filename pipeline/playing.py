@@ -33,27 +33,16 @@ def playing_env(
     n_envs: int = 1,
     monitor_folder: Path | None = None,
 ) -> VecEnv:
-    """The VecEnv that a model is played on, drawn in that render mode.
+    """The VecEnv that a model is played on, drawn in that render mode; rewards are as they are.
 
-    Observations are normalised by the statistics that belong to the model; rewards are left as they
-    are. What is drawn to be handed over is kept until `FrameTaker` asks for it.
-
-    Args:
-        chosen: the model.
-        mode: how to draw, or None.
-        n_envs: how many environments to play on at once.
-        monitor_folder: where each writes the returns of its episodes, or None.
-
-    Raises:
-        UserError: if the environment cannot be drawn so, or the statistics of its observations
-            cannot be read.
+    What is drawn to be handed over is kept until `FrameTaker` asks for it.
     """
     if mode == "rgb_array":
         # Drawing into memory needs no display, and SDL complains where it finds none.
         os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
     extra = {} if mode is None else {"render_mode": mode}
     # A VecEnv resets a finished environment at once: frames are kept before that happens.
-    wrap_innermost = keep_frames if mode in KEPT_MODES else None
+    wrap_innermost = _keep_frames if mode in KEPT_MODES else None
     spec = chosen.spec
     env: VecEnv = make_evaluation_env(
         spec, n_envs, wrap_innermost=wrap_innermost, monitor_folder=monitor_folder, **extra
@@ -65,8 +54,7 @@ def playing_env(
     return env
 
 
-def keep_frames(env: Any) -> Any:
-    """Keep the frames of an environment until they are asked for, over resets too."""
+def _keep_frames(env: Any) -> Any:
     from gymnasium.wrappers import RenderCollection
 
     return RenderCollection(env, pop_frames=True, reset_clean=False)
@@ -82,23 +70,13 @@ def play_episodes(
     before_step: Callable[[Any, Any], object] = lambda obs, actions: None,
     after_step: Callable[[bool], object] = lambda done: None,
 ) -> Iterator[tuple[float, int]]:
-    """Play until so many episodes have ended, or so many steps are done.
+    """Play until so many episodes have ended, or so many steps are done over all environments.
 
-    Args:
-        model: the agent.
-        env: a VecEnv. Each of its environments plays an equal share of the episodes, as in
-            `evaluate_policy`: were it the first to end that count, they would be the short ones.
-        n_episodes: how many episodes; None for any number.
-        n_steps: how many steps at most, over all environments; None for any number.
-        deterministic: the policy's best actions rather than samples of them.
-        before_step: told before each step what the agent observes, and what it will do.
-        after_step: told after each step whether it ended an episode of the first environment.
+    ``before_step`` is told what the agent observes, and what it will do; ``after_step`` whether the
+    step ended an episode of the first environment.
 
     Yields:
         Return and length of each episode as it ends.
-
-    Raises:
-        NotFiniteError: if an observation or a return is not finite.
     """
     from pipeline.evaluation.policies import player
     from pipeline.finite_numbers import FinitePlayer, check_numbers
@@ -107,7 +85,11 @@ def play_episodes(
     obs: Any = env.reset()
     state = None
     starts = np.ones(env.num_envs, dtype=bool)
-    due = _shares(n_episodes, env.num_envs)
+    # An equal share for each environment, as in `evaluate_policy`: were it the first to end that
+    # count, they would be the short ones.
+    due: Any = np.full(env.num_envs, np.inf)
+    if n_episodes is not None:
+        due = (n_episodes + np.arange(env.num_envs)) // env.num_envs
     steps = 0
     while any(due > 0) and (n_steps is None or steps < n_steps):
         actions, state = choose(obs, state=state, episode_start=starts, deterministic=deterministic)
@@ -122,13 +104,6 @@ def play_episodes(
                 due[index] -= 1
                 check_numbers(episode["r"], "return", f"of an episode of environment {index}")
                 yield episode["r"], episode["l"]
-
-
-def _shares(n_episodes: int | None, n_envs: int) -> Any:
-    """How many episodes each environment plays, shape (n_envs,)."""
-    if n_episodes is None:
-        return np.full(n_envs, np.inf)
-    return (n_episodes + np.arange(n_envs)) // n_envs
 
 
 class Repetition:
@@ -151,11 +126,7 @@ class Repetition:
 
 
 class FrameTaker:
-    """Hands over what an environment has drawn, and keeps the episodes apart.
-
-    Args:
-        env: a VecEnv of one environment from `playing_env`, in one of `KEPT_MODES`.
-    """
+    """Hands over what an environment of `playing_env` has drawn, and keeps the episodes apart."""
 
     def __init__(self, env: VecEnv) -> None:
         self.env = env
@@ -164,10 +135,7 @@ class FrameTaker:
     def take(self, done: bool) -> list[Any]:
         """What was drawn since the last call.
 
-        A VecEnv has begun the next episode by the time that one is done; its first frame waits.
-
-        Args:
-            done: whether the last step ended an episode.
+        Where a step is the last, a VecEnv has begun the next episode; its first frame waits.
         """
         drawn: list[Any] = self._first_of_next + self.env.env_method("render")[0]
         self._first_of_next = [drawn.pop()] if done else []

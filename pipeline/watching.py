@@ -1,4 +1,7 @@
-"""What a training looks like step by step, kept while it goes on, for a page that plays it."""
+"""Records what a training looks like while it goes on, for a page that plays it.
+
+Agents with tables are recorded step by step; of all others, maps of the greedy policy are kept.
+"""
 
 from __future__ import annotations
 
@@ -24,23 +27,12 @@ from pipeline.evaluation.value_maps import MAX_STATES, best_actions_of
 from pipeline.finite_numbers import NotFiniteError, check_model
 from pipeline.train_spec import TrainSpec
 
-# Records that are appended one by one, and lie in one array.
-
-_FIRST_CAPACITY = 256
-
 
 class GrowingRows:
-    """Records of one type, as many as come.
-
-    A list of tuples would hold the same; a state of the training is saved with it now and then, and
-    an array is saved at once.
-
-    Args:
-        kind: the type of a record.
-    """
+    """Records of one type, appended to one array, which is saved in no time with the training."""
 
     def __init__(self, kind: np.dtype[np.void]) -> None:
-        self._rows: NDArray[np.void] = np.zeros(_FIRST_CAPACITY, dtype=kind)
+        self._rows: NDArray[np.void] = np.zeros(256, dtype=kind)
         self._n = 0
 
     def __len__(self) -> int:
@@ -72,10 +64,9 @@ class GrowingRows:
         self._n = len(kept)
 
 
-# Keeps what an agent does in every state as it learns, and what its logger says beside it.
-#
-# Of more maps than a page has room for, every second one is kept, then every fourth, and so on.
+# --- maps -----------------------------------------------------------------------------------------
 
+# Of more maps than a page has room for, every second one is kept, then every fourth, and so on.
 MOST_MAPS = 1000
 MOST_FIGURES = 200_000  # of all maps together
 FEWEST_MAPS = 2  # the first and the last
@@ -90,27 +81,17 @@ LOGGED = {
 
 
 class MapRecorder(BaseCallback):
-    """Keeps the greedy policy and what each state is worth under it, at many moments.
+    """Keeps the greedy policy and what each state is worth under it, at many moments."""
 
-    Args:
-        evaluator: of the environment that the agent is judged on.
-
-    Attributes:
-        unit: what a map is kept after.
-        moments: records of the type that `moment_type` makes.
-        stride: of how many units one is kept.
-        n_units: how many there were.
-    """
-
-    unit: ClassVar[str]
+    unit: ClassVar[str]  # what a map is kept after
 
     def __init__(self, evaluator: ExactEvaluator) -> None:
         super().__init__()
         n_states = evaluator.model.n_states
         self.evaluator = evaluator
-        self.moments = GrowingRows(moment_type(n_states))
+        self.moments = GrowingRows(_moment_type(n_states))
         self.most = min(max(MOST_FIGURES // (2 * n_states), FEWEST_MAPS), MOST_MAPS)
-        self.stride = 1
+        self.stride = 1  # of how many units one is kept
         self.n_units = 0
 
     @property
@@ -151,15 +132,18 @@ class MapRecorder(BaseCallback):
         policy = best_actions_of(self.evaluator, self.model)
         if policy is None:
             return
-        values = self.evaluator.values(policy)
-        log = self.model.logger.name_to_value if self.n_units else {}
+        agent: Any = self.model
+        # The schedule: the agent's rate is set with the first step.
+        schedule = getattr(agent, "exploration_schedule", lambda progress: math.nan)
+        log = agent.logger.name_to_value if self.n_units else {}
+        returns = [episode["r"] for episode in agent.ep_info_buffer or ()]
         self.moments.append(
             self.n_units,
-            self.model.num_timesteps,
-            _exploration(self.model),
+            agent.num_timesteps,
+            float(schedule(agent._current_progress_remaining)),
             *(log.get(name, math.nan) for name in LOGGED.values()),
-            _training_return(self.model),
-            values,
+            float(np.mean(returns)) if returns else math.nan,
+            self.evaluator.values(policy),
             policy[0],
         )
 
@@ -175,10 +159,7 @@ class EvaluationMaps(MapRecorder):
 
 
 class UpdateMaps(MapRecorder, BlockCallback):
-    """Keeps a map after every training on what was collected: what an agent of the library learns.
-
-    It acts where a rollout begins, so that compiled networks train as with any callback that does.
-    """
+    """Keeps a map after every update; it acts where a rollout begins, which engines can compile."""
 
     unit = "update"
 
@@ -188,12 +169,16 @@ class UpdateMaps(MapRecorder, BlockCallback):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        self._seen = _n_updates(self.model)
+        self._seen = self._n_updates()
 
     def _on_rollout_start(self) -> None:
-        if (seen := _n_updates(self.model)) != self._seen:
+        if (seen := self._n_updates()) != self._seen:
             self._seen = seen
             self._count()
+
+    def _n_updates(self) -> int:
+        agent: Any = self.model
+        return int(agent._n_updates)
 
     def _on_step(self) -> bool:
         return True
@@ -203,8 +188,7 @@ class UpdateMaps(MapRecorder, BlockCallback):
         super()._keep_end()
 
 
-def moment_type(n_states: int) -> np.dtype[np.void]:
-    """The type of what is kept of a moment."""
+def _moment_type(n_states: int) -> np.dtype[np.void]:
     return np.dtype(
         [
             ("number", np.int64),  # of the unit that it follows; 0 before the training
@@ -218,37 +202,7 @@ def moment_type(n_states: int) -> np.dtype[np.void]:
     )
 
 
-def tells_updates(agent: Any) -> bool:
-    """Whether callbacks hear of each of its trainings."""
-    return isinstance(agent, OnPolicyAlgorithm | OffPolicyAlgorithm)
-
-
-def can_be_mapped(evaluator: ExactEvaluator) -> bool:
-    """Whether there are few enough states to look at."""
-    return evaluator.model.n_states <= MAX_STATES
-
-
-def _n_updates(agent: Any) -> int:
-    return int(agent._n_updates)
-
-
-def _exploration(agent: Any) -> float:
-    """What the agent's schedule of exploration says now; its rate is set with the first step."""
-    schedule = getattr(agent, "exploration_schedule", None)
-    return math.nan if schedule is None else float(schedule(agent._current_progress_remaining))
-
-
-def _training_return(agent: Any) -> float:
-    episodes = [episode["r"] for episode in agent.ep_info_buffer or ()]
-    return float(np.mean(episodes)) if episodes else math.nan
-
-
-# Keeps every step of an agent that learns in tables, while the return of its policy rises.
-#
-# Which entries have moved is seen by holding the tables before an update against those after it, so
-# that a rule may move one entry or many, in any of its tables. Target and TD error are those that
-# the
-# update worked with, where the agent tells them.
+# --- steps ----------------------------------------------------------------------------------------
 
 # All that a page of three megabytes can hold, and what it holds where nobody says how much.
 MOST_MOVES = 20_000
@@ -303,19 +257,11 @@ CHANGE = np.dtype(
 
 
 class TableRecorder(BlockCallback):
-    """Records steps of a training; it changes nothing of it.
+    """Records the steps of the first ``n_episodes``, over all environments.
 
-    Args:
-        n_episodes: the first so many, over all environments; 0 for the steps in which the return of
-            the greedy policy rises, or the first 5000 where that is not known.
-        exact: computes that return.
-
-    Attributes:
-        names: of the tables.
-        has_actions: whether the first of them has a number for each state and action.
-        initial: the tables before the first step, by their names.
-        steps, moves, changes: records of types `STEP`, `MOVE` and `CHANGE`.
-        is_cut: whether there were more steps in these episodes than are kept.
+    For 0 episodes it records the steps in which the return of the greedy policy rises, as ``exact``
+    computes it, or the first 5000 where that is not known. Which entries have moved is seen by
+    comparing the tables before and after an update, whatever the rule moves.
     """
 
     def __init__(self, n_episodes: int, exact: ExactEvaluator | None = None) -> None:
@@ -323,14 +269,14 @@ class TableRecorder(BlockCallback):
         self.n_episodes = n_episodes
         self.exact = None if n_episodes else exact
         self._greedy_returns: list[float] = []  # one after each `STEPS_BETWEEN_RETURNS` steps
-        self.names: list[str] = []
-        self.has_actions = False
-        self.initial: dict[str, Floats] = {}
+        self.names: list[str] = []  # of the tables
+        self.has_actions = False  # whether the first of them has a number for each state and action
+        self.initial: dict[str, Floats] = {}  # the tables before the first step
         self.steps = GrowingRows(STEP)
         self.moves = GrowingRows(MOVE)
         self.changes = GrowingRows(CHANGE)
         self.is_full = False
-        self.is_cut = False
+        self.is_cut = False  # whether these episodes have more steps than are kept
         self._tables: list[Floats] = []  # as they were last
         self._obs: Any = None
         self._returns = np.zeros(0)
@@ -367,7 +313,6 @@ class TableRecorder(BlockCallback):
         return True
 
     def _note_moves(self) -> None:
-        """What was done; what is learnt from it comes afterwards."""
         agent: Any = self.model
         told = self.locals
         next_obs, terminated = true_outcome(told["new_obs"], told["dones"], told["infos"])
@@ -440,7 +385,7 @@ class TableRecorder(BlockCallback):
         return len(self.steps) >= STEPS_BETWEEN_RETURNS * risen + STEPS_AROUND
 
     def window(self) -> tuple[int, int]:
-        """The steps to show, from the first up to but not including the last, by their numbers.
+        """The first of the steps to show, and the first behind them.
 
         They begin with an episode of the first environment, before the return of the greedy policy
         rises, and end after it has risen; where it rises for longer than there is room, they are
@@ -495,30 +440,19 @@ def has_actions(agent: BaseAlgorithm, table: Floats) -> bool:
 
 
 def _learning_rate(agent: Any) -> float:
-    """What its schedule says; nan for agents that go by no schedule."""
     if agent.averages_samples or agent.learning_rate == 0.0:
         return math.nan
     return float(agent.lr_schedule(agent._current_progress_remaining))
 
 
-# How the learning of an agent can be watched: step by step in its tables, or from far.
-
 Watch = TableRecorder | MapRecorder
 
 
 def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None) -> Watch | None:
-    """What records the learning; None where nobody asked for it.
-
-    Args:
-        spec: what is asked for.
-        agent: the agent, before its training.
-        exact: what evaluates it, where that is exact.
-
-    Raises:
-        UserError: if there is nothing to look at.
-    """
+    """What records the learning of an agent that was not trained yet; None where nobody asked."""
     if spec.watch_learning is None:
         return None
+    can_be_mapped = exact is not None and exact.model.n_states <= MAX_STATES
     if isinstance(agent, LearningAlgorithm) and (tables := tables_of(agent)):
         n_entries = sum(table.size for table in tables.values())
         if n_entries > MOST_ENTRIES:
@@ -526,16 +460,16 @@ def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None
                 f"--watch-learning shows tables of up to {MOST_ENTRIES:,} entries; those of "
                 f"{spec.algo} on {spec.env_id} have {n_entries:,}"
             )
-        is_known = exact is not None and can_be_mapped(exact)
-        return TableRecorder(spec.watch_episodes, exact if is_known else None)
-    if exact is None or not can_be_mapped(exact) or best_actions_of(exact, agent) is None:
+        return TableRecorder(spec.watch_episodes, exact if can_be_mapped else None)
+    if exact is None or not can_be_mapped or best_actions_of(exact, agent) is None:
         raise UserError(
             f"--watch-learning shows tables, or what an agent does in up to 2,500 known states: "
             f"{spec.algo} on {spec.env_id} has neither"
         )
+    tells_updates = isinstance(agent, OnPolicyAlgorithm | OffPolicyAlgorithm)
     if spec.watch_episodes:
         raise UserError(
             f"--watch-episodes is for agents with tables: {spec.algo} is shown at each "
-            f"{'update' if tells_updates(agent) else 'evaluation'}"
+            f"{'update' if tells_updates else 'evaluation'}"
         )
-    return UpdateMaps(exact) if tells_updates(agent) else EvaluationMaps(exact)
+    return UpdateMaps(exact) if tells_updates else EvaluationMaps(exact)

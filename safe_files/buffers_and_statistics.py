@@ -1,4 +1,4 @@
-"""Replay buffers and the statistics of VecNormalize, read from files of unknown origin."""
+"""Loads replay buffers and the statistics of VecNormalize from files of unknown origin."""
 
 from __future__ import annotations
 

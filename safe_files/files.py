@@ -1,4 +1,4 @@
-"""Files of unknown origin: how they are opened, how large they may be, and how they are refused.
+"""Opens files of unknown origin, limits their sizes, and refuses them.
 
 A folder of runs may come from a stranger, with a link, a pipe or a device under any of its names.
 Once such a folder is held, what lies below it is opened step by step from the folder itself, where
@@ -107,10 +107,7 @@ def hold(folder: Path) -> None:
 
 
 def take_up(folder: Path) -> None:
-    """Hold a folder, once it is sure that nothing lies there but files and folders.
-
-    Libraries that open paths by themselves may then be let in.
-    """
+    """Hold a folder with nothing but files and folders, in which libraries may open paths."""
     hold(folder)
     pending = [str(folder)]
     while pending:

@@ -1,10 +1,8 @@
-"""Models of Stable-Baselines3 and sb3-contrib, loaded from files of unknown origin.
+"""Loads models of Stable-Baselines3 and sb3-contrib from files of unknown origin.
 
 The library's own `load` gets a zip that is written anew from what was checked, so that it meets
-nothing to unpickle. It makes the networks that the settings describe before it looks at the
-weights, and the buffers too: a file of some bytes could ask for all the memory that there is. And
-PyTorch turns one kind of numbers into another without a word, and looks at the shapes of an
-optimizer's averages when they are used for the first time.
+nothing to unpickle. It would make any networks and buffers that the settings describe, and PyTorch
+turns one kind of numbers into another without a word, so sizes and kinds are checked here.
 """
 
 from __future__ import annotations
@@ -158,10 +156,7 @@ def _with_tensors(algorithm: type[Algorithm], tensors: Mapping[str, Any]) -> typ
 def _read_settings(
     members: Mapping[str, bytes], algorithm: type[BaseAlgorithm], budget: Budget
 ) -> tuple[dict[str, Any], dict[str, bytes]]:
-    """The attributes in a zip that are plain data, and the pickles of those that are not.
-
-    Those that a reader decides are left out.
-    """
+    """The attributes in a zip that are plain data, and the pickles of those that are not."""
     plain: dict[str, Any] = {}
     pickled: dict[str, bytes] = {}
     for key, value in parse_settings(members, budget).items():
@@ -178,9 +173,7 @@ def _read_settings(
 
 def hides(algorithm: type, name: str) -> bool:
     """Whether an attribute of that name would hide something of the class but a plain default."""
-    missing = object()
-    value = inspect.getattr_static(algorithm, name, missing)
-    return value is not missing and not isinstance(value, _PLAIN)
+    return not isinstance(inspect.getattr_static(algorithm, name, None), _PLAIN)
 
 
 def _tensors_of(algorithm: type[BaseAlgorithm]) -> tuple[frozenset[str], frozenset[str]]:
@@ -244,8 +237,7 @@ def _first_line(error: BaseException) -> str:
 # --- sizes in proportion to the file, and tensors of such a model ---------------------------------
 
 # Attributes that say how many rows a buffer has; they multiply where there are several.
-_BUFFER = ("buffer_size",)
-_ROLLOUT = ("n_steps", "n_envs")
+_BUFFERS = (("buffer_size",), ("n_steps", "n_envs"))
 _FLAT_BYTES = 4
 # Of what a network tries its input with; the weights behind each take more than that.
 _BYTES_PER_INPUT = 40
@@ -293,7 +285,7 @@ def _check_sizes(settings: Mapping[str, Any], budget: Budget) -> None:
     n_bytes = n_inputs * _FLAT_BYTES
     if settings.get("replay_buffer_class") is HerReplayBuffer:
         n_bytes += _BYTES_PER_INFO
-    for names in (_BUFFER, _ROLLOUT):
+    for names in _BUFFERS:
         values = [settings.get(name, 1) for name in names]
         if not all(isinstance(value, int) and 0 < value <= MAX_ROWS for value in values):
             raise UnsafeFileError(f"has {' and '.join(names)} out of all proportion", names[0])
@@ -318,15 +310,14 @@ def _check_fit(model: BaseAlgorithm, tensors: Mapping[str, Any]) -> None:
 
 
 def _check_alike(where: str, value: Any, like: Any) -> None:
-    if not isinstance(like, th.Tensor):
-        return
-    if not isinstance(value, th.Tensor) or (value.dtype, value.shape) != (like.dtype, like.shape):
-        found = _described(value) if isinstance(value, th.Tensor) else type(value).__name__
-        raise UnsafeFileError(f"{where} is {found}, and the model has {_described(like)}")
-
-
-def _described(tensor: th.Tensor) -> str:
-    return f"{str(tensor.dtype).removeprefix('torch.')} of shape {tuple(tensor.shape)}"
+    found, needed = (
+        f"{str(one.dtype).removeprefix('torch.')} of shape {tuple(one.shape)}"
+        if isinstance(one, th.Tensor)
+        else type(one).__name__
+        for one in (value, like)
+    )
+    if isinstance(like, th.Tensor) and found != needed:
+        raise UnsafeFileError(f"{where} is {found}, and the model has {needed}")
 
 
 def _check_optimizer(name: str, found: Any, optimizer: optim.Optimizer) -> None:
@@ -342,16 +333,12 @@ def _check_optimizer(name: str, found: Any, optimizer: optim.Optimizer) -> None:
     for key, state in found["state"].items():
         if key not in parameters:
             raise UnsafeFileError(f"{name}: {shown(key)} is no parameter of the model")
-        if isinstance(optimizer, _BY_ELEMENT):
-            for part, value in state.items():
-                _check_state(f"{name}: {shown(part)} of {shown(key)}", value, parameters[key])
-
-
-def _check_state(where: str, value: Any, parameter: th.Tensor) -> None:
-    if isinstance(value, th.Tensor) and value.numel() == 1 and value.is_floating_point():
-        return
-    if isinstance(value, th.Tensor) or not _is_setting(value, None):
-        _check_alike(where, value, parameter)
+        for part, value in state.items() if isinstance(optimizer, _BY_ELEMENT) else ():
+            is_tensor = isinstance(value, th.Tensor)
+            is_number = is_tensor and value.numel() == 1 and value.is_floating_point()
+            if not is_number and (is_tensor or not _is_setting(value, None)):
+                where = f"{name}: {shown(part)} of {shown(key)}"
+                _check_alike(where, value, parameters[key])
 
 
 def _is_setting(value: Any, like: Any) -> bool:

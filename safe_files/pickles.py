@@ -1,9 +1,8 @@
-"""Pickles read as data: what a file asks for is noted down, and made by fixed tables.
+"""Reads pickles as data: what a file asks for is noted down, and made by fixed tables.
 
-A pickle is a program for a small machine with a stack. Python's own one, written in Python, steps
-through it here. Its instructions that ask for a class or a call note down what was asked for, and
-nothing is imported or called. From these notes, `build` makes what the tables of
-`safe_files.known_objects` know, and refuses the rest.
+Python's own reader steps through a pickle. Its instructions that ask for a class or a call note
+down what was asked for, and nothing is imported or called. From these notes, `Build` makes what the
+tables of `safe_files.known_objects` know, and refuses the rest.
 """
 
 from __future__ import annotations
@@ -81,7 +80,6 @@ class Made:
     pairs: list[tuple[Any, Any]] = field(default_factory=list)  # keys and values to set in it
 
     def append(self, item: Any) -> None:
-        """Note down what is to be appended."""
         self.items.append(item)
 
     def __setitem__(self, key: Any, value: Any) -> None:
@@ -121,12 +119,16 @@ class Reader(pickle._Unpickler):
         return tree
 
     def follow(self, name: str, run: Callable[[Reader], None]) -> None:
-        """Run one instruction, if it is known and paid for, and look at what it leaves."""
+        """Run an instruction, if it is known and paid for, and look at what it leaves."""
         if name not in self.prices:
             raise UnsafeFileError(f"a pickle with the instruction {name}")
         self.budget.charge(self.prices[name])
         for key in self.stack[_KEYS[name]] if name in _KEYS else ():
-            self.check_key(key)
+            self.budget.charge(_BYTES_PER_KEY)
+            if type(key) not in _KINDS_OF_KEYS:
+                raise UnsafeFileError(f"uses a {type(key).__name__} as the key of a dictionary")
+            if isinstance(key, int) and abs(key) >= _END_OF_INTEGERS:
+                raise UnsafeFileError("uses an absurdly large number as the key of a dictionary")
         run(self)
         top = self.stack[-1] if self.stack else None
         if isinstance(top, int) and top.bit_length() > MAX_INTEGER_BITS:
@@ -135,22 +137,13 @@ class Reader(pickle._Unpickler):
             # One character can make all others four bytes wide.
             self.budget.charge(4 * len(top))
 
-    def check_key(self, key: Any) -> None:
-        """Refuse a key of a dictionary whose hash could take for ever, or be that of all others."""
-        self.budget.charge(_BYTES_PER_KEY)
-        if type(key) not in _KINDS_OF_KEYS:
-            raise UnsafeFileError(f"uses a {type(key).__name__} as the key of a dictionary")
-        if isinstance(key, int) and abs(key) >= _END_OF_INTEGERS:
-            raise UnsafeFileError("uses an absurdly large number as the key of a dictionary")
-
     def find_class(self, module: str, name: str) -> Name:
-        """Note down a name; the machine calls this where it would import something."""
+        """Note down a name, where Python would import something."""
         found = Name(module, name)
         self.names.add(found)
         return found
 
     def load_reduce(self) -> None:
-        """Note down a call."""
         args, maker = self.stack.pop(), self.stack.pop()
         if not (isinstance(maker, Name | Made) and isinstance(args, tuple)):
             raise UnsafeFileError("a pickle that calls what is no name")
@@ -159,14 +152,13 @@ class Reader(pickle._Unpickler):
     load_newobj = load_reduce
 
     def load_build(self) -> None:
-        """Note down a state."""
         state, top = self.stack.pop(), self.stack[-1]
         if not isinstance(top, Made) or top.state is not None:
             raise UnsafeFileError("a pickle that sets the state of what is no new object")
         top.state = state
 
     def load_bytearray8(self) -> None:
-        """Read bytes. Python would make room for all that it says, before it sees what there is."""
+        # Python would make room for all that it says, before it sees what there is.
         (size,) = struct.unpack("<Q", self.read(8))
         self.stack.append(self.read(size))
 
@@ -188,16 +180,12 @@ def read_tree(pickled: bytes, budget: Budget | None = None) -> Any:
     return Reader(io.BytesIO(pickled), budget).load()
 
 
-def parts_of(tree: Any) -> Iterable[Any]:
-    """What a list, tuple, dictionary, set or object consists of."""
-    match tree:
-        case Made():
-            return tree.maker, tree.args, tree.state, tree.items, tree.pairs
-        case dict():
-            return chain(tree, tree.values())
-        case list() | tuple() | set() | frozenset():
-            return tree
-    return ()
+def _parts_of(tree: Any) -> Iterable[Any]:
+    if isinstance(tree, Made):
+        return tree.maker, tree.args, tree.state, tree.items, tree.pairs
+    if isinstance(tree, dict):
+        return chain(tree, tree.values())
+    return tree if isinstance(tree, list | tuple | set | frozenset) else ()
 
 
 # --- making what was noted down -------------------------------------------------------------------
@@ -206,10 +194,9 @@ Maker = Callable[[Made, "Build"], Any]
 
 
 class Build:
-    """Makes the parts of a tree by fixed tables; what is shared in it is made once.
+    """Makes the parts of a tree by tables of makers, each found by the full name in the file.
 
-    A maker makes an object, and refuses what does not fit. It is found by the full name of what the
-    file says is to make it. The budget pays for all of it.
+    What is shared is made once.
     """
 
     def __init__(
@@ -222,11 +209,7 @@ class Build:
         self._made: dict[int, Any] = {}
 
     def whole(self, tree: Any) -> Any:
-        """Make all of a tree, once it is paid for.
-
-        What is shared is paid for at each of its places, since whoever copies it, compares it or
-        writes it out meets it there.
-        """
+        """Make all of a tree, once it is paid for; what is shared, at each of its places."""
         try:
             self.budget.charge(self._measure(tree)[0])
         except RecursionError:
@@ -244,7 +227,7 @@ class Build:
             self.budget.charge(_BYTES_PER_NOTE)
             self._measures[key] = None  # it is under way
             size, depth = _BYTES_PER_HOLDER, 0
-            for part in parts_of(tree):
+            for part in _parts_of(tree):
                 size_of_part, depth_of_part = self._measure(part)
                 size, depth = size + size_of_part, max(depth, depth_of_part)
             if depth == MAX_DEPTH:
