@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from rich.table import Table
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-    from pipeline.action_figures import ActionFigures
+    from pipeline.evaluation.policies import ActionFigures
     from pipeline.models.choose import ChosenModel, ModelRequest
     from pipeline.models.find import Which
     from pipeline.playing import FrameTaker, RenderMode, Repetition
@@ -129,8 +129,8 @@ def main() -> int:
     """Parse the arguments and play; the exit code."""
     args = build_parser().parse_args()
     with stops_noticed(), exits_as_mistakes():
-        from pipeline.filming import check_film_path
         from pipeline.packs import unpacked
+        from pipeline.playing import check_film_path
 
         check_playing(args)
         if args.record is not None:
@@ -232,9 +232,8 @@ def play(console: Console, chosen: ChosenModel, args: argparse.Namespace) -> Non
 
     from envs.layout import action_names
     from pipeline.environments import lacking_packages_told
-    from pipeline.filming import write_film
     from pipeline.models.load import load_to_play, with_normalised_rewards
-    from pipeline.playing import FrameTaker, Repetition, play_episodes, playing_env
+    from pipeline.playing import FrameTaker, Repetition, play_episodes, playing_env, write_film
     from pipeline.signs_of_life import Activity, can_move, doing
 
     if args.num_threads > 0:
@@ -432,7 +431,7 @@ class LiveShow:
         """Draw where the agent is, and what it is about to do."""
         import numpy as np
 
-        from pipeline.action_figures import action_figures
+        from pipeline.evaluation.policies import action_figures
 
         frames = self.taker.take(done=False)
         if frames and self._repetition.goes_on(frames[-1]):

@@ -49,7 +49,7 @@ def film_of(planned: PlannedRun) -> Path | None:
     """
     path = planned.path / FILM
     if not has_film(planned):
-        from pipeline.filming import as_gif
+        from pipeline.playing import as_gif
 
         try:
             frames, episode = _play(planned)
@@ -85,8 +85,8 @@ def has_film(planned: PlannedRun) -> bool:
 def _play(planned: PlannedRun) -> tuple[list[Any], dict[str, Any]]:
     """The frames of an episode, and how it went."""
     from pipeline.evaluation.sampled import evaluation_seed
-    from pipeline.filming import film_episode
     from pipeline.models.choose import model_of_run
+    from pipeline.playing import film_episode
 
     # Pictures alone: no display is needed, nor looked for.
     os.environ.setdefault("SDL_VIDEODRIVER", "dummy")
@@ -146,8 +146,8 @@ def write_films(results: StudyResults, tell: Tell = tell_nobody) -> tuple[list[P
 
 def _films_of(planned: PlannedRun, folder: Path) -> Iterator[Path]:
     from pipeline.evaluation.sampled import evaluation_seed
-    from pipeline.filming import write_film
     from pipeline.models.choose import model_of_run
+    from pipeline.playing import write_film
 
     name = f"{file_name(planned.agent)}_{file_name(planned.environment)}"
     for checkpoint, episode in _checkpoints(planned):
@@ -175,7 +175,7 @@ def _checkpoints(planned: PlannedRun) -> Iterator[tuple[Path, int]]:
 
 def episode_in_training(chosen: ChosenModel, seed: int, max_steps: int) -> list[Any]:
     """The frames of an episode, in which the agent samples or explores as it did in training."""
-    from pipeline.filming import film_episode
+    from pipeline.playing import film_episode
 
     with _loaded(chosen) as (model, env):
         model.set_random_seed(seed)

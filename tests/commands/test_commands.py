@@ -24,7 +24,7 @@ from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
 from pipeline import files
 from pipeline.environments import training_kwargs
 from pipeline.errors import UserError
-from pipeline.filming import FRAMES_PER_SECOND, check_film_path, write_film
+from pipeline.playing import FRAMES_PER_SECOND, check_film_path, write_film
 from pipeline.settings import hyperparams
 
 ROOT = Path(train.__file__).parent

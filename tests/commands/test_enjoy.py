@@ -17,8 +17,8 @@ from commands.enjoy import LiveShow, build_parser, check_playing, figures_table,
 from commands.terminal import TextConsole
 from experiments.plan import plan
 from experiments.study import AgentSpec, EnvironmentSpec, StudySpec
-from pipeline.action_figures import ActionFigures
 from pipeline.errors import UserError
+from pipeline.evaluation.policies import ActionFigures
 from pipeline.models.choose import ModelRequest, choose_model
 from pipeline.models.load import load_to_play
 from pipeline.runs import Run

@@ -7,7 +7,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import envs  # noqa: F401  # registers the bandits
 from agents import load_algorithm
-from pipeline.action_figures import action_figures
+from pipeline.evaluation.policies import action_figures
 
 SMALL = {"policy_kwargs": {"net_arch": [8]}}
 
