@@ -216,7 +216,7 @@ def coerce(value: Any, annotation: Any, where: str) -> Any:
     not known here, what fits no other is left as it was.
     """
     options = _options(annotation)
-    for kind, read in _READERS:
+    for kind, _, read in _READERS:
         for option in options:
             if _kind(option) is kind:
                 try:
@@ -366,39 +366,26 @@ def _items(value: Any, where: str) -> Sequence[Any]:
 
 
 # In this order: a text is what remains when it is no number, schedule or dotted name.
-_READERS: tuple[tuple[Any, Callable[[Any, Any, str], Any]], ...] = (
-    (types.NoneType, _read_as_it_is),
-    (Literal, _read_choice),
-    (bool, _read_as_it_is),
-    (int, _read_int),
-    (float, _read_float),
-    (Callable, _read_schedule),
-    (type, _read_dotted_class),
-    (str, _read_as_it_is),
-    (type, _read_class),
-    (dict, _read_mapping),
-    (list, _read_list),
-    (tuple, _read_tuple),
+_READERS: tuple[tuple[Any, str, Callable[[Any, Any, str], Any]], ...] = (
+    (types.NoneType, "null", _read_as_it_is),
+    (Literal, "one of several values", _read_choice),
+    (bool, "true or false", _read_as_it_is),
+    (int, "a whole number", _read_int),
+    (float, "a number", _read_float),
+    (Callable, "a schedule such as lin_0.001", _read_schedule),
+    (type, "the name of a class", _read_dotted_class),
+    (str, "a text", _read_as_it_is),
+    (type, "the name of a class", _read_class),
+    (dict, "a mapping of names to values", _read_mapping),
+    (list, "a list", _read_list),
+    (tuple, "a list", _read_tuple),
 )
-
+_DESCRIPTIONS = {kind: words for kind, words, _ in _READERS}
 _KINDS: Mapping[Any, Any] = {
-    **{kind: kind for kind, _ in _READERS},
+    **{kind: kind for kind in _DESCRIPTIONS},
     None: types.NoneType,
     collections.abc.Mapping: dict,
     collections.abc.Sequence: list,
-}
-
-_DESCRIPTIONS: Mapping[Any, str] = {
-    types.NoneType: "null",
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    Callable: "a schedule such as lin_0.001",
-    type: "the name of a class",
-    str: "a text",
-    dict: "a mapping of names to values",
-    list: "a list",
-    tuple: "a list",
 }
 
 

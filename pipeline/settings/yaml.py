@@ -8,7 +8,7 @@ has it, not a text.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from copy import deepcopy
 from functools import lru_cache
 from itertools import chain
@@ -41,6 +41,10 @@ def _refusal(problem: str, mark: yaml.Mark) -> ConstructorError:
     return ConstructorError(None, None, problem, mark)
 
 
+def _too_much(mark: yaml.Mark) -> ConstructorError:
+    return _refusal("is nested too deeply, or too large", mark)
+
+
 class StrictLoader(yaml.SafeLoader):
     """Refuses repeated keys, every tag but those of plain data, and what is too large."""
 
@@ -61,22 +65,21 @@ class StrictLoader(yaml.SafeLoader):
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         untyped: Any = self
         event, before = untyped.peek_event(), self._n_values
-        too_much = _refusal("is nested too deeply, or too large", event.start_mark)
         if self._level >= _MAX_DEPTH:
-            raise too_much
+            raise _too_much(event.start_mark)
         self._level += 1
         node = super().compose_node(parent, index)
         self._level -= 1
         if isinstance(event, AliasEvent):
             if id(node) not in self._sizes:  # it holds its own alias
-                raise too_much
+                raise _too_much(event.start_mark)
             self._n_values += self._sizes[id(node)][0]
         else:
             self._n_values += 1
-            levels = (self._sizes[id(part)][1] for part in _parts(node))
+            levels = [self._sizes[id(part)][1] for part in _parts(node)]
             self._sizes[id(node)] = self._n_values - before, 1 + max(levels, default=0)
         if self._n_values > _MAX_VALUES or self._level + self._sizes[id(node)][1] > _MAX_DEPTH:
-            raise too_much
+            raise _too_much(event.start_mark)
         return node
 
     def compose_mapping_node(self, anchor: dict[Any, Node]) -> MappingNode:
@@ -214,8 +217,7 @@ def _node_lines(
             yield from _node_lines(value, (*keys, index))
 
 
-def _parts(node: Node | None) -> Iterator[Node]:
+def _parts(node: Node | None) -> Iterable[Node]:
     if isinstance(node, MappingNode):
-        yield from chain.from_iterable(node.value)
-    elif isinstance(node, SequenceNode):
-        yield from node.value
+        return chain.from_iterable(node.value)
+    return node.value if isinstance(node, SequenceNode) else ()
