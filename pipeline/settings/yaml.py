@@ -64,22 +64,24 @@ class StrictLoader(yaml.SafeLoader):
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         untyped: Any = self
-        event, before = untyped.peek_event(), self._n_values
+        event = untyped.peek_event()
+        mark: Any = event.start_mark
+        before = self._n_values
         if self._level >= _MAX_DEPTH:
-            raise _too_much(event.start_mark)
+            raise _too_much(mark)
         self._level += 1
         node = super().compose_node(parent, index)
         self._level -= 1
         if isinstance(event, AliasEvent):
             if id(node) not in self._sizes:  # it holds its own alias
-                raise _too_much(event.start_mark)
+                raise _too_much(mark)
             self._n_values += self._sizes[id(node)][0]
         else:
             self._n_values += 1
             levels = [self._sizes[id(part)][1] for part in _parts(node)]
             self._sizes[id(node)] = self._n_values - before, 1 + max(levels, default=0)
         if self._n_values > _MAX_VALUES or self._level + self._sizes[id(node)][1] > _MAX_DEPTH:
-            raise _too_much(event.start_mark)
+            raise _too_much(mark)
         return node
 
     def compose_mapping_node(self, anchor: dict[Any, Node]) -> MappingNode:
