@@ -1,4 +1,4 @@
-"""Numbers that are none: nan and infinity, found before anything is learnt or judged by them.
+"""Refuses nan and infinity before anything is learnt or judged by them.
 
 Infinity is refused like nan, also where an observation space has no bounds: the first update of a
 network turns it into nan, and so does the first mean that it is part of.
@@ -53,7 +53,7 @@ def check_numbers(values: Any, what: str, when: str) -> None:
 
 
 def check_rows(values: Any, what: str, when: str) -> None:
-    """The same for values with a row for each environment, shape (n_envs, ...)."""
+    """As `check_numbers`, for values with a row for each environment, shape (n_envs, ...)."""
     for name, array in _parts(values):
         if not is_finite(array):
             rows = np.isfinite(array).reshape(len(array), -1).all(axis=1)
@@ -98,14 +98,14 @@ class FinitePlayer:
         self._when = when
 
     def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """The agent's own."""
+        """Predict, once the observation was checked."""
         check_rows(observation, "observation", self._when)
         actions, state = self._player.predict(observation, **kwargs)
         return actions, state
 
 
 def _parts(values: Any) -> Iterator[tuple[str, NDArray[Any]]]:
-    """The arrays among values, each with how it is called in a message."""
+    """The arrays among values, each with its name for a message."""
     if isinstance(values, Mapping):
         for name, array in values.items():
             yield f" {name!r}", np.asarray(array)

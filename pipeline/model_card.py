@@ -1,4 +1,4 @@
-"""The card of a pack: what a model hub reads, what a person wants to know, and how to play it."""
+"""Writes the card of a pack: metadata for model hubs, results, and how to play the agent."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from agents import ALGORITHMS
 from pipeline.errors import visible
 from pipeline.user_modules import copy_of
 
-# What stands around an environment, and a plain script would have to put there too.
+# Wrappers that a plain script would have to build too.
 _WRAPPERS = ("env_wrapper", "vec_env_wrapper", "frame_stack")
 _LIBRARIES = ("stable_baselines3", "sb3_contrib")
 _DEEP = {"dqn", "double_dqn", "deep_qlearning"}
@@ -120,7 +120,7 @@ def _figures(record: Mapping[str, Any]) -> str:
 
 
 def _measured(final: Mapping[str, Any]) -> dict[str, str]:
-    """What the figures are called that hold the return against the optimum."""
+    """Labels of the figures that compare the return with the optimum."""
     if "optimum_at_least" not in final:
         return {
             "optimum": "optimum",

@@ -1,4 +1,4 @@
-"""Packs of runs and of studies: what they hold, written whole, and read as data."""
+"""Writes packs of runs and of studies, and reads packs of anybody as data."""
 
 from __future__ import annotations
 
@@ -201,7 +201,7 @@ def _check_study(path: Path) -> int:
 
 @contextmanager
 def _opened_study(path: Path) -> Iterator[tuple[Callable[[str], bytes], set[str]]]:
-    """What reads a file in the pack of a study, and the names of all, none of which leads away."""
+    """A function that reads a file in the pack of a study, and the checked names of all files."""
     content = read_file(path, MAX_ARCHIVE_BYTES)
     with opened_zip(content, Budget(len(content))) as archive:
         infos = archive.infolist()
@@ -377,7 +377,7 @@ def pack_study(root: Path, target: Path, say: Callable[[str], object]) -> StudyP
         folders = sorted(path for path in root.glob(f"{RUNS}/*/*") if _RUN.fullmatch(path.name))
         if not folders:
             raise UserError(f"{root} holds no finished run: there is nothing to pack")
-        # A file without a name: whoever kills this process leaves nothing.
+        # A file without a name leaves nothing behind if this process is killed.
         with tempfile.TemporaryFile(dir=target.absolute().parent) as draft:
             made = _write_study(draft, root, folders)
             draft.seek(0)

@@ -27,7 +27,7 @@ RenderMode = Literal["human", "ansi", "rgb_array"]
 # What an environment draws in these modes is handed over rather than shown at once.
 KEPT_MODES: tuple[RenderMode, ...] = ("ansi", "rgb_array")
 
-# So many frames one after the other that were shown before: who watches has seen it by then.
+# An episode repeats itself after so many known frames in a row.
 FRAMES_OF_A_REPETITION = 20
 
 
@@ -111,14 +111,14 @@ def play_episodes(
 
 
 class Repetition:
-    """Notices where an episode shows nothing any more that it has not shown before."""
+    """Notices when an episode only repeats frames."""
 
     def __init__(self) -> None:
         self._seen: set[Any] = set()
         self._n_known = 0  # one after the other
 
     def goes_on(self, frame: Any) -> bool:
-        """Whether this frame, and as many before it as make a repetition, were shown before."""
+        """Whether this frame and the last `FRAMES_OF_A_REPETITION` were all shown before."""
         self._n_known = self._n_known + 1 if frame in self._seen else 0
         self._seen.add(frame)
         return self._n_known > FRAMES_OF_A_REPETITION

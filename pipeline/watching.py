@@ -29,7 +29,7 @@ from pipeline.train_spec import TrainSpec
 
 
 class GrowingRows:
-    """Records of one type, appended to one array, which is saved in no time with the training."""
+    """An array of records that grows by doubling; saving it with the training is fast."""
 
     def __init__(self, kind: np.dtype[np.void]) -> None:
         self._rows: NDArray[np.void] = np.zeros(256, dtype=kind)
@@ -119,7 +119,7 @@ class MapRecorder(BaseCallback):
             self._append()
 
     def _count(self) -> None:
-        """Another one is over: keep its map if it is one of those to be kept."""
+        """Count a unit, and keep its map if its number is a multiple of the stride."""
         self.n_units += 1
         if self.n_units % self.stride:
             return
@@ -149,7 +149,7 @@ class MapRecorder(BaseCallback):
 
 
 class EvaluationMaps(MapRecorder):
-    """Told after every evaluation, it keeps a map then."""
+    """Keeps a map after every evaluation."""
 
     unit = "evaluation"
 
@@ -217,11 +217,11 @@ STEPS_BETWEEN_RETURNS = 100
 FIRST_OF_RISE, LAST_OF_RISE = 0.1, 0.9
 STEPS_AROUND = 500  # that are kept before and after it
 
-# What ended with a step.
+# How an episode ended with a step, if it did.
 GOES_ON, TERMINATED, TRUNCATED = 0, 1, 2
 NO_STATE = -1
 
-# One step of all environments.
+# A step of all environments.
 STEP = np.dtype(
     [
         ("timesteps", np.int64),  # after it, over all environments
@@ -229,7 +229,7 @@ STEP = np.dtype(
         ("learning_rate", np.float64),  # nan where it is no number of the schedule's
     ]
 )
-# What one environment did in it.
+# What one environment did in a step.
 MOVE = np.dtype(
     [
         ("step", np.int64),  # number of the step
@@ -245,7 +245,7 @@ MOVE = np.dtype(
         ("episode_return", np.float64),  # sum of the rewards so far
     ]
 )
-# An entry that moved in it.
+# An entry of a table that a step changed.
 CHANGE = np.dtype(
     [
         ("step", np.int64),
@@ -347,7 +347,7 @@ class TableRecorder(BlockCallback):
         self._look_whether_full()
 
     def _note_changes(self, number: int, moved: Ints, before: Floats, now: Floats) -> None:
-        # What was nan and is so still differs from itself.
+        # nan is unequal to itself, but did not change.
         stays = np.isnan(before.reshape(-1)[moved]) & np.isnan(now.reshape(-1)[moved])
         moved = moved[~stays]
         changes = np.zeros(len(moved), dtype=CHANGE)
@@ -375,7 +375,7 @@ class TableRecorder(BlockCallback):
             self._greedy_returns.append(self.exact(self.model).mean_return)
 
     def _has_risen(self) -> bool:
-        """Whether there is enough after the policy came near the best that is possible."""
+        """Whether enough steps follow the first policy that is near the optimum."""
         assert self.exact is not None
         first, best = self._greedy_returns[0], self.exact.yardstick.optimum
         near = first + LAST_OF_RISE * (best - first)
@@ -449,7 +449,7 @@ Watch = TableRecorder | MapRecorder
 
 
 def watch_of(spec: TrainSpec, agent: BaseAlgorithm, exact: ExactEvaluator | None) -> Watch | None:
-    """What records the learning of an agent that was not trained yet; None where nobody asked."""
+    """The recorder for an untrained agent; None without ``--watch-learning``."""
     if spec.watch_learning is None:
         return None
     can_be_mapped = exact is not None and exact.model.n_states <= MAX_STATES

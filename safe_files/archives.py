@@ -1,4 +1,4 @@
-"""The zips of models, looked at before a library is imported: members, and settings as text.
+"""Reads members and settings from zips of models, without importing the libraries.
 
 No more is unpacked than the budget of the file allows.
 """
@@ -24,7 +24,7 @@ MEMBERS = TENSORS | {SETTINGS, "_stable_baselines3_version", "system_info.txt"}
 _TENSORS = re.compile(r"\w[\w.]*\.pth", re.ASCII)
 
 MAX_MEMBERS = 64
-# Of no use beyond this: counters of steps are far below.
+# Counters of steps need far fewer.
 MAX_INTEGER_BITS = 128
 # What begins each entry of a zip's list of members, and what Python makes of one.
 _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
@@ -32,7 +32,7 @@ _ENTRY, _BYTES_PER_ENTRY = b"PK\1\2", 1000
 # what is unpacked is paid for, as Python puts it together from pieces.
 _COPIES = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: 2}
 
-# What Python raises at zips that are damaged, encrypted, or of a kind that it does not know.
+# What Python raises for zips that are damaged, encrypted, or of an unknown kind.
 _ODD = (OverflowError, RuntimeError, ValueError)
 _DAMAGE = (zipfile.BadZipFile, zlib.error, OSError, EOFError, *_ODD)
 

@@ -38,7 +38,7 @@ _MORE_ARGUMENTS: Mapping[type, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class _Stored:
-    """A buffer as the file says it: its class and its attributes."""
+    """Class and attributes of a buffer in a file."""
 
     cls: type[ReplayBuffer]
     state: Mapping[str, Any]
@@ -98,7 +98,7 @@ def _buffer(found: _Stored, device: th.device) -> ReplayBuffer:
     given["buffer_size"] *= given.get("n_envs", 1)
     if found.cls is HerReplayBuffer:
         given["env"] = None
-        # It makes a dictionary for each row: let there be as many in the file.
+        # The constructor makes a dictionary for each row: the file must hold as many.
         if not isinstance(state.get("infos"), np.ndarray) or state["infos"].shape != shape:
             raise UnsafeFileError("holds a replay buffer with wrong infos")
     try:
@@ -118,7 +118,7 @@ def _buffer(found: _Stored, device: th.device) -> ReplayBuffer:
 
 
 def _check_part(name: str, value: Any, expected: Any) -> None:
-    """Make sure that an attribute of a buffer is such as an empty one has."""
+    """Check type, shape and range of a buffer's attribute against those of an empty buffer."""
     if isinstance(expected, dict):
         if not isinstance(value, dict) or value.keys() != expected.keys():
             raise UnsafeFileError(f"holds a replay buffer with wrong {name}")
@@ -189,7 +189,7 @@ def _normalization(made: Made, build: Build) -> Normalization:
         raise wrong(made)
     state = {name: build(trees[name]) for name in (*_FLAGS, *_NUMBERS, *_REST)}
     settings = {name: state[name] for name in (*_FLAGS, *_NUMBERS)}
-    # Files from before there was a choice of keys do not say it.
+    # Older files lack it.
     keys = trees.get("norm_obs_keys")
     settings["norm_obs_keys"] = build(keys) if isinstance(keys, list) else None
     fits = (

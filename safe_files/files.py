@@ -22,12 +22,12 @@ NO_LIMIT = 1 << 62  # bytes
 MAX_ARCHIVE_BYTES = 1 << 30
 MAX_STATISTICS_BYTES = 64 << 20
 MAX_BUFFER_BYTES = 32 << 30
-# What may be made of a file: so many times its own bytes, and these.
+# Reading a file may take so many times its size, and these bytes.
 _TIMES = 4
 _FREE_BYTES = 64 << 20
 # Of an empty dictionary, with its place in what holds it: no value takes more beside its text.
 _BYTES_PER_JSON_VALUE = 100
-# Where no system tells; many machines have as much.
+# If the system does not tell.
 _MEMORY_IF_UNKNOWN = 16 << 30
 
 
@@ -39,20 +39,20 @@ class UnsafeFileError(ValueError):
     """
 
     def __init__(self, message: str, key: str | None = None) -> None:
-        # What a terminal obeys instead of showing it is spelt out.
+        # Control characters are escaped.
         signs = (c if c.isprintable() else repr(c)[1:-1] for c in " ".join(message.split()))
         super().__init__("".join(signs))
         self.key = key
 
 
 def shown(value: object) -> str:
-    """A name from a file as a message quotes it: short, and nothing in it that a terminal obeys."""
+    """Quote a name from a file in a message: shortened, control characters escaped."""
     text = ascii(value)
     return text if len(text) <= 80 else f"{text[:76]}...'"
 
 
 class Budget:
-    """The memory that a file of so many bytes may take: who makes something of it pays before."""
+    """The memory that reading a file may take; it is charged before something is made."""
 
     def __init__(self, n_bytes: int) -> None:
         self.n_bytes = n_bytes

@@ -53,12 +53,12 @@ MAX_ROWS = 1_000_000_000  # of a buffer
 
 
 def _called(make: Callable[..., Any], *kinds: type) -> Maker:
-    """What makes an object of a call's arguments, if they are of these kinds."""
+    """A maker that calls ``make`` with the arguments in the file, checked for these types."""
     return lambda made, build: make(*arguments(made, build, *kinds))
 
 
 def _of_state(make: Callable[..., Any], /, **kinds: tuple[type, ...]) -> Maker:
-    """What makes an object of its attributes: these, of these kinds, and all numbers finite."""
+    """A maker from exactly these attributes, checked for types and finite numbers."""
 
     def maker(made: Made, build: Build) -> Any:
         state = fields(made, build)
@@ -126,7 +126,7 @@ def _from_buffer(made: Made, build: Build) -> NDArray[Any]:
 
 
 def _state_of_five(made: Made, build: Build) -> tuple[Any, ...]:
-    """What NumPy's own functions, whose arguments do not matter, hand to what they make."""
+    """The state of five parts that NumPy gives to an array or a seed sequence."""
     state = build(made.state)
     if not (isinstance(state, tuple) and len(state) == 5) or made.items or made.pairs:
         raise wrong(made)
@@ -274,7 +274,7 @@ def _lone_storage(made: Made, build: Build) -> th.Tensor:
     (content,) = arguments(made, build, bytes)
     file = io.BytesIO(content)
     reader = _TensorReader(file, build.budget)
-    # Before it are three marks of the format, and behind it the list of the storages and its size.
+    # Three headers come before the storage, a list of keys and the size after it.
     storage = [reader.load() for _ in range(5)][3]
     return _flat(storage, file.read()[8:])
 
@@ -373,7 +373,7 @@ def _space(made: Made, build: Build) -> spaces.Space[Any]:
         space = spaces.MultiBinary(n)
     generator = state.get("_np_random")
     if isinstance(generator, np.random.Generator):
-        # Whoever goes on with the model draws on from where it was.
+        # Sampling goes on where it was.
         space._np_random = generator
     return space
 
@@ -501,7 +501,7 @@ def _vectorized_noise(made: Made, build: Build) -> VectorizedActionNoise:
     noises, base = state.get("_noises"), state.get("_base_noise")
     if not isinstance(noises, list) or not all(isinstance(one, _NOISES) for one in (base, *noises)):
         raise wrong(made)
-    # It copies the first of them as often as it is told.
+    # The constructor would make as many copies as the file says.
     vectorized = VectorizedActionNoise(cast(Any, base), 1)
     vectorized.n_envs = len(noises)
     vectorized.noises = noises
@@ -509,7 +509,7 @@ def _vectorized_noise(made: Made, build: Build) -> VectorizedActionNoise:
 
 
 def _device(made: Made, build: Build) -> th.device:
-    # Whatever the file says: what is read lands where its reader wants it.
+    # The reader decides the device.
     arguments(made, build, *((str,) if len(made.args) == 1 else (str, int)))
     return th.device("cpu")
 

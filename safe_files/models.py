@@ -51,13 +51,13 @@ from safe_files.known_objects import (
 )
 from safe_files.pickles import Reader
 
-# What is trained and part of no network: the entropy coefficient of SAC and its kin.
+# Trained variables outside of networks: the entropy coefficient of SAC and others.
 _OF_ENTROPY = frozenset({"log_ent_coef", "ent_coef_tensor"})
 
 # The files of those; the second is the name that the first once had.
 _VARIABLES = frozenset({"pytorch_variables.pth", "tensors.pth"})
 
-# What the reader's own side decides.
+# Attributes that the reader decides, whatever the file says.
 _NOT_READ = frozenset(
     {"env", "device", "policy", "rollout_buffer", "replay_buffer", "tensorboard_log"}
     | {"_logger", "_custom_logger", "_vec_normalize_env", "_episode_storage"}
@@ -196,7 +196,7 @@ def _decoded(key: str, text: Any) -> bytes:
 
 
 def _check_variables(tensors: Mapping[str, Any], known: frozenset[str]) -> None:
-    """The library sets each of these by the way to it: let there be no other than it writes."""
+    """Refuse variables that the library does not write: it would set any attribute by its path."""
     for name in sorted(_VARIABLES):
         variables = tensors.get(name, {})
         if not isinstance(variables, dict):
@@ -226,7 +226,7 @@ def _zipped(data: bytes, tensors: Mapping[str, Any]) -> io.BytesIO:
 
 
 def _first_line(error: BaseException) -> str:
-    """What a foreign exception says before it gives advice, or its kind where it says nothing."""
+    """The first sentence of a foreign exception, or its type."""
     lines = str(error).strip().splitlines()
     # PyTorch says below a heading which tensor it is.
     n_lines = 2 if lines and lines[0].endswith(":") else 1
@@ -246,7 +246,7 @@ _MAKERS = frozenset(
     {th.empty, th.zeros, th.ones, th.full, th.rand, th.randn, th.eye, th.arange, th.Tensor.repeat}
     | {th.empty_like, th.zeros_like, th.ones_like, th.Tensor.clone, th.clone}
 )
-# Python's part of a tensor, and of the layer that has it.
+# Python's overhead of a tensor and its layer.
 _BYTES_PER_TENSOR = 4096
 # Of the dictionary in which `HerReplayBuffer` keeps what environments say of each step.
 _BYTES_PER_INFO = 136
@@ -257,7 +257,7 @@ _BY_ELEMENT = (*(getattr(optim, name) for name in _NAMES.split()), RMSpropTFLike
 
 
 class charged_tensors(TorchFunctionMode):  # noqa: N801  # it is used as a function is
-    """While it is entered, the budget pays for tensors before they are made."""
+    """Charges the budget for each tensor before PyTorch makes it."""
 
     def __init__(self, budget: Budget) -> None:
         super().__init__()
@@ -299,7 +299,7 @@ def _check_sizes(settings: Mapping[str, Any], budget: Budget) -> None:
 
 
 def _check_fit(model: BaseAlgorithm, tensors: Mapping[str, Any]) -> None:
-    """Make sure that a model could have written the tensors that it was given."""
+    """Check kinds and shapes of the tensors against those of the model."""
     for name in model._get_torch_save_params()[0]:
         part, found = recursive_getattr(model, name), tensors.get(f"{name}.pth", {})
         if isinstance(part, nn.Module):

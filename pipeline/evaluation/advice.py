@@ -68,7 +68,7 @@ def advice(
             return None
         policy = policy[0]
     yardstick = evaluator.yardstick
-    # A return that is as good as the optimum can be that of a constant action too.
+    # Where a constant action is optimal, the score of a near-optimal return may be 0.
     near = yardstick.gap(final.mean_return) <= NEAR_OPTIMUM * abs(yardstick.optimum)
     failed = yardstick.score(final.mean_return) < FAILED and not near
     running = _still_running(evaluator, policy, 1)
@@ -128,7 +128,7 @@ def _try_first(
     raises_gamma = nearer > gamma and (is_near or score < reached - MATTERS)
     n_tables = len(getattr(agent.policy, "q_tables", [0]))
     n_pairs = int(model.reachable.sum()) * model.n_actions * n_tables
-    # What is further away takes longer to learn.
+    # A more distant goal takes longer to learn.
     few = FEW_STEPS_FAR if raises_gamma else FEW_STEPS
     needs_steps = n_steps < few * n_pairs and not isinstance(agent, PlanningAgent)
     if not (raises_gamma or needs_steps) or reached < SOLVED:

@@ -1,4 +1,4 @@
-"""Exact evaluation: what an agent's policy is worth, computed instead of sampled.
+"""Computes the value of an agent's policy exactly, instead of sampling it.
 
 Where the transition model of the environment is known, the policy is asked for every state at once,
 and its return under the time limit follows by arithmetic, without evaluation noise.
@@ -45,7 +45,7 @@ from pipeline.evaluation.policies import OfLastPolicy, best_actions, obstacle, p
 from pipeline.evaluation.sampled import Evaluation, Yardstick
 from pipeline.train_spec import TrainSpec, is_plain
 
-# What is observed in all states, kept as one array.
+# Limit for the array with the observations of all states.
 MOST_BYTES_OBSERVED = 1 << 30
 # Planning backwards from the time limit: steps times outcomes of all states and actions, of which a
 # second does some hundred million. Beyond the first number there may be a shorter way.
@@ -123,7 +123,7 @@ class ExactEvaluator:
         return policy_matrix(agent, self.observations, deterministic, self.masks)
 
     def obstacle(self, agent: BaseAlgorithm, deterministic: bool = True) -> str:
-        """Why the agent's policy is not to be had, or too dear; empty where it is neither."""
+        """Why the policy cannot be computed, or is too expensive; empty if it can."""
         return obstacle(agent, self.observations, self.masks, self.horizon, deterministic)
 
 
@@ -218,7 +218,7 @@ def discount_note(spec: TrainSpec, exact: ExactEvaluator, discount: float) -> st
 
 
 def _is_wrapped_as_vector(spec: TrainSpec) -> bool:
-    """Whether the agent sees the environment through something around all of its copies."""
+    """Whether a wrapper around the vectorised environment changes what the agent sees."""
     special = spec.hyperparams
     return bool(special.normalize is not None or special.frame_stack or special.vec_env_wrapper)
 
@@ -227,10 +227,10 @@ _kept: OrderedDict[str, ExactEvaluator] = OrderedDict()
 
 
 def evaluator_of(spec: TrainSpec) -> ExactEvaluator | None:
-    """As `exact_evaluator`; that of plain runs on the same environment is the same object."""
+    """As `exact_evaluator`, cached for plain runs on the same environment."""
     if not is_plain(spec):
         return exact_evaluator(spec)
-    # All that the environment of a plain run's evaluation is made from.
+    # Everything that determines the evaluation environment of a plain run.
     masks = spec.hyperparams.algorithm.get("mask_actions", False)
     key = repr((gym.registry[spec.env_id], sorted(evaluation_kwargs(spec).items()), masks))
     evaluator = _kept.pop(key, None) or exact_evaluator(spec)

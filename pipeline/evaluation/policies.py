@@ -58,7 +58,7 @@ def _knows_masks(predict: Callable[..., Any]) -> bool:
 
 
 def player(model: BaseAlgorithm, env: VecEnv) -> Any:
-    """What to ask by ``predict`` on ``env``: the agent, told the masks where it takes them."""
+    """The agent for ``env``; one that takes action masks is wrapped to receive them."""
     if not takes_masks(model):
         return model
     try:
@@ -79,7 +79,7 @@ class MaskTold:
         self.env = env
 
     def predict(self, observation: Any, **kwargs: Any) -> tuple[Any, Any]:
-        """The agent's own, for what the environments show now."""
+        """Predict with the current action masks of the environments."""
         masks = present_masks(self.env, observation)
         actions, state = self.model.predict(observation, action_masks=masks, **kwargs)
         return actions, state
@@ -122,7 +122,7 @@ def obstacle(
     horizon: int,
     deterministic: bool = True,
 ) -> str:
-    """Why exact evaluation is out of reach, or dearer than playing; empty where it is neither."""
+    """Why exact evaluation is impossible, or slower than playing; empty if it is neither."""
     n_states = len(observations)
     if reason := _cannot_be_asked(agent, masks):
         return reason
@@ -201,7 +201,7 @@ def best_actions(
     if reason := _cannot_be_asked(agent, masks):
         raise TypeError(f"{type(agent).__name__}: {reason}")
 
-    # A plain table is sooner looked up than asked for, which is most of an evaluation.
+    # Reading a plain table is faster than `predict`, which takes most of an evaluation.
     is_ours = type(agent).predict is TabularAlgorithm.predict and not takes_masks(agent)
     table: object = agent.policy if is_ours else None
     if isinstance(table, QTablePolicy) and type(table) is QTablePolicy:
@@ -219,7 +219,7 @@ def _in_parts(
     masks: Bools | None,
     asked: Callable[..., NDArray[Any]],
 ) -> NDArray[Any]:
-    """What ``asked`` returns for all observations, which may be too many for a network at once."""
+    """Call ``asked`` on batches of observations that are small enough for a network."""
     n_states = len(observations)
     n_rows = max(MOST_AT_ONCE // _n_inputs(agent), 1) if is_network(agent) else n_states
     told: Any = {} if masks is None or not takes_masks(agent) else {"action_masks": masks}
@@ -231,7 +231,7 @@ def _in_parts(
 
 
 def _n_inputs(agent: BaseAlgorithm) -> int:
-    """Numbers that an observation becomes before a network is handed it."""
+    """The size of a flattened observation."""
     return max(int(spaces.flatdim(agent.observation_space)), 1)
 
 
@@ -251,7 +251,7 @@ def _actor_probabilities(policy: Any, observations: NDArray[Any], **told: Any) -
     return np.asarray(distribution.probs.cpu().numpy(), dtype=np.float64)
 
 
-# --- what an agent makes of the actions before it -------------------------------------------------
+# --- values or probabilities of the actions at one observation ------------------------------------
 
 
 class ActionFigures(NamedTuple):
@@ -286,7 +286,7 @@ def _of_network(policy: Any, observations: Any) -> ActionFigures | None:
     if getattr(policy, "quantile_net", None) is not None:
         tensor, _ = policy.obs_to_tensor(observations)
         return ActionFigures("value", policy.quantile_net(tensor)[0].mean(dim=0).cpu().numpy())
-    # A policy with a memory would have to be told what it remembers.
+    # A recurrent policy would need its hidden state.
     if isinstance(policy, ActorCriticPolicy) and not hasattr(policy, "lstm_actor"):
         tensor, _ = policy.obs_to_tensor(observations)
         distribution = policy.get_distribution(tensor)

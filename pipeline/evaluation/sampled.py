@@ -27,12 +27,12 @@ from pipeline.evaluation.policies import KNOWN_LIBRARIES, is_network, player
 from pipeline.finite_numbers import FinitePlayer, check_numbers
 from pipeline.train_spec import TrainSpec
 
-# Where nothing that an agent does makes a difference, sums may differ by this much.
+# Returns closer than this are equal but for rounding.
 ROUNDING = 1e-12
 
-# By so many standard errors a mean is above what no policy exceeds only where something is wrong.
+# A mean so many standard errors above an upper bound means that something is wrong.
 BEYOND_CHANCE = 6.0
-# Of fewer episodes that cannot be said: all of them may have begun where returns are high.
+# Fewer episodes may all have begun where returns are high.
 FEWEST_TO_TELL = 10
 
 
@@ -64,7 +64,7 @@ class Yardstick:
 
     @property
     def lower_end(self) -> Yardstick:
-        """What measures by the lower end of a bracket; of a known optimum the same."""
+        """The yardstick with the lower end of a bracket as optimum."""
         return self if self.at_least is None else Yardstick(self.at_least, self.baseline)
 
     def figures(self, expected_return: float) -> dict[str, float]:
@@ -177,7 +177,7 @@ def evaluate(
         if local["done"] and "is_success" in local["info"]:
             successes.append(bool(local["info"]["is_success"]))
 
-    # Others that play have no count of their own.
+    # Planners and others have no count of steps.
     when = f"in the evaluation at step {getattr(model, 'num_timesteps', 0):,}"
     if seed is not None:
         env.seed(seed)
@@ -245,8 +245,8 @@ class Shares(NamedTuple):
     at_first: float  # of the steps of short trainings, until that comes to `STEPS_AT_FIRST`
 
 
-# Chosen by how long a step of evaluation takes beside one of training, so that all of them take a
-# fifth of its time or less. Figures: `benchmarks/evaluation_share.py`.
+# Chosen so that evaluations take a fifth of the time of training or less, as
+# `benchmarks/evaluation_share.py` measures.
 NETWORK = Shares(usual=1 / 4, at_first=1 / 2)
 TABLE = Shares(usual=1 / 100, at_first=1 / 5)
 # A2C learns once from each step, which takes no longer than to play one.
@@ -283,7 +283,7 @@ def allowed_steps(n_trained: float, shares: Shares) -> float:
     return max(shares.usual * n_trained, at_first, STEPS_IN_ANY_CASE)
 
 
-# The final evaluation has the rest, and no less where those before took more than they had.
+# The final evaluation has the rest, even if the others took more than their part.
 PART_DURING_TRAINING = 1 / 2
 
 # Episodes of an evaluation: the first number, and the next until the standard error is small.
@@ -303,7 +303,7 @@ class SampledEvaluator:
         self.yardstick = bracketed_yardstick(spec)
         self.seed = spec.seed
         self.n_episodes, self.n_final = spec.eval_episodes, spec.final_episodes
-        # Whoever says when to evaluate, or how long, gets that.
+        # Settings that say when or how long to evaluate are obeyed.
         self.is_limited = spec.eval_episodes is None and spec.eval_freq is None
         self.training_steps = spec.hyperparams.n_timesteps
         self.training_episodes = spec.hyperparams.n_episodes
@@ -361,7 +361,7 @@ class SampledEvaluator:
             n_more = n_episodes - len(found.returns)
             if is_sure(found, precision) or found.lengths.sum() + n_more * found.mean_length > most:
                 break
-            # Not seeded again, the environments go on to other episodes.
+            # Without a new seed, the environments go on to other episodes.
             found = found.joined(play(n_more, None))
         self.n_steps += int(found.lengths.sum())
         self._last_length = found.mean_length
@@ -379,7 +379,7 @@ class SampledEvaluator:
         return float(np.mean(lengths[-STAGES[0] :])) if lengths else 1.0
 
     def _compiled_copy(self, model: BaseAlgorithm) -> CompiledCopy | None:
-        """The environments in compiled code, if it is that what the agent was trained on."""
+        """The compiled environments, if the agent was trained in compiled code."""
         if getattr(model, "engine_in_use", "") != "compiled":
             return None
         return compiled_copy(self.env)
@@ -442,13 +442,13 @@ def evaluate_compiled(
     env, n_envs = copy.env, copy.env.num_envs
     if seed is not None:
         env.seed(seed)
-    # As the library shares them out.
+    # The same shares as in `evaluate_policy`.
     wanted = (n_episodes + np.arange(n_envs)) // n_envs
     states = NetworkEnvStates(env, copy.world, copy.seen)
     acting = cast(Any, model).greedy_player(copy.seen)
     with one_thread() if is_network(model) else nullcontext():
         found = play_episodes(copy.world, acting, states, env.reset(), wanted)
-    # As Monitor tells them.
+    # Rounded as in Monitor.
     returns = np.array([round(total, DECIMALS) for total in found.returns.tolist()])
     when = f"in the evaluation at step {model.num_timesteps:,}"
     check_numbers(returns, "return", when)

@@ -1,4 +1,4 @@
-"""Where on the map an agent acts well: exact values and actions in every state, and the best ones.
+"""Exact values and actions of an agent in every state of a map, beside the optimal ones.
 
 A value means the same for tables and networks: the expected return, with the whole time limit
 ahead, of the agent's deterministic policy from that state on. What the agent itself believes the

@@ -1,1 +1,1 @@
-"""Models on disk: found, looked into, loaded, gone on with, and saved."""
+"""Finds, inspects, loads, continues and saves models on disk."""

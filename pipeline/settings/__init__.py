@@ -1,1 +1,1 @@
-"""Settings from files and command lines: read, checked and built, without running any of them."""
+"""Reads, checks and builds settings from files and command lines, and runs none of them."""

@@ -44,21 +44,21 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 
-# How wrappers call the number of observations that they stack, which take their memory at once.
+# Arguments of wrappers for the number of stacked observations, whose memory is taken at once.
 _STACKS = frozenset({"n_stack", "stack_size"})
 _LONGEST_STACK = 10_000
 
 
 @dataclass(frozen=True)
 class _Component:
-    """A class and the arguments to build it with, both checked."""
+    """A checked class and its checked arguments."""
 
     cls: type
     kwargs: dict[str, Any]
     where: str
 
     def build(self, *inner: Any) -> Any:
-        """The object, around ``inner`` if it is a wrapper."""
+        """Build the object; a wrapper around ``inner``."""
         from gymnasium.error import Error
 
         try:
@@ -85,7 +85,7 @@ def wrapper_factory(
     where: str = "env_wrapper",
     folder: Path | None = None,
 ) -> Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None:
-    """What wraps an environment as ``spec`` says, the first wrapper innermost."""
+    """Return a function that applies the wrappers of ``spec``, the first one innermost, or None."""
     from gymnasium import Wrapper
 
     components = _components(spec, Wrapper, extra_packages, where, 1, folder)
@@ -108,7 +108,7 @@ def vec_wrapper_factory(
 def callbacks(
     spec: Any, extra_packages: Sequence[str] = (), save_path: Path | str | None = None
 ) -> list[BaseCallback]:
-    """The callbacks that ``spec`` names."""
+    """Build the callbacks that ``spec`` names."""
     from stable_baselines3.common.callbacks import BaseCallback
 
     folder = None if save_path is None else Path(save_path)
@@ -178,15 +178,15 @@ def _components(
 
 
 def _is_function(annotation: object) -> bool:
-    """Whether an argument takes functions alone, as its type says."""
+    """Whether the type of an argument admits functions only."""
     kind = str(annotation).partition("[")[0]
     return "Callable" in kind and "|" not in kind
 
 
-# The libraries that this project cannot do without: where they lie, packages are installed.
+# The folders that hold these required libraries count as folders of installed packages.
 _REQUIRED = ("stable_baselines3", "gymnasium", "torch")
 
-# Of rl_zoo3 only what its files name: importing it changes Gymnasium's time limit.
+# Of rl_zoo3 only two modules: importing the package changes Gymnasium's time limit.
 _PACKAGES = (
     "stable_baselines3",
     "sb3_contrib",
@@ -241,7 +241,7 @@ def find_class(
 
 
 def _import(module_name: str, what: str, typed: Sequence[str]) -> ModuleType:
-    """Import a module, after each package that it lies in has been looked at."""
+    """Import a module, after each package around it was checked."""
     parts = module_name.split(".")
     try:
         for end in range(1, len(parts) + 1):
@@ -261,7 +261,7 @@ def _import(module_name: str, what: str, typed: Sequence[str]) -> ModuleType:
 
 
 def _is_typed(name: str, typed: Sequence[str]) -> bool:
-    """Whether a module was typed, lies in a package that was, or is one around it."""
+    """Whether the user typed this module, a package around it, or a module in it."""
     return any(
         f"{name}.".startswith(f"{one}.") or f"{one}.".startswith(f"{name}.") for one in typed
     )
@@ -274,7 +274,7 @@ def _is_installed(name: str) -> bool:
     """
     try:
         spec = importlib.util.find_spec(name)
-    except ValueError:  # somebody has put an object of another kind in its place
+    except ValueError:  # `sys.modules` has something else under that name
         return False
     if spec is None:
         raise ModuleNotFoundError(name=name)
@@ -289,7 +289,7 @@ def _is_installed(name: str) -> bool:
 
 @cache
 def _folders() -> tuple[Path, ...]:
-    """Where packages are installed; neither the current folder nor PYTHONPATH is such a place."""
+    """The folders of installed packages, without the current folder and PYTHONPATH."""
     paths = sysconfig.get_paths()
     places = [paths["purelib"], paths["platlib"], *site.getsitepackages()]
     places += [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
@@ -315,12 +315,12 @@ _NAME_OF_A_PLACE = re.compile(
 
 
 def names_a_place(argument: str) -> bool:
-    """Whether an argument of that name says where something is written."""
+    """Whether an argument of that name is a path to write to."""
     return _NAME_OF_A_PLACE.search(argument) is not None
 
 
 def confined(kwargs: Mapping[str, Any], folder: Path | None, where: str) -> dict[str, Any]:
-    """The arguments, with those that name a place leading into the folder."""
+    """Move paths among the arguments into the folder; refuse those that lead out of it."""
     return {
         name: _confined(name, value, folder, f"{where}: {name}") for name, value in kwargs.items()
     }
@@ -345,7 +345,7 @@ def _confined(name: str, value: Any, folder: Path | None, where: str) -> Any:
         return str(value)
     folder = Path(_scratch().name) if folder is None else folder
     leads_out = bool(path.anchor) or ".." in path.parts or "\0" in str(value)
-    # Where it leads by way of links.
+    # Links are followed first.
     if leads_out or not (folder / value).resolve().is_relative_to(folder.resolve()):
         raise UserError(f"{where} must lie inside the run folder, unlike {shown(str(value))}")
     return str(folder / value)
@@ -362,7 +362,7 @@ def build_algorithm_kwargs(
     where: str,
     extra_packages: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """An agent's constructor arguments, checked to the last one and built, the policy's too."""
+    """Check and build the arguments of an agent's constructor, ``policy_kwargs`` included."""
     from agents.common.model_files import JsonAlgorithm
     from agents.common.schedules import ExponentialSchedule, library_schedule
 
@@ -380,7 +380,7 @@ def build_algorithm_kwargs(
     built = _build(checked, parameters, where, extra_packages)
     if issubclass(algorithm, JsonAlgorithm):
         return built
-    # Schedules of classes that a library agent's zip finds wherever that agent is installed.
+    # A zip of a library agent must load without this project's classes.
     return {
         name: library_schedule(value) if isinstance(value, ExponentialSchedule) else value
         for name, value in built.items()
@@ -388,13 +388,13 @@ def build_algorithm_kwargs(
 
 
 def needs_policy(algorithm: type[BaseAlgorithm], kwargs: Mapping[str, Any]) -> bool:
-    """Whether the constructor wants a policy that the arguments do not say."""
+    """Whether the constructor requires a policy and the arguments have none."""
     policy = algorithm_parameters(algorithm).get("policy")
     return policy is not None and policy.default is policy.empty and "policy" not in kwargs
 
 
 def default_policy(algorithm: type[BaseAlgorithm], is_dict: bool) -> str:
-    """The policy of an agent for which none is said."""
+    """The policy of an agent if the settings name none."""
     prefix = "MultiInput" if is_dict else "Mlp"
     known = algorithm.policy_aliases
     fitting = (name for name in known if name.startswith(prefix))
@@ -429,7 +429,7 @@ def _build(
     where: str,
     extra_packages: Sequence[str],
 ) -> dict[str, Any]:
-    """Build each argument, and hold classes against ``type[...]`` in the annotations."""
+    """Build each argument, and check classes against ``type[...]`` in the annotations."""
     built = {}
     for name, value in kwargs.items():
         built[name] = build_value(value, extra_packages, f"{where}: {name}")

@@ -1,4 +1,4 @@
-"""Entries of hyperparameters in rl_zoo3's format: found in a file, checked strictly, never run.
+"""Reads and checks hyperparameters in rl_zoo3's format; nothing in a file is run.
 
 One YAML file per algorithm maps environment ids to entries. An entry holds arguments of the
 algorithm's constructor, and the special keys that `Hyperparams` lists. Beside the entries, under
@@ -95,17 +95,17 @@ class Hyperparams:
 SPECIAL_KEYS = tuple(key.name for key in fields(Hyperparams) if key.name != "algorithm")
 
 
-@cache  # they stand there as texts, which take longer to evaluate than the rest of an entry
+@cache  # evaluating the annotations takes longer than reading an entry
 def _special_key_types() -> Mapping[str, Any]:
     return get_type_hints(Hyperparams)
 
 
 def split(entry: Mapping[str, Any], where: str = "hyperparameters") -> Hyperparams:
-    """Tell the special keys of an entry from the algorithm's arguments, and check them.
+    """Separate the special keys of an entry from the algorithm's arguments, and check them.
 
     A special key that is null counts as left out.
     """
-    # Some agents have a noise_std of their own, on what they learn rather than on actions.
+    # Without a noise_type, noise_std is an argument of some agents.
     is_action_noise = entry.get("noise_type") is not None
     special_keys = [key for key in SPECIAL_KEYS if key != "noise_std" or is_action_noise]
     algorithm = {key: value for key, value in entry.items() if key not in special_keys}
@@ -253,7 +253,7 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, tuple[range, ...]] | No
 def _same_environment(
     entries: Mapping[str, Any], env_id: str, env_kwargs: Mapping[str, Any] | None
 ) -> str | None:
-    """An entry's id that is registered as this environment with these arguments, and no others."""
+    """The id of an entry that is registered as this environment with exactly these arguments."""
     if not env_kwargs:
         return None
     import gymnasium as gym
@@ -292,7 +292,7 @@ def _path(algo: str, path: Path | str | None) -> Path:
 
 
 def override(entry: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The entry with ``changes`` made to it; one budget of training replaces the other."""
+    """Change an entry; a new budget of training replaces the old one, whatever its unit."""
     kept = dict(entry)
     if not {"n_timesteps", "n_episodes"}.isdisjoint(changes):
         kept.pop("n_timesteps", None)

@@ -1,4 +1,4 @@
-"""Values from files and command lines: read as literals, then as what a constructor asks for.
+"""Reads values from files and command lines as literals, then as a constructor's types.
 
 No text is ever run: it is parsed to a syntax tree, and the tree is rebuilt from a short list of
 node types. A dotted name stays a name: `pipeline.settings.components` decides what it may stand
@@ -93,7 +93,7 @@ def parse_assignments(assignments: Iterable[str], where: str = "") -> dict[str, 
 
 
 def _meant(words: Sequence[str]) -> str:
-    """A hint at what ``key=value``, ``key value``, ``key = value`` or ``key: value`` should be."""
+    """A hint for ``key=value``, ``key value``, ``key = value`` and ``key: value``."""
     key, *others = [*words[0].split("=", 1), *words[1:3]]
     key = key.rstrip(":")
     value = next(filter(None, (other.lstrip("=") for other in others)), "")
@@ -107,7 +107,7 @@ def _value_or_text(text: str) -> Any:
         value = parse_literal(text)
         if not contains_name(value):
             return value
-    # [SFFF, FFFG] and false are literals in YAML only, and in a file they would be read as such.
+    # YAML has more literals, such as [SFFF, FFFG] and false.
     with contextlib.suppress(UserError):
         value = parse_yaml(text, "")
         is_collection = isinstance(value, list | dict) and text.lstrip().startswith(("[", "{"))
@@ -252,7 +252,7 @@ def _options(annotation: Any) -> tuple[Any, ...]:
 
 
 def _kind(option: Any) -> Any:
-    """What `_READERS` calls this type; None where it does not know it."""
+    """The key of this type in `_READERS`, or None."""
     origin = get_origin(option) or option
     if origin is collections.abc.Callable:
         return Callable if get_args(option) == ([float], float) else None
@@ -289,7 +289,7 @@ def _read_int(value: Any, option: Any, where: str) -> int:
     if isinstance(value, int) and not isinstance(value, bool):
         return value
     with contextlib.suppress(ValueError):
-        # Exact, where the detour by way of a float would not be.
+        # Exact, unlike a conversion through float.
         if isinstance(value, str):
             return int(value)
     number = _read_float(value, option, where)
@@ -400,7 +400,7 @@ RANGES: Mapping[str, tuple[float, float]] = {
     "n_envs": (1, _FINITE),
     "frame_stack": (1, _FINITE),
     "noise_std": (0, _FINITE),
-    # Above that a network's first step has no single precision any more.
+    # Larger rates overflow single precision in the first update.
     "learning_rate": (0, 1e37),
     "gamma": (0, 1),
     "gae_lambda": (0, 1),
@@ -457,10 +457,10 @@ def algorithm_parameters(cls: type) -> Mapping[str, inspect.Parameter]:
 
 
 def _annotated(parameter: inspect.Parameter) -> inspect.Parameter:
-    """The argument, with what its default says where it has no annotation."""
+    """The argument, annotated by the type of its default if it has no annotation."""
     default = parameter.default
     if set(get_args(parameter.annotation)) == {float, Callable}:
-        # A number or a function of no said kind: sb3-contrib's TQC means a schedule.
+        # sb3-contrib's TQC annotates a schedule as a function of no kind.
         return parameter.replace(annotation=float | Callable[[float], float])
     if parameter.annotation is not parameter.empty or isinstance(default, bool):
         return parameter

@@ -33,7 +33,7 @@ _TAG = "tag:yaml.org,2002:"
 _PLAIN_TAGS = frozenset(
     _TAG + name for name in ("null", "bool", "int", "float", "str", "seq", "map")
 )
-# How rl_zoo3 writes the settings of a run.
+# The tag with which rl_zoo3 writes the settings of a run.
 _ORDERED_DICT = _TAG + "python/object/apply:collections.OrderedDict"
 
 
@@ -85,7 +85,7 @@ class StrictLoader(yaml.SafeLoader):
         return node
 
     def compose_mapping_node(self, anchor: dict[Any, Node]) -> MappingNode:
-        # Here, and not where the mapping is built: by then merged keys stand among its own.
+        # Checked before merge keys (<<) add keys of other mappings.
         node = super().compose_mapping_node(anchor)
         first_lines: dict[str, int] = {}
         for key in (key for key, _ in node.value if isinstance(key, ScalarNode)):
@@ -102,7 +102,7 @@ class StrictLoader(yaml.SafeLoader):
         if node.tag not in self.admitted_tags:
             problem = f"{node.tag.replace(_TAG, '!!')} is not allowed here"
         elif not self.admits_control_characters and visible(text) != text:
-            # As itself none is YAML. Spelt out, it would go on into tables, pictures and names.
+            # YAML refuses plain ones; escaped ones would reach tables, pictures and file names.
             problem = f"{shown(text)} holds control characters"
         elif is_number and len(node.value) > _LONGEST_NUMBER:
             problem = f"{shown(node.value)} is too long for a number"
@@ -120,10 +120,7 @@ StrictLoader.add_implicit_resolver(
 
 
 class SavedSettingsLoader(StrictLoader):
-    """Reads rl_zoo3's tag for an OrderedDict too: as the data that it is, looking nothing up.
-
-    A folder's name among the settings may be whatever it was.
-    """
+    """Admits rl_zoo3's tag for an OrderedDict, and control characters in names of folders."""
 
     admitted_tags = _PLAIN_TAGS | {_ORDERED_DICT}
     admits_control_characters = True
