@@ -58,29 +58,31 @@ class StrictLoader(yaml.SafeLoader):
 
     def __init__(self, content: str | bytes) -> None:
         super().__init__(content)
-        self._level = 0  # of the node that is being read
         self._n_values = 0  # so far, what is shared counted at each of its places
+        self._open: list[int] = []  # values before each of the nodes that are being read
         self._sizes: dict[int, tuple[int, int]] = {}  # values and levels of each node, by its id
 
     def compose_node(self, parent: Node | None, index: Any) -> Node | None:
         untyped: Any = self
         event = untyped.peek_event()
         mark: Any = event.start_mark
-        before = self._n_values
-        if self._level >= _MAX_DEPTH:
+        if len(self._open) >= _MAX_DEPTH:
             raise _too_much(mark)
-        self._level += 1
-        node = super().compose_node(parent, index)
-        self._level -= 1
-        if isinstance(event, AliasEvent):
-            if id(node) not in self._sizes:  # it holds its own alias
-                raise _too_much(mark)
-            self._n_values += self._sizes[id(node)][0]
-        else:
+        self._open.append(self._n_values)
+        if not isinstance(event, AliasEvent):
             self._n_values += 1
+        node = super().compose_node(parent, index)
+        before = self._open.pop()
+        if not isinstance(event, AliasEvent):
             levels = [self._sizes[id(part)][1] for part in _parts(node)]
             self._sizes[id(node)] = self._n_values - before, 1 + max(levels, default=0)
-        if self._n_values > _MAX_VALUES or self._level + self._sizes[id(node)][1] > _MAX_DEPTH:
+        elif id(node) in self._sizes:
+            self._n_values += self._sizes[id(node)][0]
+        else:  # it holds its own alias
+            raise _too_much(mark)
+        around = self._open[-1] if self._open else self._n_values
+        level = len(self._open) + self._sizes[id(node)][1]
+        if self._n_values - around > _MAX_VALUES or level > _MAX_DEPTH:
             raise _too_much(mark)
         return node
 
