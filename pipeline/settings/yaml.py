@@ -74,8 +74,10 @@ class StrictLoader(yaml.SafeLoader):
         node = super().compose_node(parent, index)
         before = self._open.pop()
         if not isinstance(event, AliasEvent):
-            levels = [self._sizes[id(part)][1] for part in _parts(node)]
-            self._sizes[id(node)] = self._n_values - before, 1 + max(levels, default=0)
+            levels = 1
+            if not isinstance(node, ScalarNode):
+                levels += max((self._sizes[id(part)][1] for part in _parts(node)), default=0)
+            self._sizes[id(node)] = self._n_values - before, levels
         elif id(node) in self._sizes:
             self._n_values += self._sizes[id(node)][0]
         else:  # it holds its own alias
@@ -218,7 +220,5 @@ def _node_lines(
             yield from _node_lines(value, (*keys, index))
 
 
-def _parts(node: Node | None) -> Iterable[Node]:
-    if isinstance(node, MappingNode):
-        return chain.from_iterable(node.value)
-    return node.value if isinstance(node, SequenceNode) else ()
+def _parts(node: Any) -> Iterable[Node]:
+    return chain.from_iterable(node.value) if isinstance(node, MappingNode) else node.value
