@@ -98,7 +98,7 @@ _WORD = re.compile(r"auto(?:_([1-9]\d{0,8}))?")
 
 
 class Found(NamedTuple):
-    """A number in the place of the word."""
+    """The value that ``auto`` stands for."""
 
     value: Any  # the setting
     how: str  # the formula with its numbers, for people

@@ -324,7 +324,7 @@ class EvaluationCallback(EvalCallback):
         )
 
     def pass_over(self, n_calls: int, n_episodes: int) -> None:
-        """Take note of calls that were left out."""
+        """Count calls that were left out."""
         self.n_calls += n_calls
         self.episodes_seen += n_episodes
 
@@ -355,7 +355,7 @@ class EvaluationCallback(EvalCallback):
 
     @contextmanager
     def timed(self) -> Iterator[None]:
-        """Count what is done within among the time that evaluation takes."""
+        """Add the time of the ``with`` statement to that of evaluations."""
         begun = WorkTime.now()
         try:
             yield

@@ -73,7 +73,7 @@ class DamagedFileError(UserError):
 
 @dataclass(frozen=True)
 class RecordedFiles:
-    """The files of a run, each held against what it was when the run ended."""
+    """The files of a run, checked against the digests of its end."""
 
     folder: Path  # the run folder
     # by name relative to the folder; None where the run recorded none
@@ -96,7 +96,7 @@ class RecordedFiles:
         return content
 
     def check(self, path: Path) -> None:
-        """Make sure of the same for a file that need not fit the memory."""
+        """Check the digest of a file that need not fit the memory."""
         recorded = self._recorded(path)
         with _as_damage(path):
             if recorded is not None and digest_of(path) != recorded:
@@ -145,7 +145,7 @@ def sealed(record: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def read_record(path: Path) -> dict[str, Any]:
-    """The contents of a ``run.json``, which is as it was written."""
+    """The contents of a ``run.json``, checked against its digest."""
     hold(path.parent)
     try:
         content = read_file(path, LARGEST_RECORD)

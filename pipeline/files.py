@@ -73,7 +73,7 @@ def put_in_place(draft: Path, path: Path, folder: int | None = None) -> None:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Let a disk that is full, and the like, say where: at ``path``, unless it says so itself."""
+    """Add ``path`` to errors of the disk that name no file."""
     try:
         yield
     except OSError as error:
@@ -214,5 +214,5 @@ def _marked(value: Any, tokens: Mapping[float, str]) -> Any:
 
 
 def _key(key: Any) -> str:
-    """A name as JSON has it: that of a number or truth value is its text."""
+    """A key of JSON: the text of a number or truth value."""
     return key if isinstance(key, str) else json.dumps(plain(key))

@@ -47,7 +47,7 @@ _SECONDS_OF_AN_INSTANT = 5.0
 
 
 def mark() -> dict[str, Any]:
-    """What names this process, as JSON holds it; what the platform does not tell is None."""
+    """The identity of this process, as JSON; None for what the platform does not tell."""
     pid = os.getpid()
     return {
         "pid": pid,
@@ -94,7 +94,7 @@ def _first_line(*files: str) -> str | None:
 
 
 def _machine() -> str | None:
-    """What the machine is told apart by: a digest, since the identity itself is not for others."""
+    """A digest of the machine's identity, which itself is not for others."""
     identity = _first_line(*_MACHINES)
     return identity and hashlib.sha256(f"yardstick {identity}".encode()).hexdigest()[:32]
 
@@ -147,18 +147,18 @@ else:
 
 
 def give_sign(path: Path) -> None:
-    """Show that the owner of a file or folder is alive."""
+    """Touch a file or folder, to show that its owner is alive."""
     # Without a time, so that a network folder takes that of its server.
     os.utime(path, follow_symlinks=os.utime not in os.supports_follow_symlinks)
 
 
 def seconds_silent(path: Path) -> float:
-    """How long ago `give_sign` was last called for a path, or it was written to."""
+    """Seconds since a path was last touched, by the folder's clock."""
     return _now_in(path.parent) - last_sign(path)
 
 
 def last_sign(path: Path) -> float:
-    """When that was, by the folder's clock."""
+    """When a path was last touched, by the folder's clock."""
     if path.is_dir():
         return path.stat().st_mtime
     # Network folders remember for a while what a file was, but not beyond its being opened.
@@ -190,7 +190,7 @@ def remove_remains(root: Path) -> None:
 
 
 def _names_in(folder: Path) -> list[str]:
-    """What lies in a folder; nothing where it is none, or has gone meanwhile, as others' do."""
+    """The names in a folder; none where it is gone."""
     with contextlib.suppress(OSError):
         return [path.name for path in folder.iterdir()]
     return []
@@ -208,7 +208,7 @@ class FolderGoneError(UserError):
 
 
 def is_gone(path: Path) -> bool:
-    """Whether there is no such file or folder, which is more than that it cannot be reached."""
+    """Whether there is no such file or folder; False where it cannot be reached."""
     try:
         path.stat()
     except (FileNotFoundError, NotADirectoryError):
@@ -291,7 +291,7 @@ def _take(path: Path, token: str, say: Callable[[str], object]) -> None:
 
 
 def _appears(path: Path, content: str) -> bool:
-    """Let the lock appear, whole; whether it was not there."""
+    """Create the lock in one step; False where it is there already."""
     draft = path.with_name(f"{LOCK}.{secrets.token_hex(8)}.tmp")
     try:
         with os.fdopen(open_number(draft, NEW), "wb") as file:
@@ -323,7 +323,7 @@ def _unlink(path: Path) -> None:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """What a lock says; nothing where it says nothing, and that it is gone where it is."""
+    """The contents of a lock; empty where they are damaged, `_GONE` where it is gone."""
     try:
         owner = json.loads(read_file(path, _LARGEST))
     except FileNotFoundError:
@@ -334,7 +334,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def _is_at_work(path: Path, owner: dict[str, Any], say: Callable[[str], object]) -> bool:
-    """Whether the owner of a lock is there; one that is elsewhere is waited for, until it shows."""
+    """Whether the owner of a lock is alive; waits for a sign of one on another machine."""
     alive = is_alive(owner)
     if alive is not None:
         return alive

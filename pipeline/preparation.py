@@ -156,7 +156,7 @@ def prepare(
 
 
 def _set_arithmetic(spec: TrainSpec) -> None:
-    """What holds for the whole process, and so is set anew for each run in it."""
+    """Set the number of threads and denormal numbers for the whole process."""
     if spec.num_threads > 0:
         th.set_num_threads(spec.num_threads)
     flushes = spec.hyperparams.flush_denormal
@@ -166,7 +166,7 @@ def _set_arithmetic(spec: TrainSpec) -> None:
 
 @contextmanager
 def _library_errors_in_one_line() -> Iterator[None]:
-    """Errors of settings that only the library checks, when it gets them."""
+    """Turn errors of settings that only the library checks into one line."""
     try:
         yield
     except (ValueError, TypeError, AssertionError, RuntimeError, MemoryError) as error:
@@ -285,7 +285,7 @@ def _say(console: Console, line: str) -> None:
 def _exact_evaluator(
     spec: TrainSpec, model: BaseAlgorithm, console: Console
 ) -> ExactEvaluator | None:
-    """What computes evaluations where the environment's model is known and the agent lets it."""
+    """The exact evaluator, if the environment's model is known and the agent allows it."""
     exact = evaluator_of(spec)
     reason = (
         "" if exact is None else exact.obstacle(model) or why_not_exact(model, exact.observations)
@@ -318,7 +318,7 @@ def _training_env(
 
 
 def is_unread(spec: TrainSpec) -> bool:
-    """Whether nobody reads the library's log, so that its figures need not be worked out."""
+    """Whether nobody reads the library's log, so that it need not be computed."""
     return spec.tensorboard_log is None and spec.verbose < 2
 
 
@@ -365,7 +365,7 @@ class EngineOutlook:
 def engine_outlook(
     model: BaseAlgorithm, spec: TrainSpec, callbacks: list[BaseCallback]
 ) -> EngineOutlook | None:
-    """The outlook of an agent that is there; None for one that has no networks, or one engine."""
+    """The outlook of an agent; None for one without compiled networks."""
     from agents.networks.engine_setting import CompiledNetworks  # it takes a while to load
 
     if not isinstance(model, CompiledNetworks) or model.env is None:
@@ -381,7 +381,7 @@ def engine_outlook(
 
 
 def planned_outlook(spec: TrainSpec) -> EngineOutlook | None:
-    """The same of a run that another process will do: its agent is made here, and thrown away.
+    """The outlook of a run that another process will do; its agent is made here and dropped.
 
     Whatever goes wrong, the run itself will say so.
     """

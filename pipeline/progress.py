@@ -110,7 +110,7 @@ class ProgressDisplay(BlockCallback):
 
     @contextmanager
     def doing(self, activity: str) -> Iterator[None]:
-        """Say so where it takes long what goes on besides training."""
+        """Name what goes on besides training, if it takes long."""
         before, self.activity = self.activity, activity
         try:
             yield
@@ -119,7 +119,7 @@ class ProgressDisplay(BlockCallback):
 
     @property
     def share_done(self) -> float:
-        """How much of the training is behind."""
+        """The share of the training that is done."""
         return min(self.num_timesteps / max(self.model._total_timesteps, 1), 1.0)
 
     def look(self) -> None:

@@ -106,7 +106,7 @@ OUTCOME = (
 )
 # The field of ``run.json`` that says, while a run is running, which process is at work on it.
 PROCESS = "process"
-# Kept by a run that is under way: where nothing else fits on the disk, its last word does.
+# Reserved while a run is under way, so that its last ``run.json`` fits on a full disk.
 ROOM = ".room"
 ROOM_BYTES = 16 << 10
 
@@ -218,10 +218,6 @@ class Run:
         return self.path / "learning_curve.png"
 
     @property
-    def pulls_picture_path(self) -> Path:  # on bandits
-        return self.path / "pulls.png"
-
-    @property
     def value_maps_path(self) -> Path:  # the policy and its values during training, on grid worlds
         return self.path / "value_maps.npz"
 
@@ -243,7 +239,7 @@ class Run:
 
     @property
     def state(self) -> str | None:
-        """What became of the run: one whose process is gone before its end was interrupted."""
+        """The state in ``run.json``; interrupted if its process is gone."""
         info = self.read_info()
         state = info.get("state")
         if state == RUNNING and is_alive(info.get(PROCESS)) is False:
@@ -264,12 +260,12 @@ class Run:
         write_json(self.info_path, sealed(info))
 
     def reopen(self) -> None:
-        """Take out of ``run.json`` what came out so far: the run goes on."""
+        """Remove the outcome from ``run.json``: the run continues."""
         info = {key: value for key, value in self.read_info().items() if key not in OUTCOME}
         write_json(self.info_path, {**info, "state": RUNNING, PROCESS: mark()})
 
     def keep_room(self) -> None:
-        """Take the room on the disk that the run's last word needs."""
+        """Reserve space on the disk for the last ``run.json``."""
         with replacing(self.path / ROOM) as file:
             file.write(bytes(ROOM_BYTES))
 
@@ -287,14 +283,14 @@ class Run:
         self.update_info(**fields, **{VERSION_FIELD: VERSION, FIELD: digests_of(self.path)})
 
     def add_file(self, path: Path) -> None:
-        """Let the record name a file that came into the folder after the end of the run."""
+        """Add the digest of a file that was written after the end of the run."""
         digests = self.files.digests
         if digests is not None and path.parent.resolve() == self.path.resolve():
             self.update_info(**{FIELD: {**digests, path.name: digest_of(path)}})
 
     @property
     def files(self) -> RecordedFiles:
-        """The files that the run left, each held against what it was then."""
+        """The files that the run left, checked against their digests."""
         return RecordedFiles(self.path, self.read_info().get(FIELD))
 
     def discard(self) -> None:
@@ -365,7 +361,7 @@ def write_arguments(run: Run, spec: TrainSpec, args: Mapping[str, Any]) -> None:
 
 
 def _yaml(data: Mapping[str, Any]) -> str:
-    """As `yaml.safe_dump`, by the library's faster half where that was built."""
+    """As `yaml.safe_dump`, in C where the library has it."""
     import yaml
 
     return str(yaml.dump(data, Dumper=getattr(yaml, "CSafeDumper", yaml.SafeDumper)))
@@ -382,7 +378,7 @@ def recorded_versions() -> dict[str, str]:
 
 @cache
 def recorded_machine() -> dict[str, str]:
-    """What times may depend on, and the bits of networks; nothing that names this very machine."""
+    """What times and the bits of networks may depend on; nothing names the machine itself."""
     return {
         "processor": _processor(),
         "cores": str(os.cpu_count() or "unknown"),
@@ -391,7 +387,7 @@ def recorded_machine() -> dict[str, str]:
 
 
 def _processor() -> str:
-    """The model, as Linux tells it; Python itself knows the family alone."""
+    """The processor's model, as Linux tells it."""
     try:
         lines = _PROCESSORS.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:
@@ -402,7 +398,7 @@ def _processor() -> str:
 
 @contextmanager
 def at_work_on(run: Run, say: Callable[[str], object]) -> Iterator[None]:
-    """Keep others from going on with a run inside the ``with`` statement."""
+    """Lock a run inside the ``with`` statement."""
     take_up(run.path)
     with folder_lock(run.path, partial(_thread.interrupt_main, signal.SIGTERM), say):
         yield
@@ -441,7 +437,7 @@ def remove_leftovers(log_folder: Path, algo: str, env_id: str) -> None:
             if info.get("state") != RUNNING or is_alive(info.get(PROCESS)) is not False:
                 continue
             if "spec" not in info and _is_mere_set_up(run):
-                _remove(path)
+                shutil.rmtree(path)
                 continue
             for draft in drafts:
                 draft.unlink(missing_ok=True)
@@ -459,11 +455,3 @@ def _is_mere_set_up(run: Run) -> bool:
     )
     names = (path.relative_to(run.path).as_posix() for path in paths)
     return all(own.fullmatch(name) and not (run.path / name).is_symlink() for name in names)
-
-
-def _remove(folder: Path) -> None:
-    """Remove a folder, unless something comes into it meanwhile."""
-    for parent, _, names in os.walk(folder, topdown=False):
-        for name in names:
-            (Path(parent) / name).unlink(missing_ok=True)
-        Path(parent).rmdir()

@@ -34,7 +34,7 @@ def can_move(console: Console) -> bool:
 
 
 def tell_nobody(detail: str) -> None:
-    """A `Tell` where nobody watches."""
+    """A `Tell` that does nothing."""
 
 
 def duration(seconds: float) -> str:
@@ -47,7 +47,7 @@ def duration(seconds: float) -> str:
 
 
 class Silence:
-    """How long nothing has been said: the first line is due after so many seconds."""
+    """Tells when the next line is due; the first after so many seconds."""
 
     def __init__(self, allowed: float = SECONDS_BEFORE_A_LINE) -> None:
         self._ends = time.monotonic() + allowed
@@ -81,7 +81,7 @@ class Heartbeat:
             _thread.start_new_thread(self._beat, (self._stopping,))
 
     def stop(self) -> None:
-        """Call it no more, from when this returns; harmless when called again."""
+        """Stop; the function is not called after this returns."""
         with self._calling:
             self._stopping.set()
 
@@ -109,7 +109,7 @@ class CompilationNotice(logging.Handler):
         self.log.setLevel(logging.INFO)
 
     def stop(self) -> None:
-        """Say no more; harmless when called again."""
+        """Stop listening."""
         self.log.removeHandler(self)
         self.log.setLevel(self.level_before)
 
@@ -156,7 +156,7 @@ class Activity:
 
     @contextmanager
     def shown(self) -> Iterator[None]:
-        """Show it while the ``with`` statement runs, and leave nothing of it on a terminal."""
+        """Show the activity while the ``with`` statement runs; a terminal keeps nothing of it."""
         with ExitStack() as stack:
             if can_move(self.console):
                 columns = (

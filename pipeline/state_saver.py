@@ -86,7 +86,7 @@ class StateSaver(BlockCallback):
 
     @property
     def taken(self) -> WorkTime:
-        """What the training has taken, in all processes that worked on it."""
+        """The time that the training has taken, in all processes that worked on it."""
         return self.time_before + (WorkTime.now() - self.started)
 
     def horizon(self) -> Horizon:
@@ -266,7 +266,7 @@ _OF_THIS_PROCESS = (
 
 
 def generator_states() -> dict[str, Any]:
-    """Where they are."""
+    """The states of the random generators."""
     cuda = (
         [state.numpy() for state in th.cuda.get_rng_state_all()] if th.cuda.is_available() else []
     )
@@ -279,7 +279,7 @@ def generator_states() -> dict[str, Any]:
 
 
 def set_generators(states: dict[str, Any]) -> None:
-    """Put them where they were."""
+    """Restore the states of the random generators."""
     random.setstate(states["python"])
     np.random.set_state(states["numpy"])  # noqa: NPY002
     th.set_rng_state(th.from_numpy(states["torch"].copy()))
@@ -301,7 +301,7 @@ def user_state(modules: Iterable[UserModule]) -> dict[str, dict[str, Any]]:
 
 
 def put_back(modules: Iterable[UserModule], state: Mapping[str, Mapping[str, Any]]) -> None:
-    """Let the names have those values."""
+    """Restore the values of the user's modules."""
     for name, holder in _holders(modules):
         before = _values(holder)
         for attribute, value in state.get(name, {}).items():
@@ -334,12 +334,12 @@ def _is_of(module: ModuleType, name: str, user: UserModule) -> bool:
 
 
 def _is_method(value: Any) -> bool:
-    """Whether a class's attribute is a method or the like, but for those that remember."""
+    """Whether a class's attribute is a method or the like; caches are not."""
     return hasattr(type(value), "__get__") and not isinstance(value, functools._lru_cache_wrapper)
 
 
 def _values(holder: ModuleType | type) -> dict[str, Any]:
-    """What is data of it: no code, and nothing that Python keeps there itself."""
+    """The data that a module or class holds: no code, and nothing of Python's own."""
     return {
         name: value
         for name, value in vars(holder).items()
@@ -378,12 +378,12 @@ class IterationLogger(Logger):
 
 
 def iterations_before(model: BaseAlgorithm, note: dict[str, Any]) -> int:
-    """How many an algorithm that counts from 1 has behind it in a saved state."""
+    """Iterations before a saved state, of an algorithm that counts from 1 at each `learn`."""
     return int(note["rollouts"]) if isinstance(model, OnPolicyAlgorithm) else 0
 
 
 def resumed_logger(model: BaseAlgorithm, note: dict[str, Any]) -> Logger:
-    """A logger that goes on where that of a saved state was, with the same outputs."""
+    """A logger that appends to the log of a saved state."""
     folder = note["log_folder"]
     names = ["stdout"] if model.verbose > 0 or folder is None else []
     names += [] if folder is None else ["tensorboard"]

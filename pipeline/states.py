@@ -79,7 +79,7 @@ _POINTER = 8  # bytes
 
 
 class NotKeepableError(Exception):
-    """Something in a training cannot be part of a state; the message says where it is, and why."""
+    """Something in a training cannot be pickled; the message says where it is, and why."""
 
 
 class NotFittingError(Exception):
@@ -127,7 +127,7 @@ def pickled(roots: dict[str, Any], kept: tuple[type, ...] = ()) -> Pickled:
     """
     stream = io.BytesIO()
     pickler = _Pickler(stream, roots, kept)
-    pickler.write(roots)
+    pickler.write()
     memories = [
         th.from_numpy(memory.content) if memory.is_tensor else memory.content
         for memory in pickler.memories
@@ -152,10 +152,10 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         self._all_steps: dict[int, tuple[str, ...]] | None = None
         self._last: Any = None
 
-    def write(self, roots: dict[str, Any]) -> None:
+    def write(self) -> None:
         """Pickle the roots."""
         try:
-            self.dump(roots)
+            self.dump(self.roots)
         except (NotKeepableError, MemoryError):
             raise
         except Exception as error:  # objects may raise anything where they are looked into
@@ -165,7 +165,7 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
             raise self._not_keepable(self._last, error) from error
 
     def reducer_override(self, obj: Any) -> Any:  # noqa: PLR0912  # a table
-        """What an object becomes; containers, numbers and texts do not come here."""
+        """How an object is pickled; never called for containers, numbers and texts."""
         self._last = obj
         kind: Any = type(obj)
         if kind is Memory:
@@ -197,9 +197,14 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
             return _torch_generator, (obj.get_state(),)
         if kind is memoryview:
             raise self._not_keepable(obj)
-        if self._is_made_of_attributes(kind):
-            return self._attributes(obj)
-        return NotImplemented
+        # What a class of attributes says in `__getstate__` is not asked: it may leave out what a
+        # model file does not need, or have the object made anew, as an `EzPickle` does.
+        has_own_reduce = (
+            kind.__reduce_ex__ is not object.__reduce_ex__
+            or kind.__reduce__ is not object.__reduce__
+            or kind in self.dispatch_table
+        )
+        return NotImplemented if has_own_reduce or _hides_state(kind) else self._attributes(obj)
 
     def _is_of_process(self, obj: Any) -> bool:
         """Whether an object belongs to the process, and is taken from the newly built training."""
@@ -213,19 +218,6 @@ class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
         if isinstance(obj, threading.Thread | weakref.ref) and kind is not weakref.ref:
             return True
         return _is_made_anew(kind)
-
-    def _is_made_of_attributes(self, kind: Any) -> bool:
-        """Whether attributes are all that objects of a class hold.
-
-        `__getstate__` is not asked: it may leave out what a model file does not need, or have the
-        object made anew, as an `EzPickle` does.
-        """
-        return (
-            kind.__reduce_ex__ is object.__reduce_ex__
-            and kind.__reduce__ is object.__reduce__
-            and kind not in self.dispatch_table
-            and not _hides_state(kind)
-        )
 
     def _attributes(self, obj: Any) -> Any:
         kind: Any = type(obj)
@@ -361,7 +353,7 @@ def _steps_to(roots: Mapping[str, Any], everything: bool) -> dict[int, tuple[str
 
 
 def _children(value: Any) -> Iterator[tuple[str, Any]]:  # noqa: PLR0912  # a table
-    """What a value holds, each with the step that leads there as one would write it in Python."""
+    """The values inside a value, each with the step to it, as written in Python."""
     if isinstance(value, dict):
         for key, held in value.items():
             if isinstance(key, str | int) and not isinstance(held, _SIMPLE):
@@ -494,7 +486,7 @@ def unpickled(
 
 
 def _follow(roots: Mapping[str, Any], place: Place) -> Any:
-    """What is at a place; None where there is nothing."""
+    """The object at a place; None where there is nothing."""
     first, *steps = place.steps or ("",)
     found: Any = roots.get(first)
     for step in steps:
@@ -503,7 +495,7 @@ def _follow(roots: Mapping[str, Any], place: Place) -> Any:
 
 
 class _Existing:
-    """Gives what the newly built training has at the places of a state."""
+    """Looks up what the newly built training has at the places of a state."""
 
     existing: list[Any]
     places: Sequence[Place]
@@ -566,7 +558,7 @@ def _blank(kind: type) -> Any:
 
 
 def _fill(obj: Any, attributes: dict[str, Any]) -> None:
-    """Let an object have these attributes, and no others but those that no state keeps."""
+    """Replace the attributes of an object, except those that no state keeps."""
     kind: Any = type(obj)
     slots, inside = _slots(kind), getattr(obj, "__dict__", {})
     for name in inside.keys() - attributes.keys() - _excluded(kind):
@@ -635,7 +627,7 @@ def _empty_cell() -> CellType:
 
 
 def _function(code: CodeType, module: str, name: str, cells: tuple[CellType, ...]) -> FunctionType:
-    """A function without a name of its own, among the global names of its module."""
+    """A nested function; it sees the global names of its module."""
     return FunctionType(code, vars(importlib.import_module(module)), name, None, cells)
 
 

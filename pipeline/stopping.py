@@ -114,7 +114,7 @@ class StopRequest:
         self._raise_if_due()
 
     def _seconds_left(self) -> float:
-        """Until `Stopped` is to be raised; infinite where nobody has asked, or it is held."""
+        """Seconds until `Stopped` is to be raised; infinite if nobody has asked, or it is held."""
         if self.number is None or self._patience == math.inf:
             return math.inf
         return 0.0 if self.is_urgent else self._asked_at + self._patience - time.monotonic()

@@ -275,7 +275,7 @@ def draw(training: Training, final: Evaluation | None) -> None:
     title = f"{spec.algo} on {run.env_name}, seed {spec.seed}"
     has_pulls = recorder is not None and recorder.n_calls > 0
     if recorder is not None and has_pulls:
-        draw_pulls(run.pulls_picture_path, title, recorder.arrays())
+        draw_pulls(run.path / "pulls.png", title, recorder.arrays())
     if not has_pulls or training.evaluation.evaluations_timesteps:
         yardstick = None if final is None else final.yardstick
         first_step, on_variant = training.model._num_timesteps_at_start, training.display.on_variant

@@ -141,7 +141,7 @@ def go_on(run: Run, keeping: StateKeeping, tell: Callable[[str], object]) -> Sta
 
 
 def tell_changes(run: Run, spec: TrainSpec, tell: Callable[[str], object]) -> None:
-    """Tell of files that are no more what a run began with: the user's modules, the agent of -i."""
+    """Tell which files have changed since a run began: the user's modules, the agent of -i."""
     changed = changed_since(spec.user_modules, run.path)
     agent, before = spec.trained_agent, run.read_info().get(TRAINED_AGENT)
     if agent is not None and before is not None and agent.is_file() and digest_of(agent) != before:
@@ -176,14 +176,14 @@ def _tell_versions(run: Run, tell: Callable[[str], object]) -> None:
 
 
 def _forget(run: Run) -> None:
-    """Remove what a run without a state would not write over, beginning anew."""
+    """Remove what a run that begins anew would not overwrite."""
     remove_states(run.state_path)
     for path in monitor_files(run.path):  # another name of one keeps what it holds
         path.unlink()
 
 
 def settings_digest(spec: Mapping[str, Any]) -> str:
-    """What tells a run's settings from others'."""
+    """The digest of a run's settings."""
     text = json.dumps(spec, sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -224,7 +224,7 @@ def cut_back(run_folder: Path, log_folder: str | None, positions: Mapping[str, P
 
 
 def _position(path: Path, length: int) -> Position:
-    """Where a file is after so many bytes, or at its end if that comes before."""
+    """Length and checksum of the first bytes of a file."""
     checksum = n_read = 0
     for piece in _pieces(path, length):
         checksum, n_read = zlib.crc32(piece, checksum), n_read + len(piece)
