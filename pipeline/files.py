@@ -168,19 +168,22 @@ def write_json(path: Path, data: Any) -> None:
 _INFINITY = "1e999"
 
 
-def plain(value: Any) -> Any:
-    """The value as JSON gives it back: Python's numbers, tuples as lists, nan as None."""
+def plain(value: Any, infinities: Mapping[float, str] | None = None) -> Any:
+    """The value as JSON gives it back: Python's numbers, tuples as lists, nan as None.
+
+    Infinities become the texts that are given for them.
+    """
     match value:
         case Mapping():
-            return {_key(key): plain(item) for key, item in value.items()}
+            return {_key(key): plain(item, infinities) for key, item in value.items()}
         case list() | tuple():
-            return [plain(item) for item in value]
+            return [plain(item, infinities) for item in value]
         case float():
-            return None if math.isnan(value) else float(value)
+            return None if math.isnan(value) else (infinities or {}).get(value, float(value))
         case None | bool() | int() | str():
             return value
         case _:
-            return plain(_from_numpy(value))
+            return plain(_from_numpy(value), infinities)
 
 
 def _from_numpy(value: Any) -> Any:
@@ -195,22 +198,10 @@ def json_text(value: Any, indent: int | None = None) -> str:
     """The value as JSON, with infinity as a number that is too large."""
     # Nobody can have put these into a text of his.
     tokens = {sign: secrets.token_hex(16) for sign in (math.inf, -math.inf)}
-    text = json.dumps(_marked(plain(value), tokens), indent=indent, allow_nan=False)
+    text = json.dumps(plain(value, tokens), indent=indent, allow_nan=False)
     for sign, token in tokens.items():
         text = text.replace(f'"{token}"', _INFINITY if sign > 0 else f"-{_INFINITY}")
     return text
-
-
-def _marked(value: Any, tokens: Mapping[float, str]) -> Any:
-    match value:
-        case dict():
-            return {key: _marked(item, tokens) for key, item in value.items()}
-        case list():
-            return [_marked(item, tokens) for item in value]
-        case float():
-            return tokens.get(value, value)
-        case _:
-            return value
 
 
 def _key(key: Any) -> str:

@@ -6,6 +6,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,8 +68,9 @@ def newest_unfinished(log_folder: Path, algo: str, env_id: str) -> Run:
     name = environment_name(env_id)
     runs = [Run(path, name) for _, path in numbered_runs(log_folder / algo, name)]
     for run in reversed(runs):
-        if _may_go_on(run):
-            return run
+        with suppress(DamagedFileError):
+            if run.recorded_spec() and not is_finished(run):
+                return run
     there = f"all {len(runs)} are finished" if runs else "there is none at all"
     raise UserError(f"no run of {algo} on {name} in {log_folder} was interrupted: {there}")
 
@@ -148,13 +150,6 @@ def tell_changes(run: Run, spec: TrainSpec, tell: Callable[[str], object]) -> No
         changed.append(agent)
     for path in changed:
         tell(f"{path} has changed since the run began, so that its result may differ")
-
-
-def _may_go_on(run: Run) -> bool:
-    try:
-        return bool(run.recorded_spec()) and not is_finished(run)
-    except DamagedFileError:
-        return False
 
 
 def _settings(spec: Mapping[str, Any], any_seed: bool) -> Any:
