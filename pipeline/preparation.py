@@ -203,11 +203,6 @@ def _set_up(
         model.set_logger(resumed_logger(model, keeping.state.note))
     is_bandit = env.has_attr("n_arms")
     exact = _exact_evaluator(spec, model, console)
-    gamma = getattr(model, "gamma", None)
-    if spec.verbose and exact is not None and isinstance(gamma, float) and not is_bandit:
-        note = discount_note(spec, exact, gamma)
-        if note is not None:
-            _say(console, note)
     n_eval_envs = 1
     if exact is None and takes_batches(model):
         n_eval_envs = n_environments(spec.n_eval_envs, spec.eval_episodes)
@@ -222,10 +217,7 @@ def _set_up(
         value_maps=None if exact is None else ValueMapRecorder(run.value_maps_path, exact),
         during=display.doing,
     )
-    saver = StateSaver(
-        run, keeping.interval, partial(_say, console), keeping.state, keeping.was_cut_off
-    )
-    saver.modules = spec.user_modules
+    saver = StateSaver(run, keeping, partial(_say, console), spec.user_modules)
     pulls = None
     if is_bandit and getattr(model, "engine", None) == "compiled":  # which stops at no pull
         _say(console, "engine: compiled keeps no pulls, so that regret is not known")
@@ -287,14 +279,20 @@ def _exact_evaluator(
 ) -> ExactEvaluator | None:
     """The exact evaluator, if the environment's model is known and the agent allows it."""
     exact = evaluator_of(spec)
-    reason = (
-        "" if exact is None else exact.obstacle(model) or why_not_exact(model, exact.observations)
-    )
+    if exact is None:
+        return None
+    reason = exact.obstacle(model) or why_not_exact(model, exact.observations)
     if reason:
         _say(console, f"evaluations are sampled, not exact: {reason}")
-    elif exact is not None and (note := map_refusal(exact)) is not None:
+        return None
+    notes = [map_refusal(exact)]
+    gamma = getattr(model, "gamma", None)
+    is_bandit = model.env is not None and model.env.has_attr("n_arms")
+    if spec.verbose and isinstance(gamma, float) and not is_bandit:
+        notes.append(discount_note(spec, exact, gamma))
+    for note in filter(None, notes):
         _say(console, note)
-    return None if reason else exact
+    return exact
 
 
 def _training_env(

@@ -33,7 +33,7 @@ from pipeline.runs import Run
 from pipeline.state_files import SavedState, save_state
 from pipeline.states import NotFittingError, NotKeepableError, pickled, unpickled
 from pipeline.stopping import current
-from pipeline.unfinished_runs import SaveInterval, log_positions, settings_digest
+from pipeline.unfinished_runs import StateKeeping, log_positions, settings_digest
 from pipeline.user_modules import UserModule
 
 # Saving may take this share of the time, where the user has not said how often.
@@ -58,21 +58,20 @@ class StateSaver(BlockCallback):
     def __init__(
         self,
         run: Run,
-        interval: SaveInterval,
+        keeping: StateKeeping,
         tell: Callable[[str], object],
-        state: SavedState | None = None,
-        was_cut_off: bool = False,
+        modules: tuple[UserModule, ...] = (),
     ) -> None:
         super().__init__()
         self.run = run
         self.root: BaseCallback = self  # all callbacks, this one among them
-        self.modules: tuple[UserModule, ...] = ()  # the user's
+        self.modules = modules  # the user's
         self.told: set[str] = set()
-        self.interval = interval
+        self.interval = keeping.interval
         self.tell = tell  # told in one line why no state is kept
-        self.state = state  # that the training goes on from
-        self.is_off = interval.is_off
-        note = {} if state is None else state.note
+        self.state = keeping.state  # that the training goes on from
+        self.is_off = keeping.interval.is_off
+        note = {} if self.state is None else self.state.note
         self.n_saved = int(note.get("number", 0))
         self.n_rollouts = int(note.get("rollouts", 0))
         self.time_before = WorkTime(
@@ -81,8 +80,12 @@ class StateSaver(BlockCallback):
         self.started = WorkTime.now()
         self.steps_at_save = 0
         self.saved_at = time.monotonic()
-        self.was_cut_off = was_cut_off
-        self.pause = interval.seconds or self._first_pause(note)
+        self.was_cut_off = keeping.was_cut_off
+        self.pause = self.interval.seconds  # until the next state
+        if self.pause == 0.0:  # the user has not said how often
+            self.pause = FIRST_COST / SHARE_OF_TIME
+            if self.was_cut_off:
+                self.pause = max(float(note.get("pause", 0.0)) * SHARE_OF_TIME, SHORTEST_PAUSE)
 
     @property
     def taken(self) -> WorkTime:
@@ -155,12 +158,6 @@ class StateSaver(BlockCallback):
             seconds = self.saved_at - begun
             pause = max(seconds / SHARE_OF_TIME, SHORTEST_INTERVAL)
             self.pause = min(pause, 2 * (self.pause + seconds)) if self.was_cut_off else pause
-
-    def _first_pause(self, note: Mapping[str, Any]) -> float:
-        """Seconds until the first state, where the user has not said how often."""
-        if not self.was_cut_off:
-            return FIRST_COST / SHARE_OF_TIME
-        return max(float(note.get("pause", 0.0)) * SHARE_OF_TIME, SHORTEST_PAUSE)
 
     def _tell_once(self, line: str) -> None:
         """Say a line once that would be the same at each state, as long as a disk is full."""

@@ -500,7 +500,7 @@ def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
     """However long a state takes, the next is saved fifty times as long after it."""
     clock = [0.0]
     monkeypatch.setattr("pipeline.state_saver.time.monotonic", lambda: clock[0])
-    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    saver = StateSaver(Run(tmp_path, ""), StateKeeping(), pytest.fail)
     clock[0] = 2.4
     assert not saver.wants_position()
     clock[0] = 2.6
@@ -523,7 +523,7 @@ def test_saving_by_time_takes_its_share(tmp_path, monkeypatch):
 def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
     """To look for it among all that the libraries hold takes longer than a state."""
     seen = []
-    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    saver = StateSaver(Run(tmp_path, ""), StateKeeping(), pytest.fail)
     monkeypatch.setattr(StateSaver, "_write", lambda _: seen.append(gc.isenabled()))
     saver.model = type("Model", (), {"num_timesteps": 0})()
     saver.save()
@@ -533,7 +533,7 @@ def test_saving_leaves_garbage_alone(tmp_path, monkeypatch):
 
 def test_no_search_for_garbage_follows_a_state(tmp_path, monkeypatch):
     kept, generations, thresholds = [], [], gc.get_threshold()
-    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), pytest.fail)
+    saver = StateSaver(Run(tmp_path, ""), StateKeeping(), pytest.fail)
     monkeypatch.setattr(StateSaver, "_write", lambda _: kept.extend([[] for _ in range(5000)]))
     saver.model = type("Model", (), {"num_timesteps": 0})()
     for _ in range(4):
@@ -556,8 +556,8 @@ def test_what_was_cut_off_is_saved_sooner(tmp_path, monkeypatch):
 
     def saver_of(note, seconds=0.0, was_cut_off=True):
         state = None if note is None else SavedState(Pickled(b"", (), ()), note)
-        interval = SaveInterval(seconds=seconds)
-        return StateSaver(Run(tmp_path, ""), interval, pytest.fail, state, was_cut_off)
+        keeping = StateKeeping(SaveInterval(seconds), state, was_cut_off=was_cut_off)
+        return StateSaver(Run(tmp_path, ""), keeping, pytest.fail)
 
     assert saver_of(None, was_cut_off=False).pause == 2.5
     assert saver_of(None).pause == 0.1  # it was cut off before its first state

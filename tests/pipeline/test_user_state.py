@@ -9,7 +9,7 @@ from pipeline import state_files
 from pipeline.runs import Run
 from pipeline.state_saver import StateSaver, put_back, user_state
 from pipeline.states import Pickled, pickled, unpickled
-from pipeline.unfinished_runs import SaveInterval
+from pipeline.unfinished_runs import StateKeeping
 from pipeline.user_modules import import_typed
 
 SOURCE = """
@@ -109,7 +109,7 @@ def test_what_is_installed_is_left_alone():
 
 def saver_of(tmp_path, monkeypatch):
     told = []
-    saver = StateSaver(Run(tmp_path, ""), SaveInterval(), told.append)
+    saver = StateSaver(Run(tmp_path, ""), StateKeeping(), told.append)
     saver.model = type("Model", (), {"num_timesteps": 0})()
     return saver, told
 
