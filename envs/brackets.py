@@ -16,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 
 from envs.known_models import TRANSPARENT_WRAPPERS, time_limit
+from envs.model_claims import is_changed
 
 DATA = Path(__file__).with_name("brackets.json")
 
@@ -90,7 +91,7 @@ def _is_plain(env: gym.Env[Any, Any]) -> bool:
     """Whether no wrapper, and nobody's own method, comes between agent and environment."""
     while isinstance(env, gym.Wrapper):
         kind = type(env)
-        if _has_own_method(env):
+        if is_changed(env):
             return False
         only_shows = isinstance(env, gym.ObservationWrapper) and f"{kind.__module__}.".startswith(
             _OBSERVATION_HOMES
@@ -98,9 +99,4 @@ def _is_plain(env: gym.Env[Any, Any]) -> bool:
         if not only_shows and f"{kind.__module__}.{kind.__qualname__}" not in TRANSPARENT_WRAPPERS:
             return False
         env = env.env
-    return not _has_own_method(env)
-
-
-def _has_own_method(env: gym.Env[Any, Any]) -> bool:
-    """Whether something in the object hides a method of its class."""
-    return any(callable(getattr(type(env), name, None)) for name in vars(env))
+    return not is_changed(env)

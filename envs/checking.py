@@ -1,4 +1,4 @@
-"""Whether an environment's model is what its `step` and `reset` do."""
+"""Check an environment's transition model against its `step` and `reset`."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 import numpy as np
 from gymnasium.utils import seeding
-from numpy.random import Generator
 
-from envs.model_claims import Claim, claim_of
+from envs.finite_env import first_above
+from envs.model_claims import Claim, claim_of, one_line
 from mdp.array_types import Floats, Ints
 from mdp.transition_model import TransitionModel
 
@@ -39,7 +39,7 @@ PLAYED_KINDS = (np.random.Generator, np.random.RandomState, random.Random, gym.S
 
 @dataclass(frozen=True)
 class ModelCheck:
-    """What came of holding a model against `step`.
+    """The result of a check of a model against `step`.
 
     Attributes:
         refusal: why the model is not believed, in one line; None where it is.
@@ -48,7 +48,7 @@ class ModelCheck:
             probabilities as ``P`` orders them, or never has anything to draw. Whoever draws so
             from the model, by the same generator, gets the very same episodes.
         state_can_be_set: whether the environment goes on from where its attribute ``s`` is put.
-        n_steps: the steps that were held against the model.
+        n_steps: the steps that were compared with the model.
     """
 
     refusal: str | None
@@ -58,11 +58,11 @@ class ModelCheck:
 
 
 _checks: dict[tuple[Any, ...], ModelCheck] = {}
-_kept_alive: list[object] = []
+_kept_alive: list[object] = []  # what is told apart by its id
 
 
 def check_transition_model(env: Env, n_steps: int = N_STEPS) -> ModelCheck:
-    """Hold the model that an environment brings against what its `step` and `reset` do.
+    """Compare the model that an environment brings with what its `step` and `reset` do.
 
     A copy of the environment, without its wrappers, plays random episodes, up to their time limit
     or 1000 steps. Then, where its attribute ``s`` can be set, which is tried out, it takes every
@@ -80,10 +80,9 @@ def check_transition_model(env: Env, n_steps: int = N_STEPS) -> ModelCheck:
     happened before, and are on the whole as the model says, it is believed. Not found either is
     what happens too seldom to be seen, what is hidden in states that neither episodes nor setting
     ``s`` lead to, and what changes after the check. The copy is a deep one, or another environment
-    made alike (see `copy_of`): the caller's episode and generators stay as they are, but what the
-    environment shares with its copies, such as an attribute of its class, is used. The same
-    environment is always judged in the same way, unless it draws from a generator that `reset`
-    does not seed.
+    made alike: the caller's episode and generators stay as they are, but what the environment
+    shares with its copies, such as an attribute of its class, is used. The same environment is
+    always judged in the same way, unless it draws from a generator that `reset` does not seed.
 
     Args:
         env: an environment that has ``P`` and ``initial_state_distrib``, wrapped or not.
@@ -117,31 +116,21 @@ def checked(base: Env, claim: Claim) -> ModelCheck:
 
 def _check(base: Env, claim: Claim, n_steps: int) -> ModelCheck:
     try:
-        with global_generators_apart(SEED):
-            twin = copy_of(base)
-            _require_same(claim, twin)
-            watched = WatchedEnv(twin, claim)
-            can_be_set = sample(watched, n_steps, _limit(base))
+        with _global_generators_apart():
+            twin = _copy_of(base)
+            other = claim_of(twin)
+            if other is None or _model_digest(other.model) != _model_digest(claim.model):
+                raise ValueError("another environment made in the same way has another P")
+            trial = Trial(twin, claim, _limit(base))
+            can_be_set = trial.run(n_steps)
     except DisagreementError as error:
         return ModelCheck(DIFFERENT + str(error))
     except ValueError as error:
         return ModelCheck(f"the environment's P cannot be held against step: {error}")
-    odd = odd_frequency(watched)
-    n_done = len(watched.steps.row)
+    odd, n_done = odd_frequency(trial), len(trial.steps[0])
     if odd is not None:
         return ModelCheck(DIFFERENT + odd, n_steps=n_done)
-    return ModelCheck(None, watched.draws_as_toy_text(), can_be_set, n_done)
-
-
-def _require_same(claim: Claim, twin: Env) -> None:
-    """Make sure that a copy says the same of itself.
-
-    Raises:
-        ValueError: if it does not.
-    """
-    other = claim_of(twin)
-    if other is None or _model_digest(other.model) != _model_digest(claim.model):
-        raise ValueError("another environment made in the same way has another P")
+    return ModelCheck(None, trial.draws_as_toy_text(), can_be_set, n_done)
 
 
 def _limit(base: Env) -> int:
@@ -152,8 +141,8 @@ def _limit(base: Env) -> int:
 def _digest_when_new(base: Env, model: TransitionModel) -> bytes:
     """The digest that the environment has at the beginning of an episode."""
     try:
-        with global_generators_apart(SEED):
-            twin = copy_of(base)
+        with _global_generators_apart():
+            twin = _copy_of(base)
             twin.reset(seed=SEED)
     except Exception:  # noqa: BLE001  # whatever it is, the check will say
         return _digest(base, model)
@@ -182,57 +171,32 @@ def _model_digest(model: TransitionModel) -> bytes:
     return found.digest()
 
 
-# --- copies to try things on ----------------------------------------------------------------------
-
-
-def copy_of(base: Env) -> Env:
-    """An environment like this one, which draws nothing on the screen.
-
-    It is a deep copy. Where that cannot be had (an open window, a file), another one is made as
-    `gymnasium.make` made this one, and what was changed by hand since then is not in it.
-
-    Args:
-        base: an environment without wrappers.
-
-    Raises:
-        ValueError: if neither works, or if ``step`` or ``reset`` of this very object was replaced:
-            that of a copy may well act on the original.
-    """
+def _copy_of(base: Env) -> Env:
+    """A deep copy that draws nothing on the screen; where there is none, one made as this was."""
     for name in ("step", "reset"):
-        if name in vars(base):
+        if name in vars(base):  # that of a copy may well act on the original
             raise ValueError(f"its {name} was replaced by hand, and cannot be tried on a copy")
     try:
         twin = copy.deepcopy(base)
-    except Exception as error:  # noqa: BLE001  # whatever it is that cannot be copied
-        twin = _made_anew(base, error)
+    except Exception as error:
+        reason = f"be copied ({one_line(error)})"
+        if base.spec is None:
+            raise ValueError(f"it cannot {reason}") from error
+        try:
+            twin = gym.make(base.spec, render_mode=None).unwrapped
+        except Exception as new:
+            raise ValueError(f"it can neither {reason} nor made anew ({one_line(new)})") from new
     if twin.render_mode is not None:
         vars(twin)["render_mode"] = None
     return twin
 
 
-def _made_anew(base: Env, reason: Exception) -> Env:
-    if base.spec is None:
-        raise ValueError(f"it cannot be copied ({_one_line(reason)})") from reason
-    try:
-        return gym.make(base.spec, render_mode=None).unwrapped
-    except Exception as error:
-        text = f"it can neither be copied ({_one_line(reason)}) nor made anew ({_one_line(error)})"
-        raise ValueError(text) from error
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
-
-
 @contextmanager
-def global_generators_apart(seed: int) -> Iterator[None]:
-    """Within, the generators that all code shares start from a seed; afterwards they are as before.
-
-    Environments should not draw from them. Some do.
-    """
+def _global_generators_apart() -> Iterator[None]:
+    """Seed the generators that all code shares, which some environments use, and restore them."""
     kept = random.getstate(), np.random.get_state()  # noqa: NPY002  # not to draw from it
-    random.seed(seed)
-    np.random.seed(seed)  # noqa: NPY002
+    random.seed(SEED)
+    np.random.seed(SEED)  # noqa: NPY002
     try:
         yield
     finally:
@@ -240,34 +204,18 @@ def global_generators_apart(seed: int) -> Iterator[None]:
         np.random.set_state(kept[1])  # noqa: NPY002
 
 
-# --- what may be seen of a step -------------------------------------------------------------------
-
+# What may be seen of a step: row (``state * A + action``), next state, reward in single precision,
+# and whether the episode terminated.
 Observed = tuple[int, int, float, bool]
-"""Row, next state, reward in single precision, and whether the episode terminated."""
 
 # Probabilities within this of one are one, and rows this alike are the same.
 TOLERANCE = 1e-9
-MAX_TABLE = 4_000_000
 
 
 class OutcomeClasses:
-    """Classes of outcomes that cannot be told apart.
-
-    Args:
-        model: the transition model.
-
-    Attributes:
-        ids: the class of everything that may be observed; classes of a row follow each other, in
-            the model's order.
-        row: the row of each class, shape (C,).
-        place: which of its row's classes it is, from 0 on, shape (C,).
-        row_prob: probabilities of a row's classes, padded with zeros, shape (S * A, M).
-        pattern: rows with the same probabilities have the same pattern, shape (S * A,).
-        pattern_prob: the probabilities of each pattern, shape (P, M).
-    """
+    """A model's outcomes by what may be seen of them: those that look alike are one class."""
 
     def __init__(self, model: TransitionModel) -> None:
-        self._model = model
         n_rows = model.n_states * model.n_actions
         prob = model.prob.reshape(n_rows, -1)
         possible = prob > 0
@@ -276,223 +224,30 @@ class OutcomeClasses:
             reward = model.reward.astype(np.float32)
         arrays: tuple[Any, ...] = (model.next_state, reward, model.terminated)
         seen = (part.reshape(n_rows, -1)[possible].tolist() for part in arrays)
+        # The number of each class; those of a row follow each other, in the model's order.
         self.ids: dict[Observed, int] = {}
         classes = [
             self.ids.setdefault(key, len(self.ids))
             for key in zip(rows.tolist(), *seen, strict=True)
         ]
-        self._of_outcome = np.full(prob.shape, -1)
-        self._of_outcome[possible] = classes
-        self.row: Ints = np.array([key[0] for key in self.ids])
+        self.row: Ints = np.array([key[0] for key in self.ids])  # of each class, shape (C,)
+        # Which of its row's classes it is, from 0 on, shape (C,).
         self.place: Ints = np.arange(len(self.row)) - np.searchsorted(self.row, self.row)
-        self.row_prob = np.zeros((n_rows, int(self.place.max()) + 1))
-        self.row_prob[self.row, self.place] = np.bincount(classes, prob[possible])
-        self.row_prob[self.row_prob > 1 - TOLERANCE] = 1
-        rounded = (self.row_prob / TOLERANCE).round()
-        _, first, pattern = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
-        self.pattern: Ints = pattern.reshape(-1)
-        self.pattern_prob: Floats = self.row_prob[first]
+        self.of_outcome = np.full(prob.shape, -1)  # the class of each outcome of a row
+        self.of_outcome[possible] = classes
+        self.prob = np.zeros((n_rows, int(self.place.max()) + 1))
+        self.prob[self.row, self.place] = np.bincount(classes, prob[possible])
+        self.prob[self.prob > 1 - TOLERANCE] = 1
 
     def prob_of(self, observed: Observed) -> float:
         """The probability that the model gives to what was observed."""
         found = self.ids.get(observed)
-        return 0.0 if found is None else float(self.row_prob[observed[0], self.place[found]])
-
-    def predicted(self, rows: Ints, uniforms: Floats) -> tuple[Ints, Floats]:
-        """What `categorical_sample` of Gymnasium's toy_text makes of uniform numbers.
-
-        Args:
-            rows: where they are drawn, shape (n,).
-            uniforms: the numbers, shape (n,).
-
-        Returns:
-            Classes, shape (n,), -1 where an outcome without probability is drawn; and rewards in
-            full precision, likewise.
-        """
-        n_rows, n_outcomes = self._of_outcome.shape
-        cumulative = np.cumsum(self._model.prob, axis=2).reshape(n_rows, -1)
-        chosen = np.zeros(len(rows), np.int64)
-        for start in range(0, len(rows), max(MAX_TABLE // n_outcomes, 1)):
-            part = slice(start, start + max(MAX_TABLE // n_outcomes, 1))
-            chosen[part] = np.argmax(cumulative[rows[part]] > uniforms[part, None], axis=1)
-        reward = self._model.reward.reshape(n_rows, -1)
-        return self._of_outcome[rows, chosen], reward[rows, chosen]
-
-
-# --- an environment that is watched ---------------------------------------------------------------
+        return 0.0 if found is None else float(self.prob[observed[0], self.place[found]])
 
 
 class DisagreementError(Exception):
     """An environment did what its model rules out; the message is one line."""
 
-
-class Steps(NamedTuple):
-    """Steps as they are written down; all arrays have shape (n,)."""
-
-    row: Ints  # ``state * A + action``
-    outcome: Ints  # its class in `OutcomeClasses`
-    draw: Ints  # how many uniform numbers had been drawn, if one is for each step and each start
-
-
-class WatchedEnv:
-    """Steps a copy of an environment, and holds each step against the model that it claims.
-
-    After an error it is where nobody knows: `reset` it.
-    """
-
-    def __init__(self, env: Env, claim: Claim) -> None:
-        self.env: Any = env
-        self.claim = claim
-        self.classes = OutcomeClasses(claim.model)
-        self._log, self._rewards = array("q"), array("d")
-        # Where episodes began, and the number of draws before that.
-        self.starts: list[tuple[int, int]] = []
-        # Where it is, the steps since the episode began, and whether it has ended.
-        self.state, self.time, self.over = 0, 0, True
-        self._initial = claim.model.initial.tolist()
-        self._n_actions = claim.model.n_actions
-        self._draws = 0
-
-    def reset(self) -> None:
-        """Begin an episode, which may begin where the model rules it out: DisagreementError."""
-        try:
-            # Seeded once, as trainings are: what comes later follows from it.
-            obs, _ = self.env.reset(seed=None if self.starts else SEED)
-        except Exception as error:
-            raise DisagreementError(f"reset raised {_error_text(error)}") from error
-        self.state = self._state_of(obs, None)
-        if self._initial[self.state] <= 0:
-            raise DisagreementError(
-                f"reset gave state {self.state}, "
-                "where initial_state_distrib says that no episode begins"
-            )
-        self.starts.append((self.state, self._draws))
-        self._draws += 1
-        self.time, self.over = 0, False
-
-    def step(self, action: int) -> None:
-        """Take a step and write it down, unless the model rules it out: DisagreementError."""
-        row = self.state * self._n_actions + action
-        n_drawn = self._draws
-        seen, reward = self._act(row)
-        outcome = self.classes.ids.get(seen)
-        if outcome is None:
-            raise DisagreementError(f"{self._where(row)}: {self._difference(seen)}")
-        self._log.extend((row, outcome, n_drawn))
-        self._rewards.append(reward)
-        self.time += 1
-
-    @property
-    def steps(self) -> Steps:
-        """All steps but those of `try_action`."""
-        return Steps(*np.array(self._log).reshape(-1, len(Steps._fields)).T)
-
-    def put(self, state: int) -> bool:
-        """Put the environment into a state, if it lets its attribute ``s`` be set."""
-        try:
-            self.env.s = state
-        except Exception:  # noqa: BLE001  # a setter may refuse in any way
-            return False
-        self.state = state
-        return self.states_agree
-
-    def try_action(self, action: int) -> Observed | None:
-        """Act without holding what comes of it against the model; None if that cannot be done."""
-        try:
-            return self._act(self.state * self._n_actions + action)[0]
-        except DisagreementError:
-            return None
-
-    @property
-    def states_agree(self) -> bool:
-        """Whether the environment's attribute ``s`` is where it is."""
-        try:
-            return operator.index(self.env.s) == self.state
-        except (AttributeError, TypeError):
-            return False
-
-    def draws_as_toy_text(self) -> bool:
-        """Whether all that was seen is what toy_text makes of the generator's uniform numbers.
-
-        Of one for each start and each step, by `OutcomeClasses.predicted`.
-        """
-        generator, _ = seeding.np_random(SEED)
-        uniforms = generator.random(self._draws)
-        steps = self.steps
-        predicted, rewards = self.classes.predicted(steps.row, uniforms[steps.draw])
-        starts = np.array(self.starts)
-        cumulative = np.cumsum(self.claim.model.initial)
-        first = [np.argmax(cumulative > uniform) for uniform in uniforms[starts[:, 1]]]
-        return (
-            np.array_equal(predicted, steps.outcome)
-            and np.array_equal(rewards, np.array(self._rewards))
-            and np.array_equal(first, starts[:, 0])
-        )
-
-    def _act(self, row: int) -> tuple[Observed, float]:
-        try:
-            obs, reward, terminated, truncated, _ = self.env.step(row % self._n_actions)
-            reward, self.over = float(reward), bool(terminated)
-        except Exception as error:
-            text = f"{self._where(row)}: step raised {_error_text(error)}"
-            raise DisagreementError(text) from error
-        self._draws += 1
-        self.state = self._state_of(obs, row)
-        if truncated:
-            raise DisagreementError(
-                f"{self._where(row)}: step gave truncated, which no model holds: "
-                "leave time limits to max_episode_steps"
-            )
-        return (row, self.state, float(np.float32(reward)), self.over), reward
-
-    def _state_of(self, obs: Any, row: int | None) -> int:
-        """Where the environment is after a row, or a start, by what is observed."""
-        by_obs = self.claim.observes_states
-        found: Any = obs if by_obs else getattr(self.env, "s", None)
-        try:
-            state = operator.index(found)
-        except TypeError:
-            what = "observation" if by_obs else "attribute s"
-            text = f"{self._where(row)}: the {what} is {found!r}, not the number of a state"
-            raise DisagreementError(" ".join(text.split())) from None
-        if not 0 <= state < len(self._initial):
-            text = f"P has states 0 to {len(self._initial) - 1}, this led to {state}"
-            raise DisagreementError(f"{self._where(row)}: {text}")
-        expected = self.claim.observations
-        if not (by_obs or expected is None or np.array_equal(expected[state], obs)):
-            text = f"{self._where(row)}: state {state} was observed as {obs}, not {expected[state]}"
-            raise DisagreementError(" ".join(text.split()))
-        return state
-
-    def _where(self, row: int | None) -> str:
-        return "reset" if row is None else row_text(row, self._n_actions)
-
-    def _difference(self, seen: Observed) -> str:
-        classes = self.classes
-        here = [key for key in classes.ids if key[0] == seen[0]]
-        said = " or ".join(map(outcome_text, here[:3]))
-        more = f" or {len(here) - 3} others" if len(here) > 3 else ""
-        return f"P says {said}{more}, step gave {outcome_text(seen)}"
-
-
-def outcome_text(seen: Observed) -> str:
-    """An outcome in words."""
-    _, state, reward, terminated = seen
-    # The shortest number that is the same in single precision.
-    return f"state {state} with reward {np.float32(reward)}{', terminated' if terminated else ''}"
-
-
-def row_text(row: int, n_actions: int) -> str:
-    """A state and an action in words."""
-    state, action = divmod(row, n_actions)
-    return f"state {state}, action {action}"
-
-
-def _error_text(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
-
-
-# --- which steps to take --------------------------------------------------------------------------
 
 # Shares of the budget: random episodes, then all states and actions alike, then those in doubt.
 EPISODE_SHARE, SPREAD_SHARE, DOUBT_SHARE = 0.4, 0.35, 0.25
@@ -510,175 +265,288 @@ RARE = 1e-3
 MAX_MISSES = N_ATTEMPTS // 50
 
 
-def sample(watched: WatchedEnv, n_steps: int, limit: int) -> bool:
-    """Play random episodes, then visit all states and actions, then those that seem wrong.
+class Trial:
+    """A copy of an environment that is played, each step compared with the model that it claims."""
 
-    Where the state cannot be set, episodes are steered instead, by plans on the model itself, to
-    states and actions that were seen least.
+    def __init__(self, env: Env, claim: Claim, limit: int) -> None:
+        self.env: Any = env
+        self.claim, self.model = claim, claim.model
+        self.n_states, self.n_actions = self.model.n_states, self.model.n_actions
+        self.limit = limit  # steps after which an episode is left
+        self.classes = OutcomeClasses(self.model)
+        self.state, self.time, self.over = 0, 0, True
+        # Where episodes began; and of each step the class of its outcome. Beside them, how many
+        # uniform numbers had been drawn, if one is for each step and each start.
+        self._starts, self._steps, self._rewards = array("q"), array("q"), array("d")
+        self._n_drawn = 0
+        self._rng = np.random.default_rng(SEED)
 
-    Args:
-        watched: the environment.
-        n_steps: steps in all, where there are no more states and actions than that.
-        limit: steps after which an episode is left.
+    def run(self, n_steps: int) -> bool:
+        """Play random episodes, then visit all states and actions, then those that seem wrong.
 
-    Returns:
-        Whether the environment obeys where its state is set.
-
-    Raises:
-        DisagreementError: as soon as something happens that the model rules out.
-    """
-    rng = np.random.default_rng(SEED)
-    _play_at_random(watched, rng, int(EPISODE_SHARE * n_steps), limit)
-    for _ in range(int(STARTS_PER_STEP * n_steps)):
-        watched.reset()
-    if not _obeys(watched, rng):
-        _play_steered(watched, int((1 - EPISODE_SHARE) * n_steps), limit)
-        return False
-    model = watched.claim.model
-    states = np.flatnonzero(model.reachable)
-    rows = (states[:, None] * model.n_actions + np.arange(model.n_actions)).ravel()
-    for _ in range(max(int(SPREAD_SHARE * n_steps / len(rows)), 1)):
-        _visit(watched, rng.permutation(rows))
-    each = DOUBT_SHARE * n_steps / len(DOUBTFUL)
-    for number in DOUBTFUL:
-        doubtful = _most_doubtful(watched, number)
-        _visit(watched, np.tile(doubtful, math.ceil(each / max(len(doubtful), 1))))
-    return True
-
-
-def _play_at_random(watched: WatchedEnv, rng: Generator, n_steps: int, limit: int) -> None:
-    for action in rng.integers(watched.claim.model.n_actions, size=n_steps).tolist():
-        if watched.over or watched.time >= limit:
-            watched.reset()
-        watched.step(action)
-
-
-def _visit(watched: WatchedEnv, rows: Ints) -> None:
-    """Take a step from each of many states, with the action that belongs to it."""
-    n_actions = watched.claim.model.n_actions
-    for i, row in enumerate(rows.tolist()):
-        if watched.over or i % STEPS_FROM_SET_STATES == 0:
-            watched.reset()
-        state, action = divmod(row, n_actions)
-        if watched.put(state):
-            watched.step(action)
-        else:
-            watched.reset()
-
-
-def _most_doubtful(watched: WatchedEnv, number: int) -> Ints:
-    """The rows whose counts speak most against the model."""
-    steps, classes = watched.steps, watched.classes
-    found = frequencies(steps.row, classes.place[steps.outcome], classes.row_prob)
-    evidence = found.evidence.max(axis=1)
-    order = np.argsort(-evidence, kind="stable")[:number]
-    doubtful: Ints = found.groups[order][np.isfinite(evidence[order])]
-    return doubtful
-
-
-def _obeys(watched: WatchedEnv, rng: Generator) -> bool:
-    """Whether the environment goes on from where it is put, by what it does there.
-
-    What comes of a step is held against the model at two places: where the environment was put,
-    and where it had been before. Only states and actions that episodes have seen are tried, of
-    which it is known that they hardly ever do what the model rules out. If they do now, then more
-    makes up the state than what was set.
-    """
-    n_actions, evidence, misses = watched.claim.model.n_actions, 0.0, 0
-    rows = np.unique(watched.steps.row)
-    for i, row in enumerate(rng.choice(rows, N_ATTEMPTS).tolist()):
-        if watched.over or i % STEPS_FROM_SET_STATES == 0:
-            watched.reset()
-        before = watched.state
-        if not (watched.states_agree and watched.put(row // n_actions)):
+        Where the state cannot be set, episodes are steered instead, by plans on the model itself,
+        to states and actions that were seen least. Returns whether the state can be set; raises
+        DisagreementError as soon as something happens that the model rules out.
+        """
+        n_random = int(EPISODE_SHARE * n_steps)
+        for action in self._rng.integers(self.n_actions, size=n_random).tolist():
+            if self.over or self.time >= self.limit:
+                self._reset()
+            self._step(action)
+        for _ in range(int(STARTS_PER_STEP * n_steps)):
+            self._reset()
+        if not self._obeys():
+            self._play_steered(int((1 - EPISODE_SHARE) * n_steps))
             return False
-        seen = watched.try_action(row % n_actions)
-        if seen is None:
+        states = np.flatnonzero(self.model.reachable)
+        rows = (states[:, None] * self.n_actions + np.arange(self.n_actions)).ravel()
+        for _ in range(max(int(SPREAD_SHARE * n_steps / len(rows)), 1)):
+            self._visit(self._rng.permutation(rows))
+        each = DOUBT_SHARE * n_steps / len(DOUBTFUL)
+        for number in DOUBTFUL:
+            doubtful = self._most_doubtful(number)
+            self._visit(np.tile(doubtful, math.ceil(each / max(len(doubtful), 1))))
+        return True
+
+    @property
+    def starts(self) -> Ints:
+        """The state in which each episode began, shape (n,)."""
+        return np.array(self._starts[::2])
+
+    @property
+    def steps(self) -> tuple[Ints, Ints]:
+        """The row of each step, and which of its classes was seen; each of shape (n,)."""
+        outcomes = np.array(self._steps[::2])
+        return self.classes.row[outcomes], self.classes.place[outcomes]
+
+    def draws_as_toy_text(self) -> bool:
+        """Whether all was what toy_text makes of the uniform numbers of the same generator."""
+        generator, _ = seeding.np_random(SEED)
+        uniforms = generator.random(self._n_drawn)
+        starts_upto, drawn = np.cumsum(self.model.initial), uniforms[self._steps[1::2]]
+        first = [first_above(starts_upto, uniform) for uniform in uniforms[self._starts[1::2]]]
+        rows, _ = self.steps
+        upto = np.cumsum(self.model.prob, axis=2).reshape(self.classes.of_outcome.shape)
+        chosen = np.zeros(len(rows), np.int64)  # the first, where rounding leaves none
+        for k in reversed(range(upto.shape[1])):
+            chosen[upto[rows, k] > drawn] = k
+        return (
+            np.array_equal(first, self.starts)
+            and np.array_equal(self.classes.of_outcome[rows, chosen], self._steps[::2])
+            and np.array_equal(self.model.reward.reshape(upto.shape)[rows, chosen], self._rewards)
+        )
+
+    def row_text(self, row: int) -> str:
+        """A state and an action in words."""
+        state, action = divmod(row, self.n_actions)
+        return f"state {state}, action {action}"
+
+    def _visit(self, rows: Ints) -> None:
+        """Take a step from each of many states, with the action that belongs to it."""
+        for i, row in enumerate(rows.tolist()):
+            if self.over or i % STEPS_FROM_SET_STATES == 0:
+                self._reset()
+            state, action = divmod(row, self.n_actions)
+            if self._put(state):
+                self._step(action)
+            else:
+                self._reset()
+
+    def _most_doubtful(self, number: int) -> Ints:
+        """The rows whose counts speak most against the model."""
+        rows, _, evidence = frequencies(*self.steps, self.classes.prob)
+        strongest = evidence.max(axis=1)
+        order = np.argsort(-strongest, kind="stable")[:number]
+        doubtful: Ints = rows[order][np.isfinite(strongest[order])]
+        return doubtful
+
+    def _obeys(self) -> bool:
+        """Whether the environment goes on from where it is put, and not from where it was.
+
+        Only states and actions that episodes have seen are tried, of which it is known that they
+        hardly ever do what the model rules out. If they do now, then more makes up the state than
+        what was set.
+        """
+        n_actions, evidence, misses = self.n_actions, 0.0, 0
+        rows = np.unique(self.steps[0])
+        for i, row in enumerate(self._rng.choice(rows, N_ATTEMPTS).tolist()):
+            if self.over or i % STEPS_FROM_SET_STATES == 0:
+                self._reset()
+            before = self.state
+            if not (self._states_agree() and self._put(row // n_actions)):
+                return False
+            try:
+                seen, _ = self._act(row % n_actions)
+            except DisagreementError:
+                return False
+            stayed: Observed = (before * n_actions + row % n_actions, *seen[1:])
+            there, here = (self.classes.prob_of(where) for where in (seen, stayed))
+            misses += there == 0
+            evidence += math.log(max(there, RARE) / max(here, RARE))
+        is_sure = self.n_states == 1 or evidence > CERTAIN
+        return is_sure and misses <= MAX_MISSES
+
+    def _play_steered(self, n_steps: int) -> None:
+        horizon = min(self.limit, STEERED_STEPS)
+        for _ in range(STEERED_PARTS):
+            actions = self._plan_to_the_unseen(horizon)
+            self._reset()
+            for _ in range(n_steps // STEERED_PARTS):
+                if self.over or self.time >= horizon:
+                    self._reset()
+                left = min(horizon - self.time, len(actions))
+                self._step(int(actions[left - 1, self.state]))
+
+    def _plan_to_the_unseen(self, horizon: int) -> Ints:
+        """What to do with 1, 2, ... steps left to see what was seen least, shape (m, S)."""
+        from mdp.finite_horizon import finite_horizon_optimum
+
+        visits = np.bincount(self.steps[0], minlength=len(self.classes.prob))
+        prize: Floats = 1 / (1.0 + visits.reshape(self.n_states, -1, 1))
+        wanted = replace(self.model, reward=np.broadcast_to(prize, self.model.prob.shape))
+        return finite_horizon_optimum(wanted, horizon).actions_left.astype(np.int64)
+
+    def _reset(self) -> None:
+        try:
+            # Seeded once, as trainings are: what comes later follows from it.
+            obs, _ = self.env.reset(seed=None if self._starts else SEED)
+        except Exception as error:
+            raise DisagreementError(f"reset raised {_error_text(error)}") from error
+        self.state = self._state_of(obs, None)
+        if self.model.initial[self.state] <= 0:
+            raise DisagreementError(
+                f"reset gave state {self.state}, "
+                "where initial_state_distrib says that no episode begins"
+            )
+        self._starts.extend((self.state, self._n_drawn))
+        self._n_drawn += 1
+        self.time, self.over = 0, False
+
+    def _step(self, action: int) -> None:
+        """Take a step and count what came of it."""
+        n_drawn = self._n_drawn
+        seen, reward = self._act(action)
+        outcome = self.classes.ids.get(seen)
+        if outcome is None:
+            here = [key for key in self.classes.ids if key[0] == seen[0]]
+            said = " or ".join(map(outcome_text, here[:3]))
+            more = f" or {len(here) - 3} others" if len(here) > 3 else ""
+            text = f"P says {said}{more}, step gave {outcome_text(seen)}"
+            raise self._disagreement(seen[0], text)
+        self._steps.extend((outcome, n_drawn))
+        self._rewards.append(reward)
+        self.time += 1
+
+    def _act(self, action: int) -> tuple[Observed, float]:
+        """What comes of an action, and the reward in full precision."""
+        row = self.state * self.n_actions + action
+        try:
+            obs, reward, terminated, truncated, _ = self.env.step(action)
+            reward, self.over = float(reward), bool(terminated)
+        except Exception as error:
+            raise self._disagreement(row, f"step raised {_error_text(error)}") from error
+        self._n_drawn += 1
+        self.state = self._state_of(obs, row)
+        if truncated:
+            text = "step gave truncated, which no model holds: leave time limits to"
+            raise self._disagreement(row, f"{text} max_episode_steps")
+        return (row, self.state, float(np.float32(reward)), self.over), reward
+
+    def _put(self, state: int) -> bool:
+        """Put the environment into a state, if it lets its attribute ``s`` be set."""
+        try:
+            self.env.s = state
+        except Exception:  # noqa: BLE001  # a setter may refuse in any way
             return False
-        stayed: Observed = (before * n_actions + row % n_actions, *seen[1:])
-        there, here = (watched.classes.prob_of(where) for where in (seen, stayed))
-        misses += there == 0
-        evidence += math.log(max(there, RARE) / max(here, RARE))
-    is_sure = watched.claim.model.n_states == 1 or evidence > CERTAIN
-    return is_sure and misses <= MAX_MISSES
+        self.state = state
+        return self._states_agree()
+
+    def _states_agree(self) -> bool:
+        """Whether the environment's attribute ``s`` is where it is."""
+        try:
+            return operator.index(self.env.s) == self.state
+        except (AttributeError, TypeError):
+            return False
+
+    def _state_of(self, obs: Any, row: int | None) -> int:
+        """Where the environment is after a row, or a start, by what is observed."""
+        by_obs = self.claim.observes_states
+        found: Any = obs if by_obs else getattr(self.env, "s", None)
+        try:
+            state = operator.index(found)
+        except TypeError:
+            what = "observation" if by_obs else "attribute s"
+            text = f"the {what} is {found!r}, not the number of a state"
+            raise self._disagreement(row, text) from None
+        if not 0 <= state < self.n_states:
+            text = f"P has states 0 to {self.n_states - 1}, this led to {state}"
+            raise self._disagreement(row, text)
+        expected = self.claim.observations
+        if not (by_obs or expected is None or np.array_equal(expected[state], obs)):
+            text = f"state {state} was observed as {obs}, not {expected[state]}"
+            raise self._disagreement(row, text)
+        return state
+
+    def _disagreement(self, row: int | None, text: str) -> DisagreementError:
+        where = "reset" if row is None else self.row_text(row)
+        return DisagreementError(" ".join(f"{where}: {text}".split()))
 
 
-def _play_steered(watched: WatchedEnv, n_steps: int, limit: int) -> None:
-    horizon = min(limit, STEERED_STEPS)
-    for _ in range(STEERED_PARTS):
-        actions = _plan_to_the_unseen(watched, horizon)
-        watched.reset()
-        for _ in range(n_steps // STEERED_PARTS):
-            if watched.over or watched.time >= horizon:
-                watched.reset()
-            left = min(horizon - watched.time, len(actions))
-            watched.step(int(actions[left - 1, watched.state]))
+def outcome_text(seen: Observed) -> str:
+    """An outcome in words."""
+    _, state, reward, terminated = seen
+    # The shortest number that is the same in single precision.
+    return f"state {state} with reward {np.float32(reward)}{', terminated' if terminated else ''}"
 
 
-def _plan_to_the_unseen(watched: WatchedEnv, horizon: int) -> Ints:
-    """What to do with 1, 2, ... steps left to see what was seen least, shape (m, S)."""
-    from mdp.finite_horizon import finite_horizon_optimum
-
-    model: TransitionModel = watched.claim.model
-    visits = np.bincount(watched.steps.row, minlength=model.n_states * model.n_actions)
-    prize: Floats = 1 / (1.0 + visits.reshape(model.n_states, model.n_actions, 1))
-    wanted = replace(model, reward=np.broadcast_to(prize, model.prob.shape))
-    return finite_horizon_optimum(wanted, horizon).actions_left.astype(np.int64)
+def _error_text(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-# --- counts that the right probabilities would not have led to ------------------------------------
-# A test at a fixed number of draws goes wrong where what is seen decides what is drawn next, as the
-# states of episodes do. A likelihood ratio does not: where the probabilities are right, that of any
-# mixture of others to them is a martingale with mean one, and exceeds 1/alpha, ever, with
-# probability alpha at most (Ville, Étude critique de la notion de collectif, 1939; Robbins, Annals
-# of Mathematical Statistics 41, 1970). Nothing is approximated, at any number of draws.
+# Counts that the right probabilities would not have led to: a test at a fixed number of draws goes
+# wrong where what is seen decides what is drawn next, as the states of episodes do. A likelihood
+# ratio does not: where the probabilities are right, that of any mixture of others to them is a
+# martingale with mean one, and exceeds 1/alpha, ever, with probability alpha at most (Ville, Étude
+# critique de la notion de collectif, 1939; Robbins, Annals of Mathematical Statistics 41, 1970).
+# Nothing is approximated, at any number of draws.
 
 # The chance that counts of a right model are called odd: over all that is looked at.
 FALSE_ALARMS = 1e-6
 N_FAMILIES = 3
 
 
-def odd_frequency(watched: WatchedEnv) -> str | None:
-    """What an environment did too often or too seldom, in one line.
-
-    Under the right probabilities there is one with a chance of at most `FALSE_ALARMS`, however the
-    steps were chosen.
-    """
-    initial = watched.claim.model.initial
+def odd_frequency(trial: Trial) -> str | None:
+    """What an environment did too often or too seldom, in one line."""
+    initial, prob = trial.model.initial, trial.classes.prob
     possible = np.flatnonzero(initial)
-    starts = np.searchsorted(possible, [state for state, _ in watched.starts])
+    starts = np.searchsorted(possible, trial.starts)
     odd = _oddest(0 * starts, starts, initial[possible][None], len(possible))
     if odd is not None:
-        return (
-            f"initial_state_distrib says state {possible[odd.outcome]} in "
-            f"{initial[possible[odd.outcome]]:.1%} of cases, reset gave it in "
-            f"{odd.times / odd.trials:.1%} of {odd.trials:,}"
-        )
-    steps, classes = watched.steps, watched.classes
-    rows, places = steps.row, classes.place[steps.outcome]
-    odd, where = _oddest(rows, places, classes.row_prob, len(classes.row)), ""
+        says = f"initial_state_distrib says state {possible[odd.outcome]}"
+        return f"{says} {odd.shares.format('reset')}"
+    rows, places = trial.steps
+    odd, where = _oddest(rows, places, prob, len(trial.classes.row)), ""
     if odd is None:
-        patterns, n_tests = classes.pattern[rows], int(np.count_nonzero(classes.pattern_prob))
-        odd = _oddest(patterns, places, classes.pattern_prob, n_tests)
+        rounded = (prob / TOLERANCE).round()
+        _, first, pattern = np.unique(rounded, axis=0, return_index=True, return_inverse=True)
+        patterns, alike = pattern.reshape(-1)[rows], prob[first]
+        odd = _oddest(patterns, places, alike, int(np.count_nonzero(alike)))
         if odd is None:
             return None
         odd = odd._replace(group=int(rows[np.argmax(patterns == odd.group)]))
         where = ", counted over all that P gives these probabilities"
-    outcome = list(classes.ids)[int(np.searchsorted(classes.row, odd.group)) + odd.outcome]
-    return (
-        f"{row_text(odd.group, watched.claim.model.n_actions)}: P says {outcome_text(outcome)} in "
-        f"{classes.row_prob[odd.group, odd.outcome]:.1%} of cases, step gave it in "
-        f"{odd.times / odd.trials:.1%} of {odd.trials:,}{where}"
-    )
+    first_of_row = int(np.searchsorted(trial.classes.row, odd.group))
+    outcome = list(trial.classes.ids)[first_of_row + odd.outcome]
+    says = f"{trial.row_text(odd.group)}: P says {outcome_text(outcome)}"
+    return f"{says} {odd.shares.format('step')}{where}"
 
 
 class Odd(NamedTuple):
-    """The oddest count: of which outcome, in which group, how often, of how many."""
+    """The oddest count: of which outcome in which group, and the shares in words."""
 
     group: int
     outcome: int
-    times: int
-    trials: int
+    shares: str
 
 
 def _oddest(groups: Ints, outcomes: Ints, probabilities: Floats, n_tests: int) -> Odd | None:
@@ -686,61 +554,38 @@ def _oddest(groups: Ints, outcomes: Ints, probabilities: Floats, n_tests: int) -
 
     ``n_tests`` counts all groups and outcomes that could be looked at, whether they came up or not.
     """
-    if not len(groups):
+    groups, counts, evidence = frequencies(groups, outcomes, probabilities)
+    group, outcome = np.unravel_index(np.argmax(evidence), evidence.shape)
+    if evidence[group, outcome] < math.log(N_FAMILIES * n_tests / FALSE_ALARMS):
         return None
-    found = frequencies(groups, outcomes, probabilities)
-    group, outcome = np.unravel_index(np.argmax(found.evidence), found.evidence.shape)
-    if found.evidence[group, outcome] < math.log(N_FAMILIES * n_tests / FALSE_ALARMS):
-        return None
-    counts = found.counts[group]
-    return Odd(int(found.groups[group]), int(outcome), int(counts[outcome]), int(counts.sum()))
+    trials, said = counts[group].sum(), probabilities[groups[group], outcome]
+    share = counts[group, outcome] / trials
+    return Odd(
+        int(groups[group]),
+        int(outcome),
+        f"in {said:.1%} of cases, {{}} gave it in {share:.1%} of {trials:,}",
+    )
 
 
-class Frequencies(NamedTuple):
-    """What was counted in groups of draws, and what it says.
+def frequencies(groups: Ints, outcomes: Ints, probabilities: Floats) -> tuple[Ints, Ints, Floats]:
+    """The groups in which something was drawn, and how often which outcome, with its evidence.
 
-    Attributes:
-        groups: the groups in which something was drawn, shape (G,).
-        counts: how often each outcome was drawn in each, shape (G, K).
-        evidence: natural logarithm of the likelihood ratio against the outcome's probability, shape
-            (G, K); minus infinity where that is 0 or 1.
-    """
-
-    groups: Ints
-    counts: Ints
-    evidence: Floats
-
-
-def frequencies(groups: Ints, outcomes: Ints, probabilities: Floats) -> Frequencies:
-    """Count draws, and hold each outcome's count against its probability.
-
-    Args:
-        groups: the group of each draw, from 0 on, shape (n,).
-        outcomes: what was drawn, 0 to K - 1, shape (n,).
-        probabilities: of the outcomes in each group, shape (H, K).
+    ``groups`` and ``outcomes``, of shape (n,), are those of each draw, ``probabilities``, of shape
+    (H, K), those of the outcomes in each group. Shapes returned: (G,), (G, K), (G, K).
     """
     n_outcomes = probabilities.shape[1]
     found, index = np.unique(groups, return_inverse=True)
     cells = index * n_outcomes + outcomes
     counts = np.bincount(cells, minlength=len(found) * n_outcomes).reshape(-1, n_outcomes)
-    evidence = log_evidence(counts, counts.sum(1, keepdims=True), probabilities[found])
-    return Frequencies(found, counts, evidence)
+    return found, counts, log_evidence(counts, counts.sum(1, keepdims=True), probabilities[found])
 
 
 def log_evidence(counts: Ints, trials: Ints, prob: Floats) -> Floats:
     """Logarithm of how much likelier counts are under a probability that nobody knows.
 
     That one is drawn from Beta(1/2, 1/2); Krichevsky and Trofimov, IEEE Transactions on Information
-    Theory 27, 1981.
-
-    Args:
-        counts: successes.
-        trials: draws, of a shape that broadcasts with that of ``counts``.
-        prob: the probability of a success that is doubted, likewise.
-
-    Returns:
-        The logarithms; minus infinity where the probability is 0 or 1, which counts cannot refute
-        bit by bit: one draw does, or none.
+    Theory 27, 1981. Minus infinity where ``prob``, that of a success which is doubted, is 0 or 1:
+    counts cannot refute these bit by bit, one draw does, or none.
     """
     from scipy.special import betaln
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from bisect import bisect_right
+from collections.abc import Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -59,7 +61,7 @@ class FiniteEnv(ShownEnv):
     ) -> tuple[int, dict[str, Any]]:
         """Begin an episode; ``options`` are not used."""
         super().reset(seed=seed)
-        self.s = choose(self.transition_model().initial, self.np_random.random())
+        self.s = first_above(self.transition_model().initial.cumsum(), self.np_random.random())
         self.last_action = None
         if self.render_mode == "human":
             self.render()
@@ -99,7 +101,8 @@ class FiniteEnv(ShownEnv):
     def _draw(self, action: int) -> tuple[int, float, bool]:
         """What comes of an action: next state, reward, and whether the episode terminates."""
         model = self.transition_model()
-        outcome = self.s, action, choose(model.prob[self.s, action], self.np_random.random())
+        drawn = first_above(model.prob[self.s, action].cumsum(), self.np_random.random())
+        outcome = self.s, action, drawn
         reward = float(model.reward[outcome])
         if model.reward_variance is not None and model.reward_variance[outcome] > 0:
             std = float(np.sqrt(model.reward_variance[outcome]))
@@ -138,10 +141,10 @@ class MaskedFiniteEnv(FiniteEnv):
         return mask.copy()
 
 
-def choose(probabilities: Floats, uniform: float) -> int:
-    """The first whose running sum exceeds the number; 0 where rounding leaves none, as toy_text."""
-    place = int(probabilities.cumsum().searchsorted(uniform, side="right"))
-    return place if place < len(probabilities) else 0
+def first_above(cumulative: Sequence[float] | Floats, uniform: float) -> int:
+    """The first place whose sum exceeds the number; 0 where rounding leaves none, as toy_text."""
+    place = bisect_right(cumulative, uniform)
+    return place if place < len(cumulative) else 0
 
 
 def as_dictionaries(model: TransitionModel) -> dict[int, dict[int, list[Outcome]]]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from envs.argument_checks import check_flag, check_number
 from envs.drawing import GridRenderer, Scene, ShownEnv
-from envs.finite_env import FiniteEnv, Outcome, as_dictionaries, summing_to_one
+from envs.finite_env import FiniteEnv, Outcome, as_dictionaries, first_above, summing_to_one
 from mdp.array_types import AnyInts, Bools, Floats, Ints
 from safe_files.files import UnsafeFileError, read_file
 
@@ -537,9 +537,7 @@ class GridWorld(ShownEnv):
         action = int(action)
         if not 0 <= action < len(MOVES):
             raise ValueError(f"action {action} does not exist: 0 up, 1 down, 2 left, 3 right")
-        uniform = self.np_random.random()
-        # As categorical_sample of toy_text: the first, where rounding leaves none.
-        outcome = next((k for k, upto in enumerate(self._slip_thresholds) if upto > uniform), 0)
+        outcome = first_above(self._slip_thresholds, self.np_random.random())
         move = self.dynamics.move(self.s, POSSIBLE_MOVES[action][outcome])
         if self.render_mode is not None:
             self._note_step(action, move.next_state)

@@ -1,10 +1,9 @@
 """What is known exactly about a Gymnasium environment: its dynamics, with the wrappers folded in.
 
-The answer is None wherever something in the chain of wrappers is not known to leave the dynamics
-alone: a wrong model would make every figure computed from it wrong. For the same reason an
-environment's word is not proof: a model that comes neither from Gymnasium's own classes nor from
-this project's is held against `step` before it is believed, once a process: see
-`envs.checking`.
+The answer is None wherever a wrapper is not known to leave the dynamics alone: a wrong model would
+make every figure computed from it wrong. For the same reason a model that comes neither from
+Gymnasium's own classes nor from this project's is compared with `step` before it is believed, once
+a process: see `envs.checking`.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ OBSERVATION_WRAPPERS = (DiscretizeObservation, FlattenToDiscrete, OneHotObservat
 
 Judgement = tuple[Claim | None, ModelCheck | None]
 
-# By the numbers of environments, which live as long: what was found out about them.
+# What was found out about environments, by `id`: set while they live.
 _looked_at: ContextVar[dict[int, Judgement] | None] = ContextVar("looked_at", default=None)
 
 
@@ -77,7 +76,7 @@ def transition_model(env: Env) -> TransitionModel | None:
         The model, or None where it is not known.
     """
     base, wrappers = _layers(env)
-    claim = _believed(base) if all(_folds(wrapper) for wrapper in wrappers) else None
+    claim = _believed(base) if all(map(_folds, wrappers)) else None
     if claim is None:
         return None
     model = claim.model
@@ -107,7 +106,7 @@ def model_check(env: Env) -> ModelCheck | None:
         The check; None where there is no model, or wrappers hide it.
     """
     base, wrappers = _layers(env)
-    return _judged(base)[1] if all(_folds(wrapper) for wrapper in wrappers) else None
+    return _judged(base)[1] if all(map(_folds, wrappers)) else None
 
 
 def time_limit(env: Env) -> int | None:
@@ -128,7 +127,7 @@ def success_outcomes(env: Env) -> Bools | None:
         The mask, or None where the model is not known or no episode terminates.
     """
     base, wrappers = _layers(env)
-    claim = _believed(base) if all(_folds(wrapper) for wrapper in wrappers) else None
+    claim = _believed(base) if all(map(_folds, wrappers)) else None
     if claim is None:
         return None
     model = claim.model
@@ -175,7 +174,7 @@ def action_masks_of_states(env: Env) -> Bools | None:
         What `envs.wrappers.action_masks` says in each state, or None where that is not known.
     """
     base, wrappers = _layers(env)
-    if not all(_folds(wrapper) for wrapper in wrappers):
+    if not all(map(_folds, wrappers)):
         return None
     idle = [wrapper.masks for wrapper in wrappers if isinstance(wrapper, IdleActionMasks)]
     if idle:
@@ -204,17 +203,12 @@ def _folds(wrapper: Wrapper) -> bool:
     """Whether a wrapper leaves the states alone and changes rewards, if so, in a known way."""
     if type(wrapper) is TerminationReward:
         return not wrapper.on_truncation
-    if type(wrapper) is ClipReward:
-        return clips_to_numbers(wrapper)
+    if type(wrapper) is ClipReward:  # as it was made, with the same bounds for all rewards
+        is_own = getattr(wrapper.func, "__qualname__", "").startswith("ClipReward.__init__.")
+        return is_own and all(np.ndim(bound) == 0 for bound in wrapper._saved_kwargs.values())
     if type(wrapper) in {ScaleReward, ActionMasks, IdleActionMasks, *OBSERVATION_WRAPPERS}:
         return True
     return f"{type(wrapper).__module__}.{type(wrapper).__qualname__}" in TRANSPARENT_WRAPPERS
-
-
-def clips_to_numbers(wrapper: ClipReward[Any, Any]) -> bool:
-    """Whether the wrapper does what it was made for, with the same bounds for all rewards."""
-    is_own = getattr(wrapper.func, "__qualname__", "").startswith("ClipReward.__init__.")
-    return is_own and all(np.ndim(bound) == 0 for bound in wrapper._saved_kwargs.values())
 
 
 def _believed(base: Env) -> Claim | None:
@@ -225,10 +219,7 @@ def _believed(base: Env) -> Claim | None:
 
 @contextmanager
 def one_look(env: Env) -> Iterator[None]:
-    """Within the ``with`` statement, the model of ``env`` is worked out once, not at each question.
-
-    Nothing may change the environment there.
-    """
+    """Within the ``with`` statement, ``env`` must not change: its model is worked out once."""
     token = _looked_at.set({id(env.unwrapped): _judged(env.unwrapped)})
     try:
         yield
@@ -237,11 +228,10 @@ def one_look(env: Env) -> Iterator[None]:
 
 
 def _judged(base: Env) -> Judgement:
+    """What an environment says of its dynamics, and what came of the check of that."""
     known = _looked_at.get()
-    return _judged_now(base) if known is None or id(base) not in known else known[id(base)]
-
-
-def _judged_now(base: Env) -> Judgement:
+    if known is not None and id(base) in known:
+        return known[id(base)]
     try:
         claim = claim_of(base)
     except ValueError as error:

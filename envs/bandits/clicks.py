@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +10,7 @@ from gymnasium import spaces
 from envs import DEFAULT_PULLS
 from envs.argument_checks import check_numbers, check_table
 from envs.bandits.bandit import StochasticBandit
+from envs.finite_env import first_above
 from mdp.array_types import Floats
 from mdp.transition_model import TransitionModel
 
@@ -108,10 +108,10 @@ class ClickBandit(StochasticBandit):
         return self.means
 
     def _begin(self) -> None:
-        self.context = _choose(self._context_thresholds, self.np_random.random())
+        self.context = first_above(self._context_thresholds, self.np_random.random())
 
     def _pull(self, arm: int) -> float:
-        outcome = _choose(self._thresholds[self.context][arm], self.np_random.random())
+        outcome = first_above(self._thresholds[self.context][arm], self.np_random.random())
         clicked, self.context = divmod(outcome, len(self._expected))
         return 1.0 - clicked
 
@@ -244,9 +244,3 @@ class SegmentBandit(ClickBandit):
         if rates.shape[1] < 2:
             raise ValueError("click_rates must have a column for each treatment, two or more")
         super().__init__(shares, rates, pulls=pulls, batch_size=batch_size, render_mode=render_mode)
-
-
-def _choose(thresholds: list[float], uniform: float) -> int:
-    """The first whose threshold exceeds the number; 0 where rounding leaves none, as toy_text."""
-    place = bisect_right(thresholds, uniform)
-    return place if place < len(thresholds) else 0

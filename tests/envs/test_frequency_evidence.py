@@ -52,9 +52,10 @@ def test_what_is_certain_says_nothing():
 def test_counts_by_group():
     shared, other = [0.5, 0.5, 0.0], [0.2, 0.3, 0.5]
     probabilities = np.array([shared, shared, other, other])
-    found = frequencies(np.array([3, 0, 3, 3, 0, 2]), np.array([2, 1, 2, 0, 0, 1]), probabilities)
-    np.testing.assert_array_equal(found.groups, [0, 2, 3])
-    np.testing.assert_array_equal(found.counts, [[1, 1, 0], [0, 1, 0], [1, 0, 2]])
-    assert found.evidence[0, 2] == -np.inf
+    drawn = np.array([2, 1, 2, 0, 0, 1])
+    groups, counts, evidence = frequencies(np.array([3, 0, 3, 3, 0, 2]), drawn, probabilities)
+    np.testing.assert_array_equal(groups, [0, 2, 3])
+    np.testing.assert_array_equal(counts, [[1, 1, 0], [0, 1, 0], [1, 0, 2]])
+    assert evidence[0, 2] == -np.inf
     expected = log_evidence(np.array([1, 0, 2]), np.array(3), probabilities[3])
-    np.testing.assert_allclose(found.evidence[2], expected)
+    np.testing.assert_allclose(evidence[2], expected)

@@ -289,6 +289,41 @@ def test_what_has_nothing_to_draw_is_the_same_bit_for_bit():
     assert check_transition_model(Thrifty(calm, calm), n_steps=FEW).bit_for_bit
 
 
+class Twins(gym.Env):
+    """Outcomes that look alike in single precision: as ``P`` says, or the first one instead."""
+
+    action_space = spaces.Discrete(1)
+    observation_space = spaces.Discrete(2)
+    P = {  # noqa: RUF012
+        0: {0: [(0.25, 1, 0.1, False), (0.5, 0, 0.1, False), (0.25, 1, 0.1, False)]},
+        1: {0: [(0.5, 0, 0.3, False), (0.5, 0, 0.1 + 0.2, False)]},
+    }
+    initial_state_distrib = np.array([1.0, 0.0])
+
+    def __init__(self, exact):
+        self.exact = exact
+        self.s = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.s = int(categorical_sample(self.initial_state_distrib, self.np_random))
+        return self.s, {}
+
+    def step(self, action):
+        row = self.P[self.s][action]
+        chosen = categorical_sample([outcome[0] for outcome in row], self.np_random)
+        reward = row[chosen if self.exact else 0][2]
+        self.s = row[chosen][1]
+        return self.s, reward, False, False, {}
+
+
+def test_rewards_are_told_apart_in_full_precision_only_bit_for_bit():
+    for exact in (True, False):
+        check = check_transition_model(Twins(exact), n_steps=FEW)
+        assert check.refusal is None
+        assert check.bit_for_bit is exact
+
+
 class Unsettable(Corridor):
     """Its place is not ``s``."""
 

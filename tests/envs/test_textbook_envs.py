@@ -7,7 +7,7 @@ import pytest
 import envs  # noqa: F401 (registers the environments)
 from agents import load_algorithm
 from agents.compiled.engine import choose_engine
-from envs.finite_env import choose, summing_to_one
+from envs.finite_env import first_above, summing_to_one
 from envs.known_models import action_masks_of_states, success_outcomes, time_limit, transition_model
 from envs.textbook.windy_gridworld import WindyGridworldEnv
 from mdp import (
@@ -406,9 +406,9 @@ def test_arguments_out_of_range_are_refused(env_id, wrong, message) -> None:
 def test_numbers_on_the_edge_choose_as_toy_text_does() -> None:
     probabilities = np.array([0.25, 0.0, 0.25, 0.5])
     uniforms = [0.0, np.nextafter(0.25, 0), 0.25, 0.5, np.nextafter(1, 0)]
-    assert [choose(probabilities, uniform) for uniform in uniforms] == [0, 0, 2, 3, 3]
+    assert [first_above(probabilities.cumsum(), uniform) for uniform in uniforms] == [0, 0, 2, 3, 3]
     # Rounding may leave the last sum below a number.
-    assert choose(np.array([0.5, 0.25]), 0.9) == 0
+    assert first_above([0.5, 0.75], 0.9) == 0
 
 
 def test_probabilities_that_sum_to_one_exactly() -> None:
